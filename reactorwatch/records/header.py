@@ -122,7 +122,7 @@ class HeaderSearch:
     def _make(self, heads: list[tuple[int, list[str]]], first: int) -> Layout:
         filled = [sum(bool(cell.strip()) for cell in cells) for _, cells in heads]
         names_index = filled.index(max(filled)) if heads else 0
-        names = [cell.strip() for cell in heads[names_index][1]] if heads else [""] * self._width
+        names = [" ".join(cell.split()) for cell in heads[names_index][1]] if heads else [""] * self._width
         below = heads[names_index + 1 :]
         units_row = min(below, key=lambda head: sum(map(len, head[1]))) if below else None
         units = (
@@ -148,7 +148,7 @@ class HeaderSearch:
             names=tuple(name or str(number) for number, name in enumerate(names, start=1)),
             units=tuple(units),
             header_row=heads[names_index][0] if heads else None,
-            first_row=self._table[first][0] if first < len(self._table) else self._table[-1][0] + 1,
+            first_row=self._first_line(first),
             sample=sample,
             missing=self._missing,
             notes=notes,
@@ -158,6 +158,13 @@ class HeaderSearch:
         if layout.decimal == ",":
             notes.insert(0 if self._separator == "," else 1, "decimal comma")
         return layout
+
+    def _first_line(self, index: int) -> int:
+        """Number of the first line of a row of the head; cells may hold line ends."""
+        if index >= len(self._table):
+            return self._table[-1][0] + 1
+        row, cells = self._table[index]
+        return row - sum(cell.count("\n") for cell in cells)
 
     def _guess_decimal(self, layout: Layout) -> str:
         """Decimal sign, from all rows where the first ones leave it open.

@@ -140,8 +140,8 @@ def _sources(
     sources = []
     for column, name in enumerate(layout.names):
         is_unnamed = layout.header_row is not None and name == str(column + 1)
-        is_unnamed = is_unnamed and (layout.kind(column) == EMPTY or counts_rows(layout, column))
-        if column in time.columns or name == RUN or is_unnamed or layout.kind(column) not in (NUMBER, EMPTY):
+        is_unnamed = is_unnamed and (layout.kinds[column] == EMPTY or counts_rows(layout, column))
+        if column in time.columns or name == RUN or is_unnamed or layout.kinds[column] not in (NUMBER, EMPTY):
             continue
         own = bare[column] if bare.count(bare[column]) == 1 else name
         sources.append(_Source(SignalColumn(own), column, layout.units[column]))
@@ -154,7 +154,7 @@ def _sources(
 
 
 def _is_coded(layout: Layout, source: _Source) -> bool:
-    return source.signal.role in ("mode", "label") and layout.kind(source.column) == TEXT
+    return source.signal.role in ("mode", "label") and layout.kinds[source.column] == TEXT
 
 
 def _make_record(
@@ -201,7 +201,7 @@ def _describe_texts(layout: Layout, time: TimeColumn, sources: Sequence[_Source]
     texts = [
         layout.names[column]
         for column in range(len(layout.names))
-        if column not in used and layout.kind(column) == TEXT
+        if column not in used and layout.kinds[column] == TEXT
     ]
     return [f"text left out: {', '.join(f'`{name}`' for name in texts)}"] if texts else []
 

@@ -25,6 +25,9 @@ MIN_LINES = 12
 MIN_TRANSPOSED = 10
 """Fewest columns of a file without names that may be taken as rows."""
 
+MAX_CELL_LINES = 4
+"""Most lines of a quoted cell in the head."""
+
 _SEPARATORS = ";\t,| "
 _PAIR = re.compile(rb"([^,\n]*),([^,\n]*)(,?)")
 _BLANKS = re.compile(rb"[ \t]+")
@@ -47,7 +50,7 @@ def sniff(path: Path, text: bytes, stated: FileFormat) -> Layout:
     ]
     if comments:
         text = blank_comments(text)
-    numbered = [(row, line) for row, line in enumerate(_head(text), start=1) if line.strip(" \t")]
+    numbered = [(row, line) for row, line in _head(text) if line.strip(" \t\n")]
     if not numbered:
         raise InputError(f"{path}: expected a header and rows, got only comments")
     separator = stated.separator or _guess_separator([line for _, line in numbered], missing)
@@ -65,13 +68,21 @@ def sniff(path: Path, text: bytes, stated: FileFormat) -> Layout:
     return layout
 
 
-def _head(text: bytes) -> list[str]:
-    """Whole lines at the start of a text."""
+def _head(text: bytes) -> list[tuple[int, str]]:
+    """Whole lines at the start of a text, each with its number; lines of one quoted cell are one."""
     size = HEAD_BYTES
     while text.count(b"\n", 0, size) < MIN_LINES and size < len(text):
         size *= 4
     lines = text[:size].decode(errors="ignore").split("\n")
-    return lines[:HEAD_LINES] if size >= len(text) else lines[:-1][:HEAD_LINES]
+    lines = lines[:HEAD_LINES] if size >= len(text) else lines[:-1][:HEAD_LINES]
+    found: list[tuple[int, str]] = []
+    row = 0
+    while row < len(lines):
+        ends = range(row + 1, min(row + 1 + MAX_CELL_LINES, len(lines)) + 1)
+        end = next((end for end in ends if not "\n".join(lines[row:end]).count('"') % 2), row + 1)
+        found.append((end, "\n".join(lines[row:end])))
+        row = end
+    return found
 
 
 def _join_pairs(text: bytes) -> bytes | None:

@@ -5,6 +5,7 @@ import gzip
 import io
 import zipfile
 import zlib
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,8 @@ def _workbook(path: Path, data: bytes) -> tuple[bytes, str]:
 def _cell(value: object) -> str:
     if value is None:
         return ""
+    if isinstance(value, timedelta):
+        return repr(value.total_seconds())
     if hasattr(value, "isoformat"):
         return str(value.isoformat())
     return repr(value) if isinstance(value, float) else str(value)

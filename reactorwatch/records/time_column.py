@@ -93,11 +93,11 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
     named = [
         item
         for item in candidates
-        if item.pattern is None and layout.kind(item.columns[0]) == NUMBER and _has_time_name(layout, item)
+        if item.pattern is None and layout.kinds[item.columns[0]] == NUMBER and _has_time_name(layout, item)
     ]
     found = [*stamps, *(item for item in named if _increases(layout, item))]
     if not found:
-        numbers = [item for item in candidates if layout.kind(item.columns[0]) == NUMBER and _increases(layout, item)]
+        numbers = [item for item in candidates if layout.kinds[item.columns[0]] == NUMBER and _increases(layout, item)]
         found = [item for item in numbers if find_epoch(layout, item, _values(layout, item.columns[0])) is not None]
         found = found or [item for item in numbers if counts_rows(layout, item.columns[0])] or named
     if len(found) > 1:
@@ -163,7 +163,7 @@ def _values(layout: Layout, column: int) -> NDArray[np.float64]:
 def _increases(layout: Layout, item: TimeColumn) -> bool:
     steps = np.diff(_values(layout, item.columns[0]))
     is_ordered = bool(np.count_nonzero(steps <= 0) <= MAX_SHARE_BACK * steps.size)
-    return is_ordered and layout.kind(item.columns[0]) == NUMBER
+    return is_ordered and layout.kinds[item.columns[0]] == NUMBER
 
 
 class Epoch(NamedTuple):

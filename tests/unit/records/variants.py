@@ -196,6 +196,7 @@ def _variants() -> dict[str, Variant]:
         "quoted historian": _text(table([f'"{item}"' for item in _stamps("%d-%b-%y %H:%M:%S")], cells(), ('"Time"', '"qc"', '"C"', '"T"')), start=START),
         "an index": _text(table([f"{row},{60 * row}" for row in range(ROWS)], cells(), ("", "time", "qc", "C", "T"))),
         "names that are numbers": _text(table(SECONDS, cells(), ("time", "101", "102", "103")), names={"qc": "101", "C": "102", "T": "103"}),
+        "headers of two lines": _text(table(SECONDS, cells(), ('"Time\n[s]"', '"qc\n[l/min]"', "C", '"T\n[K]"'), ";")),
         "a hint at the separator": _text("sep=;\n" + semicolon),
         "a description below the names": _text(table(SECONDS, cells(), ("Time", "qc", "C", "T"), ";", below=["Timestamp;coolant flow;concentration;temperature", "s;l/min;mol/l;K"])),
         "time since the start": _text(table([f"{row // 60:02d}:{row % 60:02d}:00" for row in range(ROWS)], cells(), ("elapsed", "qc", "C", "T"))),
