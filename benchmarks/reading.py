@@ -42,7 +42,7 @@ def write_german(path: Path, source: Path) -> None:
 
 def write_stamps(path: Path, record: Record) -> None:
     """Write a file with timestamps instead of minutes."""
-    stamps = np.datetime64("2026-03-01T08:00", "ms") + (record.time_min * 60_000).astype("timedelta64[ms]")
+    stamps = np.datetime64("2026-03-01T08:00", "ms") + np.round(record.time_min * 60_000).astype("timedelta64[ms]")
     rows = zip(stamps.astype(str), *(values.tolist() for values in record.columns.values()), strict=True)
     with path.open("w") as file:
         file.write(f"timestamp,{','.join(record.columns)}\n")

@@ -44,7 +44,7 @@ Diagnose = Annotated[
 Files = Annotated[
     list[Path],
     typer.Argument(
-        help="Records (.csv and other tables) or recordings (.mcap), folders of them, or patterns such as 'runs/*.csv'.",
+        help="Records (.csv or other tables) or recordings (.mcap), folders of them, or patterns such as 'runs/*.csv'.",
         show_default=False,
     ),
 ]
