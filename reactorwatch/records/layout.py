@@ -15,7 +15,7 @@ _SEPARATORS = {",": "comma separated", "\t": "tab separated", " ": "blank separa
 _BRACKETED = re.compile(r"\s*[\[(]([^\[\]()]+)[\])]\s*$")
 
 
-COMMENT = re.compile(rb"^[ \t]*(?:#|%|//)[^\n]*", re.MULTILINE)
+COMMENT = re.compile(rb"^[ \t]*(?:#(?!N/A|NV\b|DIV/0!|[A-Z]+[!?])|%|//)[^\n]*", re.MULTILINE)
 
 
 @dataclass(frozen=True)
