@@ -18,7 +18,7 @@ from reactorwatch.records.sniff import sniff
 from reactorwatch.records.source_text import read_text
 from reactorwatch.records.text_table import TextTable
 from reactorwatch.records.time_column import TimeColumn, choose_time, counts_rows
-from reactorwatch.records.times import Times, read_times
+from reactorwatch.records.times import Times, find_written_zero_ns, read_times
 from reactorwatch.records.write_table import RUN
 from reactorwatch.units import UnknownUnitError, conversion
 
@@ -177,6 +177,7 @@ def _make_record(
             check_values(table, source.column, columns[name])
         columns[name], units[name] = _convert(layout, source, columns[name], notes)
     minutes, zero_ns = times.since_first()
+    zero_ns = zero_ns or find_written_zero_ns(layout, time, [source.column for source in sources])
     runs = numbered_runs(table, run)
     kept = filled_rows(times, columns)
     check_times(table, time, times, minutes, runs, kept)

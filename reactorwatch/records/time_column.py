@@ -34,7 +34,7 @@ _UNIT_WORDS = {
     "h": ("h", "hr", "hrs", "hour", "hours", "std", "stunden"),
     "d": ("d", "day", "days", "tage"),
 }
-_PLAIN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
+PLAIN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 _UNIT_OF = {word: unit for unit, words in _UNIT_WORDS.items() for word in words}
 _EPOCHS = {
     1.0: (6.3e8, 4.2e9),
@@ -157,7 +157,7 @@ def counts_rows(layout: Layout, column: int) -> bool:
 def _values(layout: Layout, column: int) -> NDArray[np.float64]:
     """Numbers in the sample of a column, without cells that are none."""
     cells = [cell.strip().replace(",", ".") for cell in layout.cells(column)]
-    return np.array([float(cell) for cell in cells if _PLAIN.fullmatch(cell)])
+    return np.array([float(cell) for cell in cells if PLAIN.fullmatch(cell)])
 
 
 def _increases(layout: Layout, item: TimeColumn) -> bool:

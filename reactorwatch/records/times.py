@@ -1,6 +1,7 @@
 """Times of the rows of a table: from timestamps, numbers or a period, to minutes and a zero."""
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +10,11 @@ from numpy.typing import NDArray
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import SECONDS, FileFormat
 from reactorwatch.records.layout import Layout
-from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.records.record import MINUTE_NS, to_time_ns
 from reactorwatch.records.text_table import TextTable
-from reactorwatch.records.time_column import TimeColumn, find_epoch
-from reactorwatch.records.timestamps import DAY_NS, Pattern, parse
+from reactorwatch.records.time_column import PLAIN, TimeColumn, find_epoch
+from reactorwatch.records.timestamps import DAY_NS, Pattern, guess_pattern, parse
+from reactorwatch.records.write_table import CLOCK
 from reactorwatch.records.zones import HOUR_NS, to_utc
 
 
@@ -65,6 +67,28 @@ def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Time
     unit = column.unit or "s"
     notes = [] if column.is_standard else [f"time {name} in {unit}"]
     return Times(values / units_per_minute(unit), valid, is_clock=False, notes=notes)
+
+
+def find_written_zero_ns(layout: Layout, column: TimeColumn, taken: Collection[int]) -> int:
+    """Zero of the minutes in a table that `write_table` wrote with clock times; 0: it has none."""
+    if not column.is_standard or CLOCK not in layout.names or not layout.sample:
+        return 0
+    at = layout.names.index(CLOCK)
+    pattern = guess_pattern(layout.cells(at)[:1])
+    if at in taken or pattern is None or not pattern.has_date:
+        return 0
+    import pyarrow as pa
+
+    instants, _ = parse(pa.array(layout.cells(at)[:1]), pattern)
+    minutes = layout.cells(column.columns[0])[0].strip()
+    if (
+        column.unit != "min"
+        or not instants.valid[0]
+        or not np.isfinite(instants.offset_s[0])
+        or not PLAIN.fullmatch(minutes)
+    ):
+        return 0
+    return int(instants.local_ns[0]) - int(instants.offset_s[0]) * 1_000_000_000 - to_time_ns(float(minutes))
 
 
 def units_per_minute(unit: str) -> float:

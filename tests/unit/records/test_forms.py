@@ -109,7 +109,8 @@ def test_any_combination_of_forms_reads_to_the_same_numbers(
     tmp_path_factory: pytest.TempPathFactory, form: Form, rows: int, columns: int, seed: int
 ) -> None:
     random = np.random.default_rng(seed)
-    values = np.round(random.normal(size=(rows, columns)) * 10.0 ** random.integers(0, 4, columns), form.digits)
+    scales = 10.0 ** random.integers(0, 4, columns)
+    values = np.asarray(np.round(random.normal(size=(rows, columns)) * scales, form.digits), dtype=np.float64)
     values[1:][random.random((rows - 1, columns)) < 0.2] = np.nan
     seconds = np.cumsum(random.integers(1, 30, rows)).tolist()
     path = tmp_path_factory.mktemp("forms") / "record.csv"

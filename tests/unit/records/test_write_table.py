@@ -33,6 +33,7 @@ def test_each_form_reads_back(tmp_path: Path, suffix: str, clock: bool) -> None:
     for written in (record(ZERO_NS), join_runs([record(ZERO_NS), record(ZERO_NS)])):
         write_table(path, written, clock=clock)
         found = read_csv(path)
+        assert found.zero_ns == (ZERO_NS if clock else 0)
         if suffix == ".xlsx":  # its writer rounds to 16 digits
             for name, values in written.columns.items():
                 np.testing.assert_allclose(found.columns[name], values, rtol=1e-15)
