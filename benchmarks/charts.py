@@ -16,6 +16,8 @@ import numpy as np
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.chart_stage import ChartWatch
 from monitor_node.config import ChartName, MonitorConfig
+from monitor_node.ingest.alignment import MeasuredRow
+from monitor_node.ingest.sampling import Interval
 from reactorwatch.spc import run_length
 from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.charts.cusum import Cusum
@@ -70,7 +72,9 @@ def of_a_plant() -> None:
     """Print what all charts of a plant cost a row in the monitor."""
     rng = np.random.default_rng(2)
     learned = [Prewhitening(0.0, (0.1,), 1.0, 1000, 5e-4, 1e-3)] * 2
-    rows = rng.standard_normal((ROWS, 2)).tolist()
+    residuals = rng.standard_normal((ROWS, 2)).tolist()
+    interval = Interval(True, False, 0)
+    rows = [MeasuredRow(time_ns, 0.0, e, ["", ""], interval, True, []) for time_ns, e in enumerate(residuals)]
     kinds: tuple[tuple[ChartName, ...], ...] = (
         MonitorConfig().charts,
         tuple(kind.name for kind in CHARTS if kind.name != "parameters"),
@@ -83,8 +87,8 @@ def of_a_plant() -> None:
         watch.start(learned, e, 2e6)
 
         def run(watch: ChartWatch = watch) -> None:
-            for time_ns, e in enumerate(rows):
-                watch.update(time_ns, e, (False, False), [1.0, 1.0], ["", ""], [], points=False)
+            for row in rows:
+                watch.update(row, row.values, (False, False), [1.0, 1.0], points=False)
 
         each = best_of(run) / ROWS
         print(f"{', '.join(charts)}: {each * 1e6:.2f} us a row of one plant   (goal: 20)")

@@ -14,7 +14,7 @@ Goal: a look within 0.25 s and a row within 50 ms, for any value, any distance o
 import random
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from statistics import median
 from typing import NamedTuple
 
@@ -23,6 +23,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation, Suspect
 from monitor_node.isolation.stage import preparation
+from monitor_node.isolation.window import Row
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode
@@ -58,9 +59,11 @@ class TimedIsolation:
     def __enter__(self) -> "TimedIsolation":
         looks, original = self.looks, self._suspects
 
-        def suspects(self: Isolation, not_before_min: float = float("-inf"), since_rows: int = 0) -> list[Suspect]:
+        def suspects(
+            self: Isolation, rows: Sequence[Row], since_rows: int = 0, not_before_min: float = float("-inf")
+        ) -> list[Suspect]:
             began = time.process_time()
-            found = original(self, not_before_min, since_rows)
+            found = original(self, rows, since_rows, not_before_min)
             looks.append(Look(time.process_time() - began, self.budget.spent, self.stopped))
             return found
 
@@ -80,9 +83,7 @@ def look_at_faults(period_min: float = 0.1) -> None:
         rows = [(t, u, (c, T)) for t, u, c, T in zip(*(column.tolist() for column in columns), strict=True)]
         for after in (10, 30, 100, 300):
             isolation = Isolation(cstr(), NoiseLevels((0.002, 0.3), (0.0, 0.0)))
-            for row in rows[: 600 + after]:
-                isolation.add(*row)
-            isolation.suspects(since_rows=after)
+            isolation.suspects(rows[after : 600 + after], since_rows=after)
 
 
 def watch_bad_values(runs: int, looks: list[Look], seed: int = 1) -> list[float]:

@@ -7,14 +7,17 @@ import secrets
 import sys
 import time
 from collections.abc import Callable, Iterator
+from itertools import chain
 from math import inf
 from pathlib import Path
 
 import structlog
 
 from monitor_node.alarms.commands import COMMANDS
+from monitor_node.baseline.training_diagnosis import read_equations
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from monitor_node.diagnosis_worker import DiagnosisWorker
 from monitor_node.health import NODE
 from monitor_node.isolation import stage
 from monitor_node.other_monitors import OtherMonitors, log_report
@@ -37,6 +40,9 @@ log = structlog.get_logger()
 
 PREPARE_EVERY_NS = 100_000_000
 """Interval between two steps of the preparation, some hundredths of a second each; samples are handled between them."""
+
+LOOK_EVERY_NS = 100_000_000
+"""Interval of looks for the finding of a diagnosis."""
 
 PREPARED = object()
 """Marks the end of the preparation."""
@@ -66,7 +72,8 @@ class MonitorNode(Monitor):
         self._logged: dict[object, str] = {}
         self._rate = CommandRateLimiter()
         self.preparation: Iterator[None] | None = None
-        self._prepare_ns = start_ns
+        self._prepare_ns = self._look_ns = start_ns
+        self._worker = DiagnosisWorker()
         self.token = keys.monitor_token(config.plant, f"{start_ns:020d}-{secrets.token_hex(4)}")
         self._others = OtherMonitors(self.token, lambda: (config.plant,))
         paths = [Path(name) for name in (config.alarm_state_file, config.state_file) if name is not None]
@@ -96,6 +103,8 @@ class MonitorNode(Monitor):
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """See `Monitor`; alarms are stored and logged."""
         publications = super().on_message(message, now_ns)
+        if self.awaits_diagnosis and not self._worker.is_busy and (job := self.diagnosis_job) is not None:
+            self._worker.submit(self.config.plant, job)
         self._keep(publications, now_ns)
         return publications
 
@@ -121,6 +130,14 @@ class MonitorNode(Monitor):
             self._prepare_ns = now_ns + PREPARE_EVERY_NS
             if next(self.preparation, PREPARED) is PREPARED:
                 self.preparation = None
+        if self._worker.is_busy and now_ns >= self._look_ns:
+            self._look_ns = now_ns + LOOK_EVERY_NS
+            for _, finding in self._worker.pop_findings():
+                log.info("training diagnosed", plant=self.config.plant, verdict=finding.verdict)
+                self.on_finding(finding)
+                if finding.equations:
+                    extended = stage.preparation(self.config, read_equations(finding.equations))
+                    self.preparation = chain(self.preparation or (), extended)
         report = self.rejects.report(now_ns)
         if report is not None:
             log.warning(report)
@@ -129,13 +146,15 @@ class MonitorNode(Monitor):
         return publications
 
     def next_tick_ns(self) -> int:
-        """See `Monitor`; or the time to store the state, or to prepare the next step."""
+        """See `Monitor`; or the time to store the state, to prepare the next step, or to look for a finding."""
         stored_ns = None if self._file is None else self._file.due_ns()
         prepared_ns = None if self.preparation is None else self._prepare_ns
-        return min(item for item in (super().next_tick_ns(), stored_ns, prepared_ns) if item is not None)
+        look_ns = self._look_ns if self._worker.is_busy else None
+        return min(item for item in (super().next_tick_ns(), stored_ns, prepared_ns, look_ns) if item is not None)
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """See `Monitor`; the state is stored for the last time."""
+        self._worker.close()
         if self._file is not None:
             self._try(self._file.store)
         return super().on_stop(now_ns)

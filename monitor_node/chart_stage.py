@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from monitor_node.alarms.alarms import ChartAlarm, Explanation, chart_point
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig, PriorityName
+from monitor_node.ingest.alignment import MeasuredRow
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.spc import false_alarm_budget
@@ -64,6 +65,9 @@ def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
     return names
 
 
+_Judgements: TypeAlias = list[Judgement | None] | None
+
+
 def _without(known: list[bool], withheld: tuple[bool, ...]) -> list[bool]:
     return [here and not outlier for here, outlier in zip(known, withheld, strict=True)]
 
@@ -71,8 +75,8 @@ def _without(known: list[bool], withheld: tuple[bool, ...]) -> list[bool]:
 class _Banked:
     """Compiled charts, one an output.
 
-    `update` takes a row and returns True if any chart is out; `judgement` is that of one chart, None without a value.
-    `_OfEach` and `_OfAll` have the same methods.
+    `update` takes a row and returns the charts' judgements of it, None for a chart without a value; None in place of
+    all if no chart is out, unless `always`. `_OfEach` and `_OfAll` have the same methods.
     """
 
     def __init__(self, bank: Bank[CompiledChart], kind: type[CompiledChart]) -> None:
@@ -81,15 +85,12 @@ class _Banked:
     def to_bytes(self) -> bytes:
         return self._bank.state.to_bytes()
 
-    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
-        self._known = _without(known, withheld) if True in withheld and self._has_memory else known
-        return self._bank.judge(e, self._known)
-
-    def judgement(self, index: int) -> Judgement | None:
-        return self._bank.judgement(index) if self._known[index] else None
+    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...], *, always: bool) -> _Judgements:
+        present = _without(known, withheld) if True in withheld and self._has_memory else known
+        return self._bank.judge(e, present, always=always)
 
     def restart(self, index: int) -> None:
-        self._bank.restart(np.arange(len(self._known)) == index)
+        self._bank.restart(index)
 
     def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
         return self._bank.chart(index).explain(judgement, signals[index])
@@ -100,21 +101,18 @@ class _OfEach:
 
     def __init__(self, charts: Sequence[SignalChart]) -> None:
         self._charts = charts
-        self._judgements: list[Judgement | None] = []
 
     def to_bytes(self) -> bytes:
         return msgspec.msgpack.encode([item.state.to_bytes() for item in self._charts])
 
-    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
+    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...], *, always: bool) -> _Judgements:
         if True in withheld and self._charts[0].has_memory:
             known = _without(known, withheld)
-        self._judgements = [
+        judgements = [
             item.update(value) if here else None for item, value, here in zip(self._charts, e, known, strict=True)
         ]
-        return any(judgement is not None and judgement.out for judgement in self._judgements)
-
-    def judgement(self, index: int) -> Judgement | None:
-        return self._judgements[index]
+        is_out = any(judgement is not None and judgement.out for judgement in judgements)
+        return judgements if is_out or always else None
 
     def restart(self, index: int) -> None:
         self._charts[index].restart()
@@ -135,24 +133,19 @@ class _OfAll:
         self._chart = joint
         self._evaluated, self._all = evaluated, all(evaluated)
         self._last: list[float] = []
-        self._judgement: Judgement | None = None
 
     def to_bytes(self) -> bytes:
         return self._chart.state.to_bytes()
 
-    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
-        """Update with a row; returns True if the chart is out. A row with a missing output is skipped."""
+    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...], *, always: bool) -> _Judgements:
+        """Update with a row; a row with a missing output is skipped."""
         if not self._all:
             e, known = list(compress(e, self._evaluated)), list(compress(known, self._evaluated))
         if False in known or True in withheld:
-            self._judgement = None
-            return False
+            return None
         self._last = e
-        self._judgement = self._chart.update(e)
-        return self._judgement.out
-
-    def judgement(self, index: int) -> Judgement | None:
-        return self._judgement
+        judgement = self._chart.update(e)
+        return [judgement] if judgement.out or always else None
 
     def restart(self, index: int) -> None:
         self._chart.restart()
@@ -296,61 +289,46 @@ class ChartWatch:
             self._watched[name] = _Watched(made(chart(name)), alarms, paths, all(alarm.is_idle for alarm in alarms))
 
     def update(
-        self,
-        time_ns: int,
-        e: list[float],
-        withheld: tuple[bool, ...],
-        scales: list[float],
-        units: list[str],
-        publications: list[Publication],
-        *,
-        points: bool,
-    ) -> bool:
-        """Judge a row.
+        self, row: MeasuredRow, e: list[float], withheld: tuple[bool, ...], scales: list[float], *, points: bool
+    ) -> None:
+        """Evaluate a row.
 
         Args:
-            time_ns: time of the row.
-            e: the prewhitened residuals; NaN where there is none.
+            row: the row; points and alarms are added to its publications.
+            e: prewhitened residuals; NaN where there is none.
             withheld: outputs whose value may be an outlier and must not enter a memory yet.
             scales: one standard deviation of each, in the outputs' units.
-            units: units of the outputs.
-            publications: messages to publish are added here.
-            points: whether the charts' points are to be published.
-
-        Returns:
-            Whether an alarm was raised.
+            points: True to publish the charts' points.
         """
-        raised = False
+        publications = row.publications
         known = [size == size for size in e]  # NaN is not equal to itself
         for watched in self._watched.values():
-            out = watched.charts.update(e, known, withheld)
-            if not (out or points) and watched.at_rest:
+            judgements = watched.charts.update(e, known, withheld, always=points or not watched.at_rest)
+            if judgements is None:
                 continue
-            for index, alarm in enumerate(watched.alarms):
-                judgement = watched.charts.judgement(index)
+            for index, (alarm, judgement) in enumerate(zip(watched.alarms, judgements, strict=True)):
                 if judgement is None:
                     continue
                 if points:
-                    publications.append(Publication(watched.keys[index], chart_point(time_ns, judgement)))
+                    publications.append(Publication(watched.keys[index], chart_point(row.time_ns, judgement)))
                 rule = alarm.memory.rule
-                if judgement.out or rule.standing or rule.recent:
-                    stood = rule.standing
-                    explain = None if stood else self._explaining(watched.charts, index, scales, units)
-                    publications.extend(self._board.evaluate(alarm, time_ns, judgement, SD, explain))
-                    raised |= rule.standing and not stood
-                    if stood and not rule.standing:
-                        watched.charts.restart(index)
-            watched.at_rest = all(alarm.is_idle for alarm in watched.alarms)
-        return raised
+                if not (judgement.out or rule.standing or rule.recent):
+                    continue
+                raised = alarm.update(judgement)
+                if raised is None:
+                    continue
+                explanation = self._explain(watched.charts, index, judgement, scales, row.units) if raised else None
+                publications.append(self._board.record_change(alarm, row.time_ns, judgement, SD, explanation))
+                if not raised:
+                    watched.charts.restart(index)
+            rules = [alarm.memory.rule for alarm in watched.alarms]
+            watched.at_rest = not any(rule.standing or rule.recent for rule in rules)
 
-    def _explaining(
-        self, charts: _Charts, index: int, scales: list[float], units: list[str]
-    ) -> Callable[[Judgement], Explanation]:
-        def explain(judgement: Judgement) -> Explanation:
-            signals = [Shown(*item) for item in zip(self._config.outputs, units, scales, self._passed, strict=True)]
-            return Explanation(*charts.explain(index, judgement, signals))
-
-        return explain
+    def _explain(
+        self, charts: _Charts, index: int, judgement: Judgement, scales: list[float], units: list[str]
+    ) -> Explanation:
+        signals = [Shown(*item) for item in zip(self._config.outputs, units, scales, self._passed, strict=True)]
+        return Explanation(*charts.explain(index, judgement, signals))
 
 
 def _of_each(kind: type[SignalChart], charts: list[SignalChart]) -> _Charts:

@@ -46,6 +46,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         delay: delay of the input in samples; with 1 it acts on the next sample.
         forgetting: forgetting factor of the adaptive model, in [0.5, 1]; with 1 it forgets nothing.
         training_min: duration of the training, in minutes of the plant.
+        diagnose_training: true to diagnose the training, beside the watch, and to judge the plant by the equations with
+            the deviations that it had from the start.
         reference: model that predicts the rows: `process`, the filter of the reactor's equations; `arx`, the identified
             model as fitted to the training; `auto`, the first if it predicts the training about as well as the second,
             else the second.
@@ -79,6 +81,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
     forgetting: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.999
     training_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] = 100.0
+    diagnose_training: bool = True
     reference: Literal["auto", "process", "arx"] = "auto"
     model: str | None = None
     charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")

@@ -6,15 +6,18 @@ Nothing here reads a clock: `now_ns` only gives up-time and the time of health m
 follow from its samples and from operators' actions. So a replay reproduces them, value for value.
 """
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.alarms.commands import execute_command
+from monitor_node.baseline.model_update import ScheduledChange
 from monitor_node.baseline.training import NO_VALUE
+from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.failures import Failures
-from monitor_node.health import NODE, health_message
+from monitor_node.health import NODE, Processed, health_message
 from monitor_node.ingest.alignment import Aligner, Row
 from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, ReceiveStats
 from monitor_node.ingest.rejects import RejectCounter
@@ -22,10 +25,11 @@ from monitor_node.ingest.replay_filter import ReplayFilter
 from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, reject_reason
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from monitor_node.pipeline import PlantPipeline
+from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, CommandReply, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -39,6 +43,8 @@ class Monitor:
         start_ns: present time.
         points: True to publish estimates and chart points; a back-test does without.
         model: process model, in minutes since 1970-01-01 UTC; None: the nominal reactor.
+        diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`, and
+            hands the result to `on_finding`.
 
     Raises:
         InputError: the settings are inconsistent.
@@ -51,14 +57,22 @@ class Monitor:
         last_ns: time of the last row; None before the first.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
         received: number of messages so far.
-        not_stored: number of failures to store the state, counted by the storage.
+        stats: statistics by receive time, which a restart resets.
     """
 
     def __init__(
-        self, config: MonitorConfig, start_ns: int, *, points: bool = True, model: ProcessModel | None = None
+        self,
+        config: MonitorConfig,
+        start_ns: int,
+        *,
+        points: bool = True,
+        model: ProcessModel | None = None,
+        diagnose: Callable[[DiagnosisJob], Finding] | None = None,
     ) -> None:
         self.config = config
-        self._points, self._model = points, model
+        self._points, self._model, self._diagnose = points, model, diagnose
+        self._changes: deque[ScheduledChange] = deque()
+        self._republishes_baseline = False
         self._settings: dict[str, Any] | None = None
         self.rejects = RejectCounter()
         self.failures = Failures()
@@ -78,13 +92,8 @@ class Monitor:
         self.span_ns = 0
         self._watching_since_ns: int | None = None
         self.received = 0
-        self.not_stored = 0
-        self._stalls, self._ticked = 0, False
+        self.stats = ReceiveStats(start_ns, start_ns)
         self._published = 0
-        self._heard_ns = 0
-        self._lag_ns = 0
-        self._start_ns = start_ns
-        self._health_due_ns = start_ns
         self._snapshot_due_ns: int | None = None
         self._snapshot_ns = int(config.snapshot_min * MINUTE_NS)
 
@@ -93,8 +102,8 @@ class Monitor:
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Process a message on a key of the plant's samples; returns publications."""
         self.received += 1
-        if message.received_ns and now_ns - message.received_ns > self._lag_ns:
-            self._lag_ns = now_ns - message.received_ns
+        if message.received_ns and now_ns - message.received_ns > self.stats.lag_ns:
+            self.stats.lag_ns = now_ns - message.received_ns
         signal = self._signal_by_key.get(message.key)
         if signal is None:
             self.rejects.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
@@ -126,7 +135,7 @@ class Monitor:
         publications: list[Publication] = []
         time_ns, number = sample.time_ns, sample.sequence
         run, is_accepted = self._runs[self._indices[signal]], True
-        if run.accept_next(time_ns, number):  # as nearly always
+        if run.accept_next(number, time_ns):  # as nearly always
             self._accept(signal, time_ns, number, value, sample.unit, publications)
         elif not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):
             self.rejects.add(
@@ -140,9 +149,9 @@ class Monitor:
                 self._reject(signal, item, run)
             for item in accepted:
                 self._accept(signal, *item, publications)
-        if is_accepted and now_ns >= self._heard_ns + HEARD_AGAIN_NS:
-            self._heard_ns = now_ns
-            self._pipeline.signals.on_receipt(now_ns)
+        if is_accepted and now_ns >= self.stats.heard_ns + HEARD_AGAIN_NS:
+            self.stats.heard_ns = now_ns
+            self._silence.of_plant.on_receipt(now_ns)
         self._published += len(publications)
         return publications
 
@@ -178,23 +187,23 @@ class Monitor:
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Publish health if it is due; raise the alarm of a plant without data."""
-        if self._ticked and now_ns - self._due_ns() > STALL_NS:
-            self._stalls += 1
-        self._ticked = True
+        if self.stats.ticked and now_ns - self.next_tick_ns() > STALL_NS:
+            self.stats.stalls += 1
+        self.stats.ticked = True
         publications = self._check_timeout(now_ns)
+        if self._republishes_baseline and self.baseline is not None:
+            publications.append(Publication(keys.key(self.config.plant, keys.BASELINE, NODE), self.baseline))
+        self._republishes_baseline = False
         self._published += len(publications)
-        if now_ns >= self._health_due_ns:
-            self._health_due_ns = now_ns + int(self.config.health_period_s * 1e9)
+        if now_ns >= self.stats.health_due_ns:
+            self.stats.health_due_ns = now_ns + int(self.config.health_period_s * 1e9)
             publications.append(self._health(now_ns, self.phase))
         return publications
 
     def next_tick_ns(self) -> int:
         """Time when health or the plant's data timeout is due."""
-        return self._due_ns()
-
-    def _due_ns(self) -> int:
-        overdue_ns = self._pipeline.signals.due_ns()
-        return self._health_due_ns if overdue_ns is None else min(self._health_due_ns, overdue_ns)
+        overdue_ns = self._silence.of_plant.due_ns()
+        return self.stats.health_due_ns if overdue_ns is None else min(self.stats.health_due_ns, overdue_ns)
 
     @property
     def finished(self) -> bool:
@@ -257,10 +266,11 @@ class Monitor:
         try:
             pipeline = self._new_pipeline(board)
             board.from_bytes(state.board)
-            pipeline.restore(state.watch, self._start_ns)
+            pipeline.restore(state.watch, self.stats.start_ns)
         except ValueError as error:
             raise InputError(f"is no state of this software's monitor: {error}") from error
         self.alarms, self._pipeline = board, pipeline
+        self._republishes_baseline = True  # it may not have been published before the stop
         self._runs = state.runs
         self._aligner.state, self._replay_filter = state.alignment, ReplayFilter(state.alignment)
         self._units, self._heard_from_ns = state.units, state.heard_from_ns
@@ -297,7 +307,7 @@ class Monitor:
             InputError: see `Annunciator.from_bytes`; nothing has changed.
         """
         self.alarms.from_bytes(data)
-        self._pipeline.signals.resume_from_alarms()
+        self._silence.resume_from_alarms()
 
     def resume_from_alarms(self, alarms: Iterable[Alarm]) -> None:
         """Resume from the alarms that another monitor of the plant published last, without its state.
@@ -308,34 +318,37 @@ class Monitor:
             alarms: the newest message of each alarm.
         """
         self.alarms.resume_from(alarms)
-        self._pipeline.signals.resume_from_alarms()
+        self._silence.resume_from_alarms()
 
     @property
-    def receive_stats(self) -> ReceiveStats:
-        """Statistics by receive time, which a restart resets."""
-        received_ns, counted_ns = self._pipeline.signals.receipts_ns
-        return ReceiveStats(
-            self._start_ns,
-            self._heard_ns,
-            received_ns,
-            counted_ns,
-            self._lag_ns,
-            self._health_due_ns,
-            self._ticked,
-            self._stalls,
-            self.not_stored,
-        )
+    def changes(self) -> int:
+        """Count of changes that a restart must preserve: of alarms and of the baseline."""
+        return self.alarms.changes + (0 if self.baseline is None else self.baseline.id)
 
-    @receive_stats.setter
-    def receive_stats(self, receive_stats: ReceiveStats) -> None:
-        self._start_ns, self._heard_ns, self._lag_ns = (
-            receive_stats.start_ns,
-            receive_stats.heard_ns,
-            receive_stats.lag_ns,
-        )
-        self._pipeline.signals.receipts_ns = receive_stats.received_ns, receive_stats.counted_ns
-        self._health_due_ns, self._ticked = receive_stats.health_due_ns, receive_stats.ticked
-        self._stalls, self.not_stored = receive_stats.stalls, receive_stats.not_stored
+    # --- diagnosis of the training ---------------------------------------------------------------------------
+
+    @property
+    def awaits_diagnosis(self) -> bool:
+        """True while there is a `diagnosis_job`."""
+        return self._pipeline.awaits_diagnosis
+
+    @property
+    def diagnosis_job(self) -> DiagnosisJob | None:
+        """The diagnosis of the training, from its end until `on_finding`; None: there is none to make."""
+        return self._pipeline.diagnosis_job
+
+    def on_finding(self, finding: Finding) -> None:
+        """Process the result of `diagnosis_job`; what it found holds from the next row on."""
+        self._pipeline.on_finding(finding)
+
+    def schedule(self, baseline: Baseline) -> None:
+        """Schedule a recorded change of the baseline for the row that it names."""
+        self._changes.append(ScheduledChange(baseline.time_ns, baseline))
+
+    @property
+    def baseline(self) -> Baseline | None:
+        """Change of the baseline in force; None: rows are evaluated by the equations as given."""
+        return self._pipeline.baseline
 
     # --- status ----------------------------------------------------------------------------------------------
 
@@ -408,13 +421,26 @@ class Monitor:
     # --- replay of timeouts ----------------------------------------------------------------------------------
 
     @property
+    def _silence(self) -> SilenceCheck:
+        return self._pipeline.signals.silence
+
+    @property
+    def receipts_ns(self) -> tuple[int | None, int | None]:
+        """See `DataTimeout.receipts_ns`, of the plant."""
+        return self._silence.of_plant.receipts_ns
+
+    @receipts_ns.setter
+    def receipts_ns(self, receipts_ns: tuple[int | None, int | None]) -> None:
+        self._silence.of_plant.receipts_ns = receipts_ns
+
+    @property
     def timeout_deadline_ns(self) -> int | None:
         """Sample time at which the plant's data timeout expires; None if unknown."""
-        return self._pipeline.signals.deadline_ns
+        return self._silence.of_plant.deadline_ns()
 
     def declare_timeout(self) -> list[Publication]:
         """Declare a data timeout that was recorded, where the receive time expired it."""
-        return self._pipeline.signals.declare_timeout()
+        return self._silence.declare_timeout()
 
     # --- rows ------------------------------------------------------------------------------------------------
 
@@ -464,7 +490,7 @@ class Monitor:
 
     def _check_timeout(self, now_ns: int) -> list[Publication]:
         try:
-            return self._pipeline.signals.check(now_ns)
+            return self._silence.check(now_ns)
         except Exception as error:  # noqa: BLE001 # the plant's border, see `_on_row`
             self._contain("silence", error)
             return []
@@ -472,7 +498,15 @@ class Monitor:
     # --- after an error of this software ---------------------------------------------------------------------
 
     def _new_pipeline(self, board: Annunciator) -> PlantPipeline:
-        return PlantPipeline(self.config, board, points=self._points, model=self._model, failures=self.failures)
+        return PlantPipeline(
+            self.config,
+            board,
+            points=self._points,
+            model=self._model,
+            failures=self.failures,
+            changes=self._changes,
+            diagnose=self._diagnose,
+        )
 
     def _contain(self, stage: str, error: Exception) -> None:
         """Contain an error: count it and train again, as the pipeline's state may be inconsistent.
@@ -481,9 +515,10 @@ class Monitor:
         """
         self.failures.add(stage, error, "the plant is learned again, its alarms stay")
         alarms = self.alarms.all_alarms()
-        notes, receipts_ns = self._pipeline.notes, self._pipeline.signals.receipts_ns
+        self._changes = deque(item for item in self._changes if item.at_ns is not None)  # findings on its training
+        notes, receipts_ns = self._pipeline.notes, self.receipts_ns
         self._pipeline = self._new_pipeline(self.alarms)
-        self._pipeline.notes, self._pipeline.signals.receipts_ns = notes, receipts_ns
+        self._pipeline.notes, self.receipts_ns = notes, receipts_ns
         self._watching_since_ns = None
         self.resume_from_alarms(alarms)
 
@@ -491,18 +526,17 @@ class Monitor:
         health = health_message(
             now_ns,
             phase,
-            self._start_ns,
-            self._aligner.state.counts,
-            self.rejects.by_reason,
-            received=self.received,
-            published=self._published,
-            lag_ns=self._lag_ns,
-            heard_from_ns=self._heard_from_ns,
-            not_stored=self.not_stored,
-            stalls=self._stalls,
-            failures=self.failures.by_stage,
+            Processed(
+                self._aligner.state.counts,
+                self.received,
+                self._published,
+                self.rejects.by_reason,
+                self.failures.by_stage,
+                self._heard_from_ns,
+            ),
+            self.stats,
             reference=self._pipeline.reference,
             training=self._pipeline.trained_share(self.last_ns),
         )
-        self._lag_ns = 0
+        self.stats.lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

@@ -5,7 +5,6 @@ without anything being wrong. With `parameters` among the charts it raises one, 
 alarms.
 """
 
-from collections.abc import Callable
 from itertools import compress
 
 from monitor_node.alarms.alarms import Explanation, chart_point
@@ -15,7 +14,6 @@ from monitor_node.config import MonitorConfig
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.parameters import ParameterT2
 
 ROWS = 50
@@ -95,7 +93,7 @@ class DriftWatch:
             predictors: the predictors given to `start`.
         """
         self.until_next -= 1
-        if self.until_next or not self.wanted:
+        if self.until_next:
             return []
         self.until_next = ROWS
         publications: list[Publication] = []
@@ -106,13 +104,14 @@ class DriftWatch:
             judgement, parts = found
             if self._publish:
                 publications.append(Publication(key, chart_point(time_ns, judgement)))
-            if signal in self._alarms:
-                explain = _explaining(signal, parts)
-                publications += self._board.evaluate(self._alarms[signal], time_ns, judgement, "", explain)
+            alarm = self._alarms.get(signal)
+            if alarm is not None and (raised := alarm.update(judgement)) is not None:
+                explanation = _explain(signal, parts) if raised else None
+                publications.append(self._board.record_change(alarm, time_ns, judgement, "", explanation))
         return publications
 
 
-def _explaining(signal: str, parts: dict[str, float]) -> Callable[[Judgement], Explanation]:
+def _explain(signal: str, parts: dict[str, float]) -> Explanation:
     largest = sorted(parts, key=lambda name: -parts[name])[:NAMED]
     text = f"the model of {signal} that adapts has drifted from its reference, most in {' and '.join(largest)}"
-    return lambda _: Explanation(text, {signal: 1.0})
+    return Explanation(text, {signal: 1.0})

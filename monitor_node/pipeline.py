@@ -6,10 +6,12 @@ that keeps adapting would learn a fault as normal. The identified models keep ad
 the reference is charted as drift.
 """
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from math import isfinite, nan
 
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.predictor import ArxPredictor
 from monitor_node.baseline.references import (
     ArxReference,
@@ -19,19 +21,22 @@ from monitor_node.baseline.references import (
     Reference,
 )
 from monitor_node.baseline.signal_range import signal_ranges
-from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult
+from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
+from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
 from monitor_node.chart_stage import ChartWatch, alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
-from monitor_node.ingest.alignment import Row
+from monitor_node.health import NODE
+from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.signal_checks.stage import SignalChecks
+from monitor_node.state.monitor_state import equations_text
 from monitor_node.state.pipeline_state import PipelineState, TrainedState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Check, Estimate, ModelSnapshot, Parameter
+from reactorwatch.contract.messages_pb2 import Baseline, Check, Estimate, ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
@@ -66,6 +71,8 @@ class PlantPipeline:
         points: True to publish estimates, chart points and models.
         model: see `Monitor`.
         failures: counter of errors in the search for causes; None: a new one.
+        changes: changes of the baseline to come.
+        diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`.
 
     Raises:
         InputError: the settings ask for a process model that does not fit the plant's signals.
@@ -86,8 +93,12 @@ class PlantPipeline:
         points: bool = True,
         model: ProcessModel | None = None,
         failures: Failures | None = None,
+        changes: deque[ScheduledChange] | None = None,
+        diagnose: Callable[[DiagnosisJob], Finding] | None = None,
     ) -> None:
         self._config = config
+        self._update = ModelUpdate(config, deque() if changes is None else changes)
+        self._diagnose = diagnose
         self._failures = Failures() if failures is None else failures
         self._board = board
         self._points = points
@@ -98,6 +109,7 @@ class PlantPipeline:
         self.signals = SignalChecks(config, board, signal_ranges(self.model, (config.input, *config.outputs)))
         self._drift = DriftWatch(config, board, publish=points)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
+        self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
         self._refusals = 0
         self._checks: list[Check] = []
@@ -125,7 +137,7 @@ class PlantPipeline:
             [predictor.state for predictor in self._predictors],
             self._refusals,
             self._began_ns,
-            self._training.state,
+            self._update.rows or self._training.state,
             None if self._reference is None else self._trained_state(self._reference),
         )
 
@@ -141,6 +153,7 @@ class PlantPipeline:
             list(self._quarantined),
             self.rows_watched,
             self._drift.until_next,
+            b"" if self.baseline is None else self.baseline.SerializeToString(),
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -158,10 +171,14 @@ class PlantPipeline:
         for predictor, of_predictor in zip(self._predictors, state.predictors, strict=True):
             predictor.restore(of_predictor)
         self._refusals, self._began_ns = state.refusals, state.began_ns
-        self._training.restore(state.training)
         watched = state.watched
         if watched is None:
+            self._training.restore(state.training)
             return
+        if state.training.times_ns and self._config.diagnose_training:
+            self._update.rows = state.training
+        if watched.baseline:
+            self._update.baseline = Baseline.FromString(watched.baseline)
         self._drift.until_next = watched.until_drift
         self._checks = [Check(name=name, result=result) for name, result in watched.checks]
         learned = [item.learned for item in watched.whiteners]
@@ -183,7 +200,29 @@ class PlantPipeline:
             return ArxReference.from_state(state)
         if self.model is None:
             raise ValueError("the state must be of a plant without a process model")
-        return ProcessReference.from_state(state, self.model, self._config.outputs)
+        model = self.model if self.baseline is None else read_equations(self.baseline.model)
+        return ProcessReference.from_state(state, model, self._config.outputs)
+
+    @property
+    def awaits_diagnosis(self) -> bool:
+        """True while the diagnosis of the training is pending."""
+        return self._update.is_pending
+
+    @property
+    def diagnosis_job(self) -> DiagnosisJob | None:
+        """The diagnosis of the training, while it is pending."""
+        return self._update.job(equations_text(self.model)) if self._update.is_pending else None
+
+    def on_finding(self, finding: Finding) -> None:
+        """Process the result of a diagnosis; a change holds from the next row on."""
+        note = self._update.resolve(finding)
+        if note and (finding.equations or isinstance(self._reference, ProcessReference)):
+            self.notes.append(note)
+
+    @property
+    def baseline(self) -> Baseline | None:
+        """Change of the model in force; None: the model is as given."""
+        return self._update.baseline
 
     @property
     def watching(self) -> bool:
@@ -224,19 +263,23 @@ class PlantPipeline:
         Args:
             row: values, the input first.
             units: units of the outputs.
-            publications: list to which publications are added.
+            publications: list to which publications are added; those before an error are published nevertheless.
         """
         time_ns = row.time_ns
-        follows = self._sampling.follows(time_ns) and not row.restarted
+        if self._update.changes:
+            self._change_model(time_ns, publications)
+        interval = self._sampling.update(time_ns)
         publications.extend(self.signals.check_row(time_ns, row.values))
         measured = self.signals.mask_values(time_ns, row.values, publications) if self._is_process else row.values
         input_value, *values = measured
+        follows = interval.follows and not row.restarted
+        measured_row = MeasuredRow(time_ns, input_value, values, units, interval, follows, publications)
         if self._reference is None:
-            self._train(time_ns, input_value, values, units, publications, follows=follows)
+            self._train(measured_row)
         else:
             if row.restarted:
                 self.signals.reset()
-            self._evaluate(time_ns, input_value, values, units, publications, follows=follows)
+            self._evaluate(measured_row)
 
     def snapshots(self, time_ns: int) -> list[Publication]:
         """Snapshots of each output's models: the adaptive one, the one fitted to the training, and the reference.
@@ -272,24 +315,16 @@ class PlantPipeline:
         ]
         self._training: Training = Training(config, self.model, self._predictors)
 
-    def _train(
-        self,
-        time_ns: int,
-        input_value: float,
-        values: list[float],
-        units: list[str],
-        publications: list[Publication],
-        *,
-        follows: bool,
-    ) -> None:
-        config = self._config
+    def _train(self, row: MeasuredRow) -> None:
+        config, time_ns, values, publications = self._config, row.time_ns, row.values, row.publications
         if not self._promise_checked and self._sampling.state.period_ns is not None:
             check_promise(config, self._sampling.period_ns / MINUTE_NS)
             self._promise_checked = True
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
         trained_min = (time_ns - self._began_ns) / MINUTE_NS
-        if trained_min >= config.training_min and self._training.is_enough(self.signals.timeout_flags[1:]):
+        if trained_min >= config.training_min and self._training.is_enough(self.signals.silence.silent[1:]):
+            rows = self._training.state
             trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
             if trained.refused:
                 self._refusals += 1
@@ -297,22 +332,33 @@ class PlantPipeline:
                 self._start_training(time_ns)
             else:
                 self._start(trained)
-                self._evaluate(time_ns, input_value, values, units, publications, follows=follows)
+                self._start_diagnosis(rows)
+                self._change_model(time_ns, publications)
+                self._evaluate(row)
                 publications.extend(self.snapshots(time_ns))
                 return
-        self._training.add(time_ns, input_value, values)
+        self._training.add(time_ns, row.input_value, values)
         if not self._points:
-            for predictor, value in zip(self._predictors, values, strict=True):
-                predictor.buffer(time_ns, input_value, value, follows=follows)
+            self._buffer(row)
         else:
-            predictions = [
-                predictor.update(time_ns, input_value, value, follows=follows)
-                for predictor, value in zip(self._predictors, values, strict=True)
-            ]
-            for key, prediction, value, unit in zip(self._estimate_keys, predictions, values, units, strict=True):
+            for key, prediction, value, unit in zip(
+                self._estimate_keys, self._predict(row), values, row.units, strict=True
+            ):
                 residual = value - prediction
                 if isfinite(residual):
                     publications.append(Publication(key, _estimate(time_ns, prediction, residual, unit)))
+
+    def _predict(self, row: MeasuredRow) -> list[float]:
+        """Predict each output by its identified model, which is updated with the row."""
+        return [
+            predictor.update(row.time_ns, row.input_value, value, follows=row.follows)
+            for predictor, value in zip(self._predictors, row.values, strict=True)
+        ]
+
+    def _buffer(self, row: MeasuredRow) -> None:
+        """Buffer a row for the identified models, whose predictions nothing needs now."""
+        for predictor, value in zip(self._predictors, row.values, strict=True):
+            predictor.buffer(row.time_ns, row.input_value, value, follows=row.follows)
 
     def _leave_out(self, left_out: dict[str, str]) -> None:
         """Exclude signals from monitoring."""
@@ -325,7 +371,39 @@ class PlantPipeline:
         of_signals = SignalChecks.CHANCE_ALARMS * sum(self._evaluated)
         return self._charts.chance_alarms + of_signals + self._drift.chance_alarms(self._evaluated)
 
-    def _start(self, trained: TrainingResult) -> None:
+    def _start_diagnosis(self, rows: TrainingState) -> None:
+        if self._config.diagnose_training and equations_text(self.model):
+            self._update.rows = rows
+        if self._diagnose is not None and (job := self.diagnosis_job) is not None:
+            self.on_finding(self._diagnose(job))
+
+    def _change_model(self, time_ns: int, publications: list[Publication]) -> None:
+        """Learn the baseline again with the model of a change, if one holds from this row on."""
+        change = self._update.pop_due(time_ns)
+        if change is None:
+            return
+        try:
+            trained = self._update.relearn(change, self._predictors)
+        except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
+            self._failures.add("baseline", error, "the plant is judged by the equations as given")
+            return
+        if trained is None:
+            self.notes.append("the identified models predict the training better; the baseline stays as it is")
+            return
+        self._start(trained, again=True)
+        publications.append(Publication(self._baseline_key, change))
+        if self.rows_watched:  # the filter stands at the end of the training, and rows have come since
+            trained.reference.restart()
+            self._quarantined = (False,) * len(self._config.outputs)
+            publications.extend(self.snapshots(time_ns))
+
+    def _start(self, trained: TrainingResult, *, again: bool = False) -> None:
+        """Start to evaluate rows.
+
+        Args:
+            trained: result of the training.
+            again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
+        """
         self._leave_out(trained.left_out)
         unmade = self._charts.choose(self._evaluated, trained.e)
         trained.checks.extend(
@@ -346,7 +424,8 @@ class PlantPipeline:
         self._whiteners = [Prewhitener(item) for item in trained.learned]
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
-        self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
+        if not again:
+            self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
 
@@ -362,13 +441,11 @@ class PlantPipeline:
             return None
         return Suspicion(self._config, self._board, reference)
 
-    def _search_causes(
-        self, time_ns: int, input_value: float, values: list[float], units: list[str], stuck: list[bool]
-    ) -> list[Publication]:
+    def _search_causes(self, row: MeasuredRow, stuck: Sequence[bool]) -> list[Publication]:
         """Search the causes of alarms; an error there costs the state of the search, and no alarm."""
         assert self._suspicion is not None
         try:
-            return self._suspicion.update(time_ns, input_value, values, units, stuck)
+            return self._suspicion.update(row.time_ns, row.input_value, row.values, row.units, list(stuck))
         except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
             self._failures.add("isolation", error, "the search for the cause of this alarm starts again")
             assert self._reference is not None
@@ -377,44 +454,33 @@ class PlantPipeline:
 
     # --- monitoring ------------------------------------------------------------------------------------------
 
-    def _evaluate(
-        self,
-        time_ns: int,
-        input_value: float,
-        values: list[float],
-        units: list[str],
-        publications: list[Publication],
-        *,
-        follows: bool,
-    ) -> None:
-        reference = self._reference
+    def _evaluate(self, row: MeasuredRow) -> None:
+        reference, time_ns, units, publications = self._reference, row.time_ns, row.units, row.publications
         assert reference is not None
         if self.left_out:
-            self._note_late_signals(input_value, values)
-            input_value = 0.0 if self._config.input in self.left_out else input_value  # as in the training
-            values = [value if evaluated else nan for value, evaluated in zip(values, self._evaluated, strict=True)]
-        publications.extend(self.signals.check_values(time_ns, values, units))
-        stuck = self.signals.invalid_outputs
-        if True in stuck:
-            values = [nan if still else value for value, still in zip(values, stuck, strict=True)]
-        if isinstance(reference, ArxReference):
-            reference.predictions = [
-                predictor.update(time_ns, input_value, value, follows=follows)
-                for predictor, value in zip(self._predictors, values, strict=True)
+            self._note_late_signals(row.input_value, row.values)
+            row.input_value = 0.0 if self._config.input in self.left_out else row.input_value  # as in the training
+            row.values = [
+                value if evaluated else nan for value, evaluated in zip(row.values, self._evaluated, strict=True)
             ]
+        publications.extend(self.signals.check_values(time_ns, row.values, units))
+        stuck = self.signals.invalid()
+        if True in stuck:
+            row.values = [nan if still else value for value, still in zip(row.values, stuck, strict=True)]
+        values = row.values
+        if isinstance(reference, ArxReference):
+            reference.predictions = self._predict(row)
         elif self._drift.wanted:
-            for predictor, value in zip(self._predictors, values, strict=True):
-                predictor.buffer(time_ns, input_value, value, follows=follows)
-        if self._sampling.gap:  # the input in it is unknown
+            self._buffer(row)
+        if row.interval.is_gap:  # the input in it is unknown
             reference.restart()
             self.signals.restart()
             for whitener in self._whiteners:
                 whitener.restart()
-        missing = self._sampling.missing
-        predictions, sds = reference.update(time_ns, input_value, values, self._quarantined, missing)
+        predictions, sds = reference.update(time_ns, row.input_value, values, self._quarantined, row.interval.missing)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
-            publications.extend(self._estimates(time_ns, values, predictions, sds, scales, units))
+            publications.extend(self._estimates(row, predictions, sds, scales))
         e = [
             whitener.update((value - prediction) / sd)
             for whitener, value, prediction, sd in zip(self._whiteners, values, predictions, sds, strict=True)
@@ -425,10 +491,11 @@ class PlantPipeline:
             for whitener, outlier in zip(self._whiteners, quarantined, strict=True):
                 if outlier:
                     whitener.reject_last()
-        self._charts.update(time_ns, e, quarantined, scales, units, publications, points=self._points)
-        publications.extend(self._drift.update(time_ns, self._predictors))
+        self._charts.update(row, e, quarantined, scales, points=self._points)
+        if self._drift.wanted:
+            publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
-            publications.extend(self._search_causes(time_ns, input_value, values, units, stuck))
+            publications.extend(self._search_causes(row, stuck))
 
     def _note_late_signals(self, input_value: float, values: list[float]) -> None:
         """Note once each signal whose first value arrives after the training."""
@@ -440,23 +507,17 @@ class PlantPipeline:
                 )
 
     def _estimates(
-        self,
-        time_ns: int,
-        values: list[float],
-        predictions: Sequence[float],
-        sds: Sequence[float],
-        scales: list[float],
-        units: list[str],
+        self, row: MeasuredRow, predictions: Sequence[float], sds: Sequence[float], scales: list[float]
     ) -> Iterator[Publication]:
         """Estimates of a row, made before the prewhitening filter is updated with it."""
         for index, whitener in enumerate(self._whiteners):
-            prediction, residual = predictions[index], values[index] - predictions[index]
+            prediction, residual = predictions[index], row.values[index] - predictions[index]
             if isfinite(residual):
                 usual, reach = (
                     prediction + sds[index] * whitener.expected_value(),
                     scales[index] * self._charts.widths[index],
                 )
-                estimate = _estimate(time_ns, prediction, residual, units[index])
+                estimate = _estimate(row.time_ns, prediction, residual, row.units[index])
                 estimate.residual_sd = scales[index]
                 estimate.lower_limit, estimate.upper_limit = usual - reach, usual + reach
                 yield Publication(self._estimate_keys[index], estimate)

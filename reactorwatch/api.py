@@ -17,6 +17,7 @@ import msgspec
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor as MonitorCore
+from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.replay.backtest import run as run_backtest
 from reactorwatch.cli.read_record import DEFAULT_PLANT
 from reactorwatch.cli.read_record import record as read_file
@@ -247,6 +248,7 @@ class BacktestResult(msgspec.Struct, frozen=True):
         signals: inputs, outputs, and signals that are not watched with the reason.
         reference: model that the rows are judged by, `equations` or `arx`; None: no row was judged.
         noise_levels: standard deviations of the equations' noise; None: they did not judge.
+        baseline: change of the equations after the diagnosis of the training; None: they stayed as given.
         alarms: the alarms in the order in which they were raised.
         text: report as `reactorwatch backtest` prints it.
     """
@@ -260,6 +262,7 @@ class BacktestResult(msgspec.Struct, frozen=True):
     signals: dict[str, Any]
     reference: str | None
     noise_levels: dict[str, dict[str, float]] | None
+    baseline: dict[str, Any] | None
     alarms: list[RaisedAlarm]
     text: str
 
@@ -313,6 +316,8 @@ class AlarmChange(msgspec.Struct, frozen=True):
 class Monitor:
     """A monitor that is fed row by row, without a bus.
 
+    The first row after the training takes some tenths of a second, in which the training is diagnosed.
+
     Args:
         process: model whose equations judge; None: as the settings say.
         settings: settings of the monitor, as for `backtest`.
@@ -327,7 +332,7 @@ class Monitor:
     def __init__(self, process: ProcessLike | None = None, **settings: Any) -> None:
         self._config = _settings(process, settings)
         model = None if process is None else _model_of(process)
-        self._core = MonitorCore(self._config, 0, points=False, model=model)
+        self._core = MonitorCore(self._config, 0, points=False, model=model, diagnose=find_deviations)
         self._rows = 0
 
     @property

@@ -1,6 +1,6 @@
 """One alarm: its chart, the rule that raises and clears it, and the state that the operator sees."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, NamedTuple, TypeAlias
 
 import msgspec
@@ -10,7 +10,7 @@ from monitor_node.alarms.on_off_delay import OnOffDelay, OnOffDelayState
 from monitor_node.alarms.states import Event, State, next_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, ChartPoint, Contribution, Priority, Suspect
-from reactorwatch.spc.charts.base import Judgement, format_quantity
+from reactorwatch.spc.charts.base import Judgement
 
 PRIORITIES: Mapping[str, Priority] = {
     "low": Priority.PRIORITY_LOW,
@@ -92,30 +92,27 @@ class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
     comment: str = ""
 
 
+SHARED = (
+    "raised_ns", "cleared_ns", "value", "limit", "unit", "text", "incident", "first_in", "shelved_until_ns", "by",
+    "comment",
+)  # fmt: skip
+"""Fields that the state of an alarm and its message have in common."""
+
+
 def memory_from_message(alarm: Alarm) -> AlarmMemory:
     """Reconstruct the state of an alarm from a message, as far as the message has it."""
     active = alarm.raised_ns != 0 and alarm.cleared_ns == 0
     return AlarmMemory(
         state=next((state for state, code in STATES.items() if code == alarm.state), State.NORMAL),
         rule=OnOffDelayState(standing=active),
-        raised_ns=alarm.raised_ns,
-        cleared_ns=alarm.cleared_ns,
-        value=alarm.value,
-        limit=alarm.limit,
         above=alarm.limit > 0.0,
-        unit=alarm.unit,
-        text=alarm.text,
         contributions={item.signal: item.share for item in alarm.contributions},
         suspects=[
             SuspectedCause(**{field: getattr(item, field) for field in SuspectedCause.__struct_fields__})
             for item in alarm.suspects
         ],
-        incident=alarm.incident,
-        first_in=alarm.first_in,
         shelved_ns=alarm.time_ns if alarm.shelved_until_ns else 0,
-        shelved_until_ns=alarm.shelved_until_ns,
-        by=alarm.by,
-        comment=alarm.comment,
+        **{field: getattr(alarm, field) for field in SHARED},
     )
 
 
@@ -164,7 +161,6 @@ class ChartAlarm:
         self.name = keys.chart_name(chart, signal)
         self.priority = PRIORITIES[priority]
         self.names_cause = names_cause
-        self._signal = signal
         self._rule = rule
         self._reach = 1 - dead_band
         self.memory = AlarmMemory(rule=rule.state)
@@ -179,28 +175,29 @@ class ChartAlarm:
         rule = self.memory.rule
         return not (rule.standing or rule.recent)
 
-    def evaluate(
-        self, time_ns: int, judgement: Judgement, unit: str, explain: Callable[[Judgement], Explanation] | None = None
-    ) -> Event | None:
+    def update(self, judgement: Judgement) -> bool | None:
         """Update the alarm's condition with a point of the chart.
+
+        Returns:
+            True if the alarm is raised, False if it is cleared, which `record` has to follow; None if nothing changes.
+        """
+        return self._rule.update(judgement.out, self._is_normal(judgement))
+
+    def record(self, time_ns: int, judgement: Judgement, unit: str, explanation: Explanation | None) -> Event:
+        """Record the change of the condition that `update` returned; returns the event, which is applied.
 
         Args:
             time_ns: time of the sample.
             judgement: point of the chart.
             unit: unit of the statistic.
-            explain: returns the explanation if the alarm is raised; None: that of a residual's chart.
-
-        Returns:
-            `RAISED` or `CLEARED`, to be applied, if the condition changes.
+            explanation: explanation of an alarm that is raised; None: it is cleared.
         """
-        change = self._rule.update(judgement.out, self._is_normal(judgement))
-        if change is None:
-            return None
         memory = self.memory
         memory.value, memory.unit = judgement.statistic, unit
-        if not change:
+        if explanation is None:
             memory.cleared_ns = time_ns
             memory.text = f"{self.name} is back within its limits"
+            self.apply(Event.CLEARED)
             return Event.CLEARED
         memory.above = judgement.statistic > judgement.centre
         memory.limit = judgement.upper_limit if memory.above else judgement.lower_limit
@@ -208,9 +205,9 @@ class ChartAlarm:
         memory.incident, memory.first_in = 0, False
         if memory.state is State.NORMAL:
             memory.by = memory.comment = ""
-        explanation = explain(judgement) if explain is not None else self._residual_explanation(judgement, unit)
         memory.text, memory.contributions = explanation.text, explanation.contributions
         memory.suspects = list(explanation.suspects)
+        self.apply(Event.RAISED)
         return Event.RAISED
 
     def apply(self, event: Event) -> None:
@@ -237,30 +234,11 @@ class ChartAlarm:
             alarm=self.name,
             state=STATES[memory.state],
             priority=self.priority,
-            raised_ns=memory.raised_ns,
-            cleared_ns=memory.cleared_ns,
-            value=memory.value,
-            limit=memory.limit,
-            unit=memory.unit,
             contributions=[Contribution(signal=name, share=share) for name, share in memory.contributions.items()],
             suspects=[Suspect(**msgspec.structs.asdict(item)) for item in memory.suspects],
-            text=memory.text,
             event=event,
-            incident=memory.incident,
-            first_in=memory.first_in,
-            shelved_until_ns=memory.shelved_until_ns,
-            comment=memory.comment,
-            by=memory.by,
+            **{field: getattr(memory, field) for field in SHARED},
         )
-
-    def _residual_explanation(self, judgement: Judgement, unit: str) -> Explanation:
-        deviation = judgement.statistic - judgement.centre
-        size, allowed = abs(deviation), abs(self.memory.limit - judgement.centre)
-        text = (
-            f"{self._signal} is {format_quantity(size, unit)} {'above' if deviation > 0 else 'below'} what the model "
-            f"expects (allowed: {format_quantity(allowed, unit)})"
-        )
-        return Explanation(text, {self._signal: 1.0})
 
     def _is_normal(self, judgement: Judgement) -> bool:
         if judgement.out:

@@ -4,7 +4,7 @@ Alarms change with samples, with an operator's actions, and when shelving ends. 
 without an operator's action follow from the samples alone.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from math import isfinite
 from typing import Literal
 
@@ -85,6 +85,7 @@ class Annunciator:
     def __init__(self, config: MonitorConfig) -> None:
         self._config = config
         self._alarms: dict[str, ChartAlarm] = {}
+        self._keys: dict[str, str] = {}  # key of each alarm's messages, by its name
         self._undeclared: dict[str, AlarmMemory] = {}  # from a stored state; settings may declare them again
         self._transient: set[str] = set()
         self._incidents = Incidents(config.incident_min)
@@ -133,32 +134,22 @@ class Annunciator:
         if is_transient:
             self._transient.add(alarm.name)
         self._alarms[alarm.name] = alarm
+        self._keys[alarm.name] = keys.key(config.plant, keys.ALARM, alarm.name)
         return alarm
 
     # --- samples ---------------------------------------------------------------------------------------------
 
-    def evaluate(
-        self,
-        alarm: ChartAlarm,
-        time_ns: int,
-        judgement: Judgement,
-        unit: str,
-        explain: Callable[[Judgement], Explanation] | None = None,
-    ) -> list[Publication]:
-        """Update an alarm with a point of its chart; returns the alarm if it changes.
+    def record_change(
+        self, alarm: ChartAlarm, time_ns: int, judgement: Judgement, unit: str, explanation: Explanation | None
+    ) -> Publication:
+        """Record that an alarm declared here was raised or cleared by its `update`; returns its message.
 
-        Args:
-            alarm: an alarm declared here.
-            time_ns: time of the sample.
-            judgement: point of the chart.
-            unit: unit of the statistic.
-            explain: returns the explanation if the alarm is raised.
+        Arguments as for `ChartAlarm.record`.
         """
-        event = alarm.evaluate(time_ns, judgement, unit, explain)
-        if event is None:
-            return []
-        self._change(alarm, event, time_ns)
-        return [self._publication(alarm, event, time_ns)]
+        before = alarm.memory.state
+        event = alarm.record(time_ns, judgement, unit, explanation)
+        self._on_change(alarm, event, before, time_ns)
+        return self._publication(alarm, event, time_ns)
 
     def end_row(self, time_ns: int) -> list[Publication]:
         """End shelving where its time is over; publish KPIs after a change and each minute.
@@ -172,7 +163,7 @@ class Annunciator:
             memory = alarm.memory
             # A clock that was set back ends shelving as well; otherwise it would last as much longer.
             if not memory.shelved_ns <= time_ns < memory.shelved_until_ns:
-                self._change(alarm, Event.SHELF_TIME_OVER, time_ns)
+                self._apply(alarm, Event.SHELF_TIME_OVER, time_ns)
                 publications.append(self._publication(alarm, Event.SHELF_TIME_OVER, time_ns))
         minute = time_ns // MINUTE_NS
         if self._kpis_changed or minute != self._kpi_minute:
@@ -345,15 +336,19 @@ class Annunciator:
 
     def _change_by(self, alarm: ChartAlarm, event: Event, time_ns: int, by: str, comment: str) -> None:
         try:
-            self._change(alarm, event, time_ns)
+            self._apply(alarm, event, time_ns)
         except InputError as error:
             raise InputError(f"alarm {alarm.name} {error}") from error
         alarm.memory.by, alarm.memory.comment = by, comment or alarm.memory.comment
 
-    def _change(self, alarm: ChartAlarm, event: Event, time_ns: int) -> None:
-        memory = alarm.memory
-        before = memory.state
+    def _apply(self, alarm: ChartAlarm, event: Event, time_ns: int) -> None:
+        before = alarm.memory.state
         alarm.apply(event)
+        self._on_change(alarm, event, before, time_ns)
+
+    def _on_change(self, alarm: ChartAlarm, event: Event, before: State, time_ns: int) -> None:
+        """Assign an alarm that changed to its incident, and count it."""
+        memory = alarm.memory
         if event is Event.CLEARED and (memory.first_in or alarm.name not in self._transient):
             self._incidents.on_cleared(time_ns, memory.incident)
         if memory.state is State.UNACKNOWLEDGED and before is not State.UNACKNOWLEDGED:
@@ -377,7 +372,7 @@ class Annunciator:
         self.has_unexplained = any(alarm.memory.rule.standing and not alarm.names_cause for alarm in alarms)
 
     def _publication(self, alarm: ChartAlarm, event: str, time_ns: int) -> Publication:
-        return Publication(keys.key(self._config.plant, keys.ALARM, alarm.name), alarm.message(time_ns, event))
+        return Publication(self._keys[alarm.name], alarm.message(time_ns, event))
 
     def _publish_kpis(self, time_ns: int) -> Publication:
         before = self._newest_kpis

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.baseline.training_record import check_training
-from monitor_node.ingest.sampling import TOLERANCE
+from monitor_node.ingest.sampling import regular_intervals
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
 from reactorwatch.identification.linear_model import standard_deviations
@@ -316,11 +316,8 @@ def fewest_rows(order: int, delay: int) -> int:
 
 def _consecutive_rows(rows: Rows, time_min: Array, history: int) -> Rows:
     """Select the rows whose whole history is evenly spaced by one period, as `update` requires it."""
-    steps = np.diff(time_min)
-    period = float(np.median(steps))
-    late = np.abs(steps - period) > TOLERANCE * period
     number = np.arange(time_min.size)
-    last_late = np.maximum.accumulate(np.where(np.concatenate([[True], late]), number, 0))
+    last_late = np.maximum.accumulate(np.where(np.append(False, regular_intervals(time_min)), 0, number))
     kept = (number - last_late)[rows.position] >= history
     return Rows(rows.regressors[kept], rows.outputs[kept], rows.position[kept])
 

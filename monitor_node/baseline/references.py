@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.ingest.sampling import missing_rows
+from monitor_node.ingest.sampling import missing_in_intervals
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
 from reactorwatch.kalman.noise_estimation import estimate_noise
@@ -241,9 +241,9 @@ class ProcessReference:
             self._filter.restart()
         residuals, z = np.full(measured.shape, np.nan), np.full(measured.shape, np.nan)
         sds = np.full(measured.shape, np.nan)
-        accept, is_after_missing = (False,) * measured.shape[1], _is_after_missing(time_min).tolist()
+        accept, missing = (False,) * measured.shape[1], [0, *missing_in_intervals(time_min).tolist()]
         for row, values in enumerate(measured.tolist()):
-            if is_after_missing[row]:
+            if missing[row]:
                 self.restart()
             predicted = self.update(round(time_min[row] * MINUTE_NS), float(inputs[row]), values, accept)
             residual = [value - prediction for value, prediction in zip(values, predicted.prediction, strict=True)]
@@ -325,21 +325,14 @@ def input_reach(time_min: Array, inputs: Array) -> float:
         time_min: times in minutes, shape (n,).
         inputs: input values, shape (n,); NaN if missing.
     """
-    moved, is_next = np.abs(np.diff(inputs)), ~_is_after_missing(time_min)[1:]
+    moved, is_next = np.abs(np.diff(inputs)), missing_in_intervals(time_min) == 0
     nearer = np.where(is_next[:-1] & is_next[1:], np.minimum(moved[:-1], moved[1:]), 0.0)
     return float(np.nanmax(nearer, initial=0.0))
 
 
-def _is_after_missing(time_min: Array) -> NDArray[np.bool_]:
-    """Flags of rows before which rows are missing, by the median period, shape (n,)."""
-    spacing = np.diff(time_min)
-    period = float(np.median(spacing)) if spacing.size else 1.0
-    return np.array([False, *(missing_rows(item / period) > 0 for item in spacing.tolist())])
-
-
 def _mask_before_missing(time_min: Array, inputs: Array) -> Array:
     """The inputs, with NaN in rows before missing rows, so that a filter restarts after these."""
-    return np.where(np.append(_is_after_missing(time_min)[1:], False), nan, inputs)
+    return np.where(np.append(missing_in_intervals(time_min), 0) > 0, nan, inputs)
 
 
 def estimate_training_noise(

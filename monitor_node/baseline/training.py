@@ -23,7 +23,7 @@ from monitor_node.baseline.references import ArxReference, ProcessReference, Ref
 from monitor_node.baseline.resolution import resolution_sd
 from monitor_node.baseline.signal_range import signal_ranges
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.sampling import TOLERANCE
+from monitor_node.ingest.sampling import regular_intervals
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -245,9 +245,7 @@ class Training:
 
     def _predict_without_input(self, time_min: Array, measured: Array) -> None:
         """Update the identified models with the rows once more, with a constant input."""
-        spacings = np.diff(time_min, prepend=np.nan)
-        period = float(np.nanmedian(spacings)) if spacings.size > 1 else 0.0
-        follows = (np.abs(spacings - period) <= TOLERANCE * period).tolist()
+        follows = [False, *regular_intervals(time_min).tolist()]
         times_ns = [round(minutes * MINUTE_NS) for minutes in time_min.tolist()]
         for predictor, column in zip(self._predictors, measured.T.tolist(), strict=True):
             for time_ns, value, is_next in zip(times_ns, column, follows, strict=True):
@@ -340,11 +338,10 @@ def _too_few_residuals(
 
 def _prediction_obstacle(time_min: Array, inputs: Array) -> str:
     """Reason why rows could not be predicted."""
-    spacings = np.diff(time_min)
-    period = float(np.median(spacings)) if spacings.size else 0.0
-    regular = np.count_nonzero(np.abs(spacings - period) <= TOLERANCE * period)
-    if regular < USUAL_SHARE * spacings.size:
-        return f"do rows come one by one period? {regular} of {spacings.size} spacings are within a tenth of the usual"
+    follows = regular_intervals(time_min)
+    regular = np.count_nonzero(follows)
+    if regular < USUAL_SHARE * follows.size:
+        return f"do rows come one by one period? {regular} of {follows.size} spacings are within a tenth of the usual"
     known = int(np.count_nonzero(np.isfinite(inputs)))
     if FEWEST_ROWS <= known < USUAL_SHARE * inputs.size:
         return f"the input has a value in {known} of them"

@@ -21,6 +21,7 @@ Nothing here reads a clock or does I/O.
 
 from collections.abc import Callable, Iterable, Iterator
 
+from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.admission import PROVEN_MESSAGES, PROVEN_ROWS, UnverifiedPlants
@@ -62,6 +63,7 @@ class FleetMonitor:
         put_back: called with a plant without a usable state, and its new monitor; returns True if the monitor was
             restored from a state that had been kept aside.
         claimed_elsewhere: returns True if another monitor has claimed a plant since it was adopted here.
+        diagnose: called with an own plant and the diagnosis of its training, which is passed to `on_finding`.
         on_ownership: called with True when a plant is adopted, and with False when it is released.
 
     Raises:
@@ -82,11 +84,12 @@ class FleetMonitor:
         put_back: Callable[[str, Monitor], bool] = lambda _plant, _monitor: False,
         claimed_elsewhere: Callable[[str], bool] = lambda _plant: False,
         on_ownership: Callable[[str, bool], None] = lambda _plant, _ours: None,
+        diagnose: Callable[[str, DiagnosisJob], None] = lambda _plant, _job: None,
     ) -> None:
         self._shards, self._on_ownership = shards, on_ownership
         self._request_history, self._store, self._unusable = request_history, store, unusable
         self._restore_kept_aside, self._is_claimed_elsewhere = put_back, claimed_elsewhere
-        self._watched = WatchedPlants(config, start_ns, model, points=points)
+        self._watched = WatchedPlants(config, start_ns, model, points=points, diagnose=diagnose)
         self._pending = PendingPlants()
         self._presume_gone_ns: int | None = start_ns + PRESUME_GONE_NS
         self._registered: dict[str, None] = {}  # all plants, with any owner
@@ -251,6 +254,10 @@ class FleetMonitor:
                 plants.add(topic.plant)
         return plants
 
+    def on_finding(self, plant: str, finding: Finding) -> None:
+        """Process the diagnosis of a plant's training; what it found holds from the plant's next row on."""
+        self._watched.on_finding(plant, finding)
+
     def monitor(self, plant: str) -> Monitor:
         """Monitor of a plant.
 
@@ -401,9 +408,9 @@ class FleetMonitor:
 
     def _evaluate(self, plant: str, own: Monitor, message: Encoded, now_ns: int) -> list[Publication]:
         """Process a message of a plant; returns publications that its previous owners have not published."""
-        restarts, publications = own.restarts, own.on_message(message, now_ns)
-        if own.restarts != restarts:  # the clock may be set back: their alarms would cover those to come
-            self._handed_over.remove(plant)
+        before_ns, publications = own.last_ns, own.on_message(message, now_ns)
+        if before_ns is not None and own.last_ns is not None and own.last_ns < before_ns:
+            self._handed_over.remove(plant)  # the clock was set back: their alarms would cover those to come
         return self._handed_over.filter_new(publications)
 
     def _plant_of(self, message: Encoded, now_ns: int) -> str:

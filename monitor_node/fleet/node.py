@@ -11,6 +11,7 @@ from monitor_node.alarms.commands import COMMANDS
 from monitor_node.alarms.kpis import is_empty
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from monitor_node.diagnosis_worker import DiagnosisWorker
 from monitor_node.fleet import sharding
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.monitor import FleetMonitor
@@ -28,7 +29,7 @@ from monitor_node.storage.kept_aside import DAMAGED, OTHER_SETTINGS
 from monitor_node.storage.state_recovery import StateRecovery
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, CommandReply
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, Baseline, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus
@@ -92,6 +93,7 @@ class FleetNode(FleetMonitor):
             bus, self._states, self._is_contested, lambda plant, line: log.warning(line, plant=plant)
         )
         self._every_ns = int(config.state_every_s * 1e9)
+        self._worker = DiagnosisWorker()
         self._lease = LeaseMonitor(lambda: bus.has_router)
         self._pending_subscriptions = len(self.subscriptions)
         self._changed: set[str] = set()  # plants with a changed alarm since their state was stored
@@ -121,6 +123,7 @@ class FleetNode(FleetMonitor):
             put_back=self._restore_kept_aside,
             claimed_elsewhere=self._is_claimed_elsewhere,
             on_ownership=self._set_ownership,
+            diagnose=self._worker.submit,
         )
         for plant in sorted({*states.plants, *states.plants_aside}) if states is not None else []:
             if keys.matches(self.expression, f"{keys.ROOT}/{plant}"):
@@ -196,6 +199,9 @@ class FleetNode(FleetMonitor):
             if not self._bus.has_router:
                 self._lease.expire(now_ns)
             self._store_due(now_ns)
+            for plant, finding in self._worker.pop_findings():
+                log.info("training diagnosed", plant=plant, verdict=finding.verdict)
+                self.on_finding(plant, finding)
         publications += self._log_alarms(super().on_tick(now_ns))
         if now_ns >= self._report_ns:
             self._report_ns = now_ns + LOG_INTERVAL_NS
@@ -213,7 +219,9 @@ class FleetNode(FleetMonitor):
     def next_tick_ns(self) -> int:
         """See `FleetMonitor`; or the next check for states to store."""
         due_ns = super().next_tick_ns()
-        return due_ns if self._states is None else min(due_ns, self._poll_ns)
+        if self._states is None and not self._worker.is_busy:
+            return due_ns
+        return min(due_ns, self._poll_ns)
 
     def on_subscribed(self, call: Callable[[Callable[[int], list[Publication]]], None]) -> None:
         """Count a completed subscription; when all are, start the recovery.
@@ -228,6 +236,7 @@ class FleetNode(FleetMonitor):
     def on_stop(self, now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; states are stored for the last time."""
         self._recovery.close()
+        self._worker.close()
         if self._states is not None:
             for plant in filter(self.is_worth_storing, self.plants):
                 self._states.put(plant, self.state_of(plant))
@@ -317,7 +326,7 @@ class FleetNode(FleetMonitor):
                 log.warning(why, plant=plant)
 
     def _log_alarms(self, publications: list[Publication]) -> list[Publication]:
-        """Log alarms, and mark their plants for storing; returns publications without empty KPIs."""
+        """Log alarms, and mark plants with changes for storing; returns publications without empty KPIs."""
         kept: list[Publication] = []
         for publication in publications:
             alarm = publication.message
@@ -326,11 +335,12 @@ class FleetNode(FleetMonitor):
                     continue
                 self._kpi_keys.add(publication.key)
             kept.append(publication)
-            if isinstance(alarm, Alarm):
+            if isinstance(alarm, Alarm | Baseline):
                 topic = keys.parse(publication.key)
                 plant = topic.plant if topic is not None else ""
                 self._changed.add(plant)
                 self._poll_ns = 0  # as soon as it is published
+            if isinstance(alarm, Alarm):
                 log.info("alarm", plant=plant, alarm=alarm.alarm, change=alarm.event, by=alarm.by, text=alarm.text)
         return kept
 

@@ -4,10 +4,11 @@ A plant in its normal state is packed with the quiet ones (`quiet`); any other h
 again. Publications are the same.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import msgspec
 
+from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.deadline_queue import DeadlineQueue
@@ -34,6 +35,7 @@ class WatchedPlants:
         start_ns: present time.
         model: see `Monitor`.
         points: see `Monitor`.
+        diagnose: called with a plant and the diagnosis of its training; the result is passed to `on_finding`.
 
     Attributes:
         alarms: names of a plant's alarms.
@@ -42,8 +44,18 @@ class WatchedPlants:
         InputError: the settings are inconsistent.
     """
 
-    def __init__(self, config: MonitorConfig, start_ns: int, model: ProcessModel | None, *, points: bool) -> None:
+    def __init__(
+        self,
+        config: MonitorConfig,
+        start_ns: int,
+        model: ProcessModel | None,
+        *,
+        points: bool,
+        diagnose: Callable[[str, DiagnosisJob], None] = lambda _plant, _job: None,
+    ) -> None:
         self._config, self._model, self._points = config, model, points
+        self._diagnose = diagnose
+        self._submitted: set[str] = set()  # plants whose training is being diagnosed
         first = Monitor(config, start_ns, points=points, model=model)  # inconsistent settings are refused here
         self._first_model = first.model
         self.alarms = tuple(alarm.alarm for alarm in first.alarms.all_alarms())
@@ -91,13 +103,28 @@ class WatchedPlants:
     def add(self, plant: str, monitor: Monitor) -> None:
         """Add a plant."""
         self._monitors[plant] = monitor
+        self._submit(plant, monitor)
         self._deadlines.schedule(plant, monitor.next_tick_ns())
+
+    def on_finding(self, plant: str, finding: Finding) -> None:
+        """Process the diagnosis of a plant's training; the plant may have been removed."""
+        self._submitted.discard(plant)
+        monitor = self.detach(plant)
+        if monitor is not None:
+            monitor.on_finding(finding)
+
+    def _submit(self, plant: str, monitor: Monitor) -> None:
+        """Submit the training of a plant for diagnosis, once."""
+        if monitor.awaits_diagnosis and plant not in self._submitted and (job := monitor.diagnosis_job) is not None:
+            self._submitted.add(plant)
+            self._diagnose(plant, job)
 
     def remove(self, plant: str) -> Monitor | None:
         """Remove a plant; returns its monitor. None: there is no such plant."""
         monitor = self.detach(plant)
         if monitor is not None:
             self._forget(plant)
+            self._submitted.discard(plant)
         return monitor
 
     def copy(self, plant: str, name: str) -> None:
@@ -140,7 +167,7 @@ class WatchedPlants:
         if self._quiet is not None and plant in self._quiet:
             self._quiet.not_stored(plant)
         elif (monitor := self._monitors.get(plant)) is not None:
-            monitor.not_stored += 1
+            monitor.stats.not_stored += 1
 
     # --- event loop ------------------------------------------------------------------------------------------
 
@@ -161,6 +188,7 @@ class WatchedPlants:
         quiet: list[str] = []
         for plant in plants:
             monitor = self._monitors[plant]
+            self._submit(plant, monitor)
             if self._demote(plant, monitor):
                 quiet.append(plant)
             else:

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from math import nan
 from typing import NamedTuple
 
+from monitor_node.ingest.sampling import Interval
+from reactorwatch.contract.codec import Publication
 from reactorwatch.runtime.delivery.gap_tracker import GapTracker
 
 MOST_LOST = 2**62  # more than any plant publishes; corrupt sequence numbers must not overflow the count in a message
@@ -34,6 +36,29 @@ class Row(NamedTuple):
     time_ns: int
     values: tuple[float, ...]
     restarted: bool
+
+
+@dataclass(slots=True)
+class MeasuredRow:
+    """A row on its way through the stages of the pipeline.
+
+    Attributes:
+        time_ns: sample time.
+        input_value: value of the input; NaN if missing.
+        values: one value an output; NaN if missing, or if the signal checks found that it is no measurement.
+        units: units of the outputs.
+        interval: interval before the row.
+        follows: True if the row is one sampling period after its predecessor in the same run.
+        publications: publications because of the row so far.
+    """
+
+    time_ns: int
+    input_value: float
+    values: list[float]
+    units: list[str]
+    interval: Interval
+    follows: bool
+    publications: list[Publication]
 
 
 @dataclass
@@ -119,9 +144,7 @@ class Aligner:
         rows: list[Row] = []
         index, state = self._index[signal], self.state
         position = state.sequences[index]
-        if position.is_next(sequence, time_ns):  # as nearly always
-            position.advance(sequence, time_ns)
-        else:
+        if not position.accept_next(sequence, time_ns):
             rows = self._restart(index, time_ns, sequence)
             if self._is_duplicate(index, time_ns):
                 state.counts.duplicated += 1

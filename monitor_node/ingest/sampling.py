@@ -10,8 +10,13 @@ tell chance from change.
 
 from dataclasses import dataclass, field, replace
 from statistics import median
+from typing import NamedTuple
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.arrays import Array
 
 LEARN_FROM = 32  # spacings
 TOLERANCE = 0.1  # of the period
@@ -58,6 +63,23 @@ class SamplingState:
     spacing_ns: int | None = None
 
 
+class Interval(NamedTuple):
+    """Interval between a row and its predecessor.
+
+    Attributes:
+        follows: True if it is one sampling period.
+        is_gap: True if it is a gap.
+        missing: number of rows that are missing in it, by its length.
+    """
+
+    follows: bool
+    is_gap: bool
+    missing: int
+
+
+NO_INTERVAL, ONE_PERIOD = Interval(False, False, 0), Interval(True, False, 0)
+
+
 class SamplingPeriod:
     """Sampling period, learned from the first rows.
 
@@ -71,45 +93,32 @@ class SamplingPeriod:
         """A copy of the state."""
         return replace(self.state, spacings_ns=list(self.state.spacings_ns))
 
-    def follows(self, time_ns: int) -> bool:
-        """Update with a row; returns True if it follows its predecessor by one period."""
+    def update(self, time_ns: int) -> Interval:
+        """Update with a row; returns the interval before it."""
         state = self.state
         last, state.last_ns = state.last_ns, time_ns
         if last is None:
-            return False
+            return NO_INTERVAL
         spacing = state.spacing_ns = time_ns - last
         if spacing == state.period_ns:  # as mostly
-            return True
+            return ONE_PERIOD
         if spacing <= 0:
-            return False
+            return Interval(False, True, 0)
         if state.period_ns is None:
             state.spacings_ns.append(spacing)
             if len(state.spacings_ns) == LEARN_FROM:
                 state.period_ns = float(median(state.spacings_ns))
-            return spacing <= 1.5 * min(state.spacings_ns)
-        return abs(spacing - state.period_ns) <= TOLERANCE * state.period_ns
+            follows = spacing <= 1.5 * min(state.spacings_ns)
+        else:
+            follows = abs(spacing - state.period_ns) <= TOLERANCE * state.period_ns
+        missing = 0 if state.period_ns is None else missing_rows(spacing / state.period_ns)
+        return Interval(follows, spacing > LARGEST_GAP * self.period_ns, missing)
 
     @property
     def period_ns(self) -> float:
         """Sampling period; before it is learned, the shortest interval so far; 0 before the second row."""
         state = self.state
         return state.period_ns if state.period_ns is not None else float(min(state.spacings_ns, default=0))
-
-    @property
-    def missing(self) -> int:
-        """Number of rows missing before the newest row, by its time."""
-        spacing, period = self.state.spacing_ns, self.state.period_ns
-        if spacing is None or period is None or spacing == period:
-            return 0
-        return missing_rows(spacing / period)
-
-    @property
-    def gap(self) -> bool:
-        """True if there is a gap before the newest row."""
-        spacing = self.state.spacing_ns
-        if spacing is None or spacing == self.state.period_ns:
-            return False
-        return spacing <= 0 or spacing > LARGEST_GAP * self.period_ns
 
 
 def missing_rows(periods: float) -> int:
@@ -122,3 +131,28 @@ def missing_rows(periods: float) -> int:
     """
     whole = round(periods)
     return whole - 1 if whole > 1 and abs(periods - whole) <= WHOLE else 0
+
+
+def regular_intervals(time_min: Array) -> NDArray[np.bool_]:
+    """Flags of the intervals of a record that are one sampling period, its median interval, to a tenth; shape (n - 1,).
+
+    Args:
+        time_min: times of the rows, shape (n,).
+    """
+    spacings = np.diff(time_min)
+    period = np.median(spacings) if spacings.size else 0.0
+    return np.abs(spacings - period) <= TOLERANCE * period
+
+
+def missing_in_intervals(time_min: Array) -> NDArray[np.intp]:
+    """Numbers of rows missing in the intervals of a record, by its median interval, shape (n - 1,).
+
+    Args:
+        time_min: times of the rows, shape (n,).
+
+    >>> missing_in_intervals(np.array([0.0, 1.0, 2.0, 4.0, 5.0])).tolist()
+    [0, 0, 1, 0]
+    """
+    spacings = np.diff(time_min)
+    periods = spacings / (np.median(spacings) if spacings.size else 1.0)
+    return np.array([missing_rows(item) for item in periods.tolist()], dtype=np.intp)

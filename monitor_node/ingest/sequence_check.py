@@ -70,7 +70,7 @@ class SequenceCheck(GapTracker):
     spacing: Spacing = field(default_factory=Spacing)
     held: list[HeldSample] = field(default_factory=list)
 
-    def accept_next(self, time_ns: int, number: int) -> bool:
+    def accept_next(self, number: int, time_ns: int) -> bool:
         """Accept a sample that has the next number at the usual time; returns True if it does."""
         if self.held or number != self.expected:
             return False

@@ -1,10 +1,10 @@
-"""The causes that an alarm is traced to.
+"""Causes to which an alarm is traced.
 
-Not the whole catalogue. What is compared within tenths of a second, at a few rows after an alarm, is what sets in on a
-running plant and shows at once: the flows, temperatures and concentrations that come in, the reaction, the cooling, and
-the sensors. Lags, delays and a wrong volume, order or timing are there from the first row on, so the filter that the
-monitor was trained with has taken them in; some bring states of their own, from which there is no infinitesimal
-deviation; and each cause that another imitates takes probability from it. Those are for a diagnosis of the record.
+These are not the whole catalogue. Causes are compared within tenths of a second at a few rows after an alarm, so these
+are the ones that occur on a running plant and act at once: the flows, temperatures and concentrations of the feeds, the
+reaction, the cooling, and the sensors. Lags, delays and a wrong volume, order or timing act from the first row on, so
+the filter of the training has adapted to them; some add states of their own, from which there is no infinitesimal
+deviation; and each cause that another imitates takes probability from it. Those are left to a diagnosis of the record.
 """
 
 from reactorwatch.process.effect import Effect
@@ -27,4 +27,4 @@ NAMES = (
 )
 
 CAUSES: tuple[Effect, ...] = tuple(effect for effect in EFFECTS if effect.name in NAMES)
-"""In the order of the catalogue."""
+"""Causes in the order of the catalogue."""

@@ -1,297 +1,275 @@
-"""How large each cause is and since when: the hypotheses, fitted to the rows.
+"""Fit of the size and onset of each cause to the rows of a window, with the hypotheses of `diagnosis.fitting`.
 
-All hypotheses run over the same rows and from the same state, that of the filter before any of them sets in.
+Up to its onset every hypothesis equals the plant without a fault, so that part of the filter's run is computed once.
 
-The linearised bank is right about a small fault, so only the best few of its hypotheses are fitted then. A large fault
-is followed from where it is still small. The fit begins with what the bank found in the first rows, and the rows that
-it is fitted to are multiplied from round to round, so that it never has far to go; what falls behind on the way is left
-behind. Where even that beginning does not keep what the bank promises, smaller sizes are tried. Asked again about the
-same fault some rows later, the fit goes on from where it was.
+The linearised scan is accurate for a small fault: its best hypotheses are fitted to all rows. A large fault is followed
+from where it is still small. The fit starts from the scan of the first rows, and the number of rows is multiplied from
+round to round, so that each round starts near its optimum; hypotheses that fall behind on the way are dropped. Where
+even the first rows do not gain what the scan predicts, smaller sizes are tried.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from math import inf, isfinite, log, pi, sqrt
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from math import sqrt
 
 import numpy as np
 
+from monitor_node.isolation.candidate import (
+    ALL_PROFILES,
+    BEHIND,
+    LEAST_GAIN,
+    MOST,
+    Candidate,
+    Progress,
+    best_first,
+    drop_needless_ends,
+    interval_middle,
+    log_share,
+    log_volume_of,
+    scan_candidates,
+    select_plausible,
+)
 from monitor_node.isolation.glr_scan import Scan
-from monitor_node.isolation.hypothesis import SETTLED, Descent, Hypothesis
-from monitor_node.isolation.segment import Stretch
+from monitor_node.isolation.residual import log_evidence_of_residual
 from monitor_node.isolation.window import Window
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
+from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import EndedRamp, FittedProfile, Ramp, Step
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.kalman.step_budget import StepBudget
-from reactorwatch.process.effect import Effect
+from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.profiles import RAMP, STEP
-from reactorwatch.stored_state import StoredState
 
-BEHIND = 15.0
-"""In log likelihood: what is worse than the best by more is left behind."""
+_DUMMY_TIME_MIN = 0.1 * np.arange(4.0)
 
-MOST = 8
-"""Hypotheses about a small fault that are fitted."""
-
-PROFILES = (STEP, RAMP)
-"""In the order of the bank."""
-
-_MARGIN_ROWS, _FIRST_ROWS = 8, 6
-_STEPS, _LAST_STEPS = 3, 6
+_MARGIN_ROWS = 8
+_STEPS, _LAST_STEPS = 3, 8
 _SHRINKS = (0.5, 0.2, 0.08)
 _HOLDS, _NOISE, _KEPT = 0.05, 5.0, 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A hypothesis and what is known of it.
-
-    Attributes:
-        hypothesis: its number, see `Fitter`.
-        size: of a step; of a ramp its slope, in a minute.
-        onset_min: when it set in.
-        gain: in log likelihood, against nothing being wrong.
-        w: the whitened innovations of the newest rows, from before any hypothesis sets in; 0: not measured.
-        log_volume: how much of what was possible beforehand is still, of all onsets and sizes; see `isolation`.
-        size_sd: standard deviation of the size.
-        onset_sd_min: of the onset.
-        reached: size in the last row, of a ramp too.
-        reached_sd: its standard deviation.
-    """
-
-    hypothesis: int
-    size: float
-    onset_min: float
-    gain: float
-    w: Array
-    log_volume: float
-    size_sd: float
-    onset_sd_min: float
-    reached: float
-    reached_sd: float
-
-
-class FitState(StoredState, frozen=True):
-    """A fit on the way: the fields of `Fit`, its hypothesis by cause and profile, without `w`."""
-
-    cause: str
-    profile: str
-    size: float
-    onset_min: float
-    gain: float
-    log_volume: float
-    size_sd: float
-    onset_sd_min: float
-    reached: float
-    reached_sd: float
-
-
-class WayState(StoredState, frozen=True):
-    """How far a large fault has been followed: the fields of `_Way`."""
-
-    stood_out_min: float
-    onset_min: float
-    until_min: float
-    first: bool
-    fits: list[FitState]
-
-
-_STORED = [item.name for item in fields(Fit) if item.name not in ("hypothesis", "w")]
-
-
-@dataclass(frozen=True, eq=False)
-class _Way:
-    """How far a large fault has been followed.
-
-    Attributes:
-        stood_out_min: when its first rows stood out.
-        onset_min: about when it set in.
-        until_min: up to where it was followed.
-        first: whether that was the first round.
-        fits: that were left, best first.
-    """
-
-    stood_out_min: float
-    onset_min: float
-    until_min: float
-    first: bool
-    fits: list[Fit]
-
-    def leads_to(self, stood_out_min: float, earliest_min: float) -> bool:
-        """Whether this is the way to where the same rows stood out, if something may set in from a time on."""
-        return self.stood_out_min == stood_out_min and min(item.onset_min for item in self.fits) > earliest_min
-
-    def further(self, window: Window) -> tuple[list[Fit], int]:
-        """The fits that are not left behind, and the row before which to follow them next."""
-        onset, end = np.searchsorted(window.time_min, (self.onset_min, self.until_min)).tolist()
-        age = end + 1 - onset
-        reached = onset + max((2 if age < 2 * _FIRST_ROWS else 4) * age, _FIRST_ROWS)
-        # How far a fit can be from its best depends on how many rows it has seen; what it gains tells that best.
-        best = self.fits[0]
-        least = best.gain - (0.5 if self.first else 0.1) * abs(best.gain) - BEHIND
-        fits = [item for item in self.fits if item.gain >= least] or [best]  # a gain may be no number
-        return fits, min(reached, window.time_min.size)
+_ENDS = (0.4, 0.6, 0.8)  # fractions of the time since the onset after which a ramp may have ended
 
 
 class Fitter:
     """Fits all causes, each as a step and as a ramp.
 
     Args:
-        model: of the plant.
-        noise: of the plant and its sensors.
-        effects: the causes, in the order of the bank.
+        model: process model of the plant.
+        noise: noise levels of the plant and its sensors.
+        effects: effects of the causes, in the order of the scan.
 
     Attributes:
-        hypotheses: of every cause the step, then of every cause the ramp.
+        progress: how far a large fault was followed; None without one.
     """
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, effects: Sequence[Effect]) -> None:
-        self._nominal = Filter(model, noise)
-        self.hypotheses = [Hypothesis(model, noise, effect, profile) for profile in PROFILES for effect in effects]
-        self._way: _Way | None = None
-
-    def forget(self) -> None:
-        """Forget how far a fault has been followed."""
-        self._way = None
+        self._model, self._noise = model, Noise(noise.measurement_sd, noise.process_sd)
+        self._effects, self._filters = tuple(effects), dict[Effect, FaultFilter]()
+        self._budget: StepBudget | None = None
+        self.progress: Progress | None = None
 
     @property
-    def state(self) -> WayState | None:
-        """How far a fault has been followed: all that is remembered from one question to the next."""
-        way = self._way
-        if way is None:
-            return None
-        fits = []
-        for fit in way.fits:
-            of = self.hypotheses[fit.hypothesis]
-            fits.append(FitState(of.effect.name, of.profile.name, **{name: getattr(fit, name) for name in _STORED}))
-        return WayState(way.stood_out_min, way.onset_min, way.until_min, way.first, fits)
+    def preparations(self) -> list[Callable[[], None]]:
+        """Functions that compile what the first fit of each cause would compile."""
+        return [partial(self._prepare, effect) for effect in self._effects]
 
-    def restore(self, state: WayState | None) -> None:
-        """Go on from where another was; a cause that is not known here is left behind."""
-        self.forget()
-        if state is None:
-            return
-        places = {(item.effect.name, item.profile.name): place for place, item in enumerate(self.hypotheses)}
-        fits = [
-            Fit(places[item.cause, item.profile], w=np.empty((0, 0)), **{name: getattr(item, name) for name in _STORED})
-            for item in state.fits
-            if (item.cause, item.profile) in places
-        ]
-        if fits:
-            self._way = _Way(state.stood_out_min, state.onset_min, state.until_min, state.first, fits)
+    def _prepare(self, effect: Effect) -> None:
+        hypothesis = self.hypothesis(effect, Step(_DUMMY_TIME_MIN))
+        hypothesis.filter.prepare()
+        if effect is self._effects[0]:  # the kernels that all causes share: a fit to rows without measurements
+            rows = _DUMMY_TIME_MIN.size
+            outputs = np.full((rows, len(self._model.outputs)), np.nan)
+            run = Run(_DUMMY_TIME_MIN, np.ones((rows, len(self._model.inputs))), outputs)
+            hypothesis.fit(run, (_DUMMY_TIME_MIN[:2],), 1)
 
-    def fit(self, window: Window, early: Scan, whole: Scan, budget: StepBudget | None = None) -> list[Fit]:
-        """The causes that come into question, likeliest first; of a small fault, then those that are not fitted.
+    def fit(self, window: Window, early: Scan, full: Scan, budget: StepBudget | None = None) -> list[Candidate]:
+        """Fit the plausible causes; return them best first, followed for a small fault by those not fitted.
 
         Args:
             window: the rows.
-            early: what the linearised bank found in the rows up to the first at which a cause stands out.
-            whole: what it found in all.
-            budget: of the filter steps that the fit may take; None: as many as it needs.
+            early: scan of the rows up to the first in which a cause stands out.
+            full: scan of all rows.
+            budget: budget of filter steps; None: unlimited.
 
         Raises:
-            BudgetExceededError: the budget does not reach. How far a large fault has been followed is kept.
+            BudgetExceededError: the budget is spent. The progress with a large fault is kept.
         """
-        self._nominal.budget = budget
-        best, rows = _begun(whole, window), window.time_min.size
+        self._budget = budget
+        best = scan_candidates(self._effects, full, window)
         if not best:
             return []
         best = [item for item in best if item.gain > (1.0 - _HOLDS) * best[0].gain - BEHIND]
-        stretch = Stretch(window, _begin(best[:MOST], window), rows, self._nominal)
-        promised, likeliest = best[0].gain, self.hypotheses[best[0].hypothesis]
-        kept = stretch.nothing.value - likeliest.loss(stretch, best[0].size, best[0].onset_min).value
-        if not abs(kept - promised) < _HOLDS * promised + _NOISE:
-            return self._followed(window, early)
-        fits = []
-        for item in best[:MOST]:
-            fit = self._fitted(item, stretch, first=True, last=True)
-            onset_sd_min = max(fit.onset_sd_min, item.onset_sd_min)
-            fits.append(replace(fit, onset_sd_min=onset_sd_min, log_volume=item.log_volume))
-        return [*sorted(fits, key=lambda item: -item.gain), *best[MOST:]]
+        without_fault = self.run_without_fault(window.run).innovations
+        segment = _Segment(self, window, 0, window.time_min.size, without_fault)
+        predicted = best[0].gain
+        gained = segment.loss_without_fault - segment.evaluate(best[0], best[0].parameters).loss
+        if not abs(gained - predicted) < _HOLDS * predicted + _NOISE:
+            return self._follow(window, early, without_fault)
+        fitted = best_first(segment.fit(item, first=True, steps=_LAST_STEPS) for item in best[:MOST])
+        if log_evidence_of_residual(*fitted[0].residual(window)) > 0.0:
+            fitted = drop_needless_ends(best_first(segment.fit_end(item) for item in fitted))
+        if len(best) <= MOST:  # a later look at more rows, in which the fault may be large, resumes from here
+            end_min = float(window.time_min[-1])
+            self.progress = Progress(fitted[0].onset_min, end_min, 1, select_plausible(fitted, 0.0))
+        return [*(segment.add_deviations(item, item.onset_sd_min) for item in fitted), *best[MOST:]]
 
-    def _followed(self, window: Window, early: Scan) -> list[Fit]:
-        """The same from where a large fault was still small, or from where it had been followed to before."""
-        fits, reached, first = _begun(early, window), early.rows, True
-        if not fits:
-            return []
-        onset_min, stood_out_min = fits[0].onset_min, float(window.time_min[early.rows - 1])
-        if self._way is not None and self._way.leads_to(stood_out_min, window.earliest_min):
-            onset_min, (fits, reached), first = self._way.onset_min, self._way.further(window), False
-        while True:
-            last = reached >= window.time_min.size
-            stretch = Stretch(window, _begin(fits, window), reached, self._nominal)
-            fits = [self._fitted(item, stretch, first=first, last=last) for item in fits]
-            fits.sort(key=lambda item: -item.gain)
-            self._way = _Way(stood_out_min, onset_min, stretch.end_min, first, fits)
-            if last:
-                return [replace(item, log_volume=_log_volume(item, window)) for item in fits]
-            (fits, reached), first = self._way.further(window), False
+    def _follow(self, window: Window, early: Scan, without_fault: FilterResult) -> list[Candidate]:
+        """Fit the plausible causes of a large fault, from where it is still small or from the last progress."""
+        times, stands_out_min = window.time_min, float(window.time_min[early.rows - 1])
+        progress = self.progress
+        if progress is None or not progress.is_of(stands_out_min, window.earliest_min):
+            candidates = select_plausible(scan_candidates(self._effects, early, window), 0.5)
+            if not candidates:
+                return []
+            progress = Progress(candidates[0].onset_min, stands_out_min, 0, candidates)
+            end = min(early.rows + 2, times.size)  # the latest onset is a row before the last
+        else:
+            end = progress.next_end(times)
+        while end < times.size:
+            segment, candidates = self._extend(progress, window, end, without_fault)
+            first, end_min = progress.rounds == 0, float(times[end - 1])
+            candidates = best_first(segment.fit(item, first=first, steps=_STEPS) for item in candidates)
+            # The fewer rows a fit has seen, the farther it may be from its optimum.
+            share = 0.5 if first else 0.1 if end_min - progress.onset_min < 100 * window.period_min else 0.05
+            candidates = select_plausible(candidates, share)
+            self.progress = progress = Progress(progress.onset_min, end_min, progress.rounds + 1, candidates)
+            end = progress.next_end(times)
+        segment, candidates = self._extend(progress, window, times.size, without_fault)
+        if any(item.profile is Ramp and segment.has_left(item, progress.end_min) for item in candidates[:2]):
+            candidates = [segment.start_end(item) for item in candidates]
+        first = progress.rounds == 0
+        candidates = best_first(segment.fit(item, first=first, steps=_LAST_STEPS) for item in candidates)
+        candidates = drop_needless_ends(candidates)
+        remaining = select_plausible(candidates, 0.5 if first else 0.05)
+        self.progress = Progress(progress.onset_min, float(times[-1]), progress.rounds + 1, remaining)
+        candidates = [segment.add_deviations(item) for item in select_plausible(candidates, 0.0)]
+        return [replace(item, log_volume=log_volume_of(item, window)) for item in candidates]
 
-    def _fitted(self, fit: Fit, stretch: Stretch, *, first: bool, last: bool) -> Fit:
-        """Fitted to the rows of a stretch, from where it is."""
-        nothing = stretch.nothing.value
-        descent = Descent(self.hypotheses[fit.hypothesis], stretch)
-        point = descent.at(fit.size, fit.onset_min)
-        if first and nothing - point.loss < _KEPT * fit.gain:
-            tried = [descent.at(share * fit.size, fit.onset_min) for share in _SHRINKS]
-            point = min((point, *tried), key=lambda item: item.loss)
-        slope, fresh = descent.slope(point, fit.size_sd), True
-        for _ in range(_LAST_STEPS if last else _STEPS):
-            nearer = descent.stepped(point, slope)
-            gained, point = point.loss - nearer.loss, nearer
-            if gained < SETTLED and fresh:
-                break
-            fresh = not (fresh and gained > SETTLED)
-            if fresh:
-                slope = descent.slope(point, slope.size_sd)
-        onset_sd_min = inf
-        if last:
-            point, onset_sd_min = descent.onset(*descent.jumped(point, slope), slope)
-        reached, reached_sd = descent.reached(point, slope)
-        gain = nothing - point.loss
-        found = (slope.size_sd, onset_sd_min, reached, reached_sd)
-        return Fit(fit.hypothesis, point.size, point.onset_min, gain, point.w, fit.log_volume, *found)
+    def _extend(
+        self, progress: Progress, window: Window, end: int, without_fault: FilterResult
+    ) -> tuple["_Segment", list[Candidate]]:
+        """Make the segment of the next round, and extrapolate the candidates to its end."""
+        times, candidates = window.time_min, progress.candidates
+        earliest = int(np.searchsorted(times, min(item.onset_min for item in candidates)))
+        begin = max(earliest - max(_MARGIN_ROWS, (end - earliest) // 4), 0)
+        parameters = [item.extrapolate(progress.end_min, float(times[end - 1])) for item in candidates]
+        segment = _Segment(self, window, begin, end, without_fault)
+        return segment, [replace(item, parameters=by) for item, by in zip(candidates, parameters, strict=True)]
 
+    def hypothesis(self, effect: Effect, profile: FittedProfile) -> Hypothesis:
+        """Hypothesis of a cause with a profile over some rows."""
+        if effect not in self._filters:  # takes some milliseconds, and many causes are never plausible
+            self._filters[effect] = FaultFilter(self._model, (effect,), self._noise)
+        self._filters[effect].limit(self._budget)
+        return Hypothesis(self._filters[effect], (profile,))
 
-def _begun(scan: Scan, window: Window) -> list[Fit]:
-    """The hypotheses of a scan of which anything can be said, best first."""
-    ratio = scan.ratio.reshape(scan.onset_min.size, -1)
-    size, information = scan.size.reshape(ratio.shape), scan.information.reshape(ratio.shape)
-    places = np.argmax(ratio, axis=0)
-    widths = np.gradient(scan.onset_min) if scan.onset_min.size > 1 else np.ones(1)
-    highest = np.max(ratio, axis=0)
-    likely = np.exp(0.5 * (ratio - np.where(np.isfinite(highest), highest, 0.0))) * widths[:, None]
-    off = scan.onset_min[:, None] - scan.onset_min[places]
-    onset_sd_min = np.sqrt(np.sum(likely * off**2, axis=0) / np.maximum(np.sum(likely, axis=0), 1e-300))
-    values = _values_since(window, scan.onset_min)
-    volume = np.sum(likely / np.sqrt(1.0 + values)[:, None], axis=0) / window.span_min
-    log_volume = np.log(np.maximum(volume, 1e-300))
-    found = []
-    for number, place in enumerate(places.tolist()):
-        if information[place, number] > 0.0 and isfinite(ratio[place, number]):
-            onset_min = float(scan.onset_min[place])
-            is_ramp = PROFILES[number // (ratio.shape[1] // len(PROFILES))] is RAMP
-            span = float(window.time_min[scan.rows - 1]) - onset_min if is_ramp else 1.0
-            value, sd = float(size[place, number]), float(information[place, number]) ** -0.5
-            gain, onset_sd = 0.5 * float(ratio[place, number]), float(onset_sd_min[number])
-            known = (sd, onset_sd, value * span, sd * span)
-            found.append(Fit(number, value, onset_min, gain, np.empty((0, 0)), float(log_volume[number]), *known))
-    return sorted(found, key=lambda item: -item.gain)
+    def run_without_fault(self, run: Run, like: Fit | None = None) -> Fit:
+        """Run of the filter of a plant without a fault; `like` is an earlier one over the same rows."""
+        return self.hypothesis(self._effects[0], Step(run.time_min)).evaluate(run, _no_fault(run), like)
 
 
-def _values_since(window: Window, onset_min: Array) -> Array:
-    """How many values were measured since each onset."""
-    counts = np.append(np.cumsum(np.sum(np.isfinite(window.measured), axis=1)[::-1])[::-1], 0)
-    return np.asarray(counts[np.searchsorted(window.time_min, onset_min)])
+class _Segment:
+    """Rows of a window on which hypotheses are compared.
+
+    Args:
+        fitter: fitter of the hypotheses.
+        window: the window.
+        begin: index of the first row.
+        end: index after the last row.
+        without_fault: the filter's run over the whole window without a fault.
+    """
+
+    def __init__(self, fitter: Fitter, window: Window, begin: int, end: int, without_fault: FilterResult) -> None:
+        part, missing = slice(begin, end), window.missing
+        self._fitter = fitter
+        self._run = Run(
+            window.time_min[part],
+            window.inputs[part],
+            window.measured[part],
+            missing=None if missing is None else missing[part],
+        )
+        self._profiles = {kind: kind(self._run.time_min) for kind in ALL_PROFILES}
+        for profile in self._profiles.values():  # of these profiles only the onset depends on the start
+            # Before an onset the first row at least is shared, so the filter never starts again: that needs a search.
+            profile.start_min = max(float(self._run.time_min[1]), window.earliest_min)
+        own = FilterResult(*(item[part] for item in without_fault))
+        like = Fit(_no_fault(self._run), 0.0, np.empty(0), own)
+        self._like = fitter.run_without_fault(self._run, like)
+
+    @property
+    def loss_without_fault(self) -> float:
+        """Loss of the filter without a fault."""
+        return self._like.loss
+
+    def _hypothesis(self, candidate: Candidate) -> Hypothesis:
+        return self._fitter.hypothesis(candidate.effect, self._profiles[candidate.profile])
+
+    def evaluate(self, candidate: Candidate, parameters: Array) -> Fit:
+        """Run the filter of a cause with this size and onset."""
+        return self._hypothesis(candidate).evaluate(self._run, (parameters,), self._like)
+
+    def fit(self, candidate: Candidate, *, first: bool, steps: int) -> Candidate:
+        """Fit a cause, starting from its parameters; in a first fit also from smaller sizes."""
+        start = candidate.parameters
+        if first:
+            at_start = self.evaluate(candidate, start)
+            if self.loss_without_fault - at_start.loss < _KEPT * candidate.gain:
+                trials = [self.evaluate(candidate, np.array([share * start[0], start[1]])) for share in _SHRINKS]
+                start = min((at_start, *trials), key=lambda item: item.loss).parameters[0]
+        fit = self._hypothesis(candidate).fit(self._run, (start,), steps, self._like)
+        gain = self.loss_without_fault - fit.loss
+        return replace(candidate, parameters=fit.parameters[0], gain=gain, w=np.nan_to_num(fit.w), fit=fit)
+
+    def has_left(self, candidate: Candidate, since_min: float) -> bool:
+        """Return true if the plant no longer follows a candidate after a time: more than noise is left."""
+        later = self._run.time_min > since_min
+        w = self.evaluate(candidate, candidate.parameters).w[later]
+        return log_evidence_of_residual(np.nan_to_num(w), np.isfinite(self._run.measured[later])) > 0.0
+
+    def start_end(self, candidate: Candidate) -> Candidate:
+        """Let a ramp end before the last row, with the same slope, if that explains the rows better as it is."""
+        if candidate.profile is not Ramp:
+            return candidate
+        (size, onset_min), end_min = candidate.parameters.tolist(), float(self._run.time_min[-1])
+        ended, span = replace(candidate, profile=EndedRamp), end_min - onset_min
+        trials = [
+            self.evaluate(ended, np.array([share * size, onset_min, onset_min + share * span])) for share in _ENDS
+        ]
+        best = min(trials, key=lambda item: item.loss)
+        if best.loss > self.evaluate(candidate, candidate.parameters).loss - LEAST_GAIN:
+            return candidate
+        return replace(ended, parameters=best.parameters[0])
+
+    def fit_end(self, candidate: Candidate) -> Candidate:
+        """Fit the end of a ramp; return the candidate as it is if it does not gain by that."""
+        (size, onset_min), end_min = candidate.parameters.tolist(), float(self._run.time_min[-1])
+        if candidate.profile is not Ramp:
+            return candidate
+        start = np.array([0.8 * size, onset_min, onset_min + 0.8 * (end_min - onset_min)])
+        ended = replace(candidate, profile=EndedRamp, parameters=start)
+        fit = self.fit(ended, first=False, steps=_LAST_STEPS)
+        return fit if fit.gain > candidate.gain + LEAST_GAIN else candidate
+
+    def add_deviations(self, candidate: Candidate, first_sd_min: float = 0.0) -> Candidate:
+        """Add the standard deviations of size and onset; that of the onset is at least `first_sd_min`."""
+        assert candidate.fit is not None
+        covariance = self._hypothesis(candidate).covariance(self._run, candidate.fit, first_sd_min)
+        size_sd, onset_sd_min, *end_sds_min = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+        parameters, times = candidate.parameters, self._run.time_min
+        end_log_volume = sum(log_share(sd, float(times[-1]) - float(parameters[1])) for sd in end_sds_min)
+        # Within an interval only the interval's mean depends on the onset; for a sensor nothing does.
+        within = float(np.interp(parameters[1], times[1:], np.diff(times))) / sqrt(12.0)
+        if candidate.profile is Step and isinstance(candidate.effect, SensorEffect):
+            parameters = np.array([parameters[0], interval_middle(times, parameters[1])])
+        onset_sd_min = max(onset_sd_min, first_sd_min, within)
+        sds = {"size_sd": size_sd, "onset_sd_min": onset_sd_min}
+        return replace(candidate, parameters=parameters, end_log_volume=end_log_volume, **sds)
 
 
-def _log_volume(fit: Fit, window: Window) -> float:
-    """That of a fit whose onset is about normal."""
-    values = float(_values_since(window, np.array([fit.onset_min]))[0])
-    return log(min(sqrt(2 * pi) * fit.onset_sd_min / window.span_min, 1.0)) - 0.5 * log(1.0 + values)
-
-
-def _begin(fits: Sequence[Fit], window: Window) -> int:
-    """The row that hypotheses begin with: some rows before any of them sets in."""
-    first = int(np.searchsorted(window.time_min, min(item.onset_min for item in fits)))
-    return max(first - _MARGIN_ROWS, 0)
+def _no_fault(run: Run) -> tuple[Array]:
+    """Parameters of any profile that is zero everywhere."""
+    return (np.array([0.0, run.time_min[-1], run.time_min[-1]]),)

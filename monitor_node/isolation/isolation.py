@@ -1,76 +1,70 @@
-"""Which cause, since when, how large: asked when an alarm has been raised.
+"""Posterior probabilities of the causes of an alarm, each with its size and onset.
 
-Every cause of `causes` may have set in as a step or as a ramp. The linearised bank (see `glr_scan`)
-tells which come into question and where to begin, and the filters of the models with these causes in them are fitted to
-the rows (see `fit`). What is said in the end is the posterior probability of each cause: of
+Every cause of `causes` may occur as a step or as a ramp. A linearised scan (`glr_scan`) selects the plausible ones and
+their initial sizes and onsets, and the hypotheses of `diagnosis.fitting` are fitted to the rows (`fit`). The result is
+the posterior probability of each cause: of
 
     likelihood(size, onset) p(size) p(onset),
 
 integrated over sizes and onsets, over that of all causes together. The prior of a size is normal and as wide as one
-measurement would tell it (the unit information prior of Kass & Wasserman 1995, J. American Statistical Association 90),
-so that no cause is preferred for its unit: with n values since the onset the integral over the size is the greatest
-likelihood over sqrt(1 + n). That of an onset is even. Of a small fault the integral over the onset is a sum over the
-bank's; of a large one its onset is about normal, and the integral is Laplace's. All causes are equally likely
-beforehand, and so are that nothing is wrong and that the cause is none of these.
+measurement would determine it (the unit information prior of Kass & Wasserman 1995, J. American Statistical Association
+90), so that no cause is preferred for its unit: with n values since the onset the integral over the size is the maximum
+likelihood over sqrt(1 + n). The prior of an onset is uniform. For a small fault the integral over the onset is a sum
+over the scan's onsets; for a large one the onset is about normal, and the integral is Laplace's approximation. All
+causes have the same prior probability, and so have the hypotheses that nothing is wrong and that the cause is none of
+these.
 
-*None of these* is judged by what the best cause leaves. If innovations are larger by a factor than they should be,
-row by row or in sums over some rows, that factor's evidence is weighed like that of a cause. Nothing and none of these
-together are one suspect, `UNKNOWN`.
+*None of these* is weighed by the residual of the best cause. If innovations are larger by a factor than they should be,
+row by row or in sums over some rows, the evidence for that factor is weighed like that for a cause. Nothing and none of
+these together are one suspect, `UNKNOWN`.
 
-Causes that imitate each other share the probability, as they should: no more can be known from these rows.
+Causes that imitate each other share the probability, as they should: these rows do not distinguish them.
 """
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import exp, inf, isfinite, log, nan
 
-import numpy as np
-
+from monitor_node.isolation.candidate import Candidate, Progress, ProgressState
 from monitor_node.isolation.causes import CAUSES
-from monitor_node.isolation.error_dynamics import linearisable
-from monitor_node.isolation.fit import Fit, Fitter, WayState
-from monitor_node.isolation.glr_scan import Bank
-from monitor_node.isolation.hypothesis import Hypothesis
-from monitor_node.isolation.segment import HUBER
-from monitor_node.isolation.window import Row, Window, newest_rows, window_of
+from monitor_node.isolation.fit import Fitter
+from monitor_node.isolation.glr_scan import GlrScan
+from monitor_node.isolation.residual import log_evidence_of_residual
+from monitor_node.isolation.window import Row, newest_rows, window_of
+from reactorwatch.diagnosis.fitting.profiles import Ramp, Step
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.kalman.step_budget import BudgetExceededError, StepBudget
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.profiles import RAMP
 
 UNKNOWN, SENSOR, PROCESS = "unknown", "sensor", "process"
 
 SHARE_OF_RAMPS = 0.3
-"""How likely a cause is to grow, beforehand, rather than to set in at once."""
+"""Prior probability that a cause grows as a ramp, rather than as a step."""
 
 LOOK_STEPS, LOOK_STEPS_A_ROW = 80_000, 200
-"""Filter steps that a look may take: so many, and so many more for each row of the window, 200,000 for 600 rows. The
-largest faults of the catalogue take up to 180,000. A sensor that shows anything at all would take millions: filters
-then lose the plant and begin again row after row, and no cause explains it. The budget is the same however far rows are
-apart: a step takes as long on any way, and a look must not. So of rows some minutes apart the last looks at a large
-fault, over hundreds of rows, may stop where those of rows 0.1 min apart do not."""
+"""Filter steps that a look may take: a fixed number, and a number for each row of the window, 200,000 for 600 rows. The
+largest faults of the catalogue take up to 142,000. A sensor with arbitrary values would take millions: filters then
+diverge and start again row after row, and no cause explains it. The budget does not depend on the sampling period: a
+step takes equally long in any interval, and the time of a look is limited. So with rows some minutes apart the last
+looks at a large fault, over hundreds of rows, may stop where those with rows 0.1 min apart do not."""
 
 LEAST_ROWS = 100
-"""Of rows that are far apart at least so many are looked at, beside two for each row since the first alarm."""
-
-SUMMED_ROWS = (1, 5, 20)
-"""Over which innovations are summed, to see whether something is left in them."""
+"""Minimum number of rows of a look at rows that are far apart, besides two for each row since the first alarm."""
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A cause, and what is known of it if it is the one.
+    """A cause with its probability, and its size and onset if it is the cause.
 
     Attributes:
         cause: its name in the catalogue, or `UNKNOWN`.
         profile: `step` or `ramp`; empty if unknown.
-        probability: that it is this cause; over all suspects they sum up to 1.
-        size: of a ramp the one that it has reached in the last row; in the effect's unit.
-        size_sd: its standard deviation.
-        onset_min: when it set in.
-        onset_sd_min: standard deviation of that.
+        probability: posterior probability; those of all suspects sum to 1.
+        size: size in the effect's unit; for a ramp, in the last row.
+        size_sd: standard deviation of the size.
+        onset_min: onset in minutes.
+        onset_sd_min: standard deviation of the onset.
         kind: `sensor` or `process`; `UNKNOWN` if unknown.
     """
 
@@ -85,146 +79,112 @@ class Suspect:
 
 
 class Isolation:
-    """Keeps the newest rows of one plant and, asked, compares all causes on them.
+    """Compares all causes on rows of one plant.
 
     Args:
-        model: of the plant.
-        noise: of the plant and its sensors.
-        window_rows: how many of the newest rows are kept.
-        effects: the causes; those that bring states of their own are left out.
-        excluded: names of causes that do not come into question.
+        model: process model of the plant.
+        noise: noise levels of the plant and its sensors.
+        usual_rows: usual number of rows of a look, which its budget depends on.
+        effects: effects of the causes; those that add states are left out.
+        excluded: names of causes to leave out.
 
     Attributes:
-        budget: of the filter steps of the last look.
-        stopped: whether the last look stopped at its budget.
+        steps: number of filter steps that a look may take.
+        budget: budget of filter steps of the last look.
+        stopped: true if the last look stopped at its budget.
     """
 
     def __init__(
         self,
         model: ProcessModel,
         noise: NoiseLevels,
-        window_rows: int = 600,
+        usual_rows: int = 600,
         effects: Sequence[Effect] = CAUSES,
         excluded: Sequence[str] = (),
     ) -> None:
-        self._rows: deque[Row] = deque(maxlen=window_rows)
-        self._effects = linearisable(model, [effect for effect in effects if effect.name not in excluded])
+        self.steps = LOOK_STEPS + LOOK_STEPS_A_ROW * usual_rows
+        # An effect that adds a state has no infinitesimal deviation.
+        linearisable = (effect for effect in effects if effect.extend(model).state_names == model.state_names)
+        self._effects = tuple(effect for effect in linearisable if effect.name not in excluded)
         self._nominal = Filter(model, noise)
-        self._bank = Bank(model, noise, self._effects)
+        self._scan = GlrScan(model, noise, self._effects)
         self._fitter = Fitter(model, noise, self._effects)
         self.budget, self.stopped = StepBudget(1), False
 
-    def add(self, time_min: float, input_value: float, measured: Sequence[float]) -> None:
-        """Keep a row; NaN where something is missing."""
-        self._rows.append((time_min, input_value, measured))
-
-    def clear(self) -> None:
-        """Forget all rows."""
-        self._rows.clear()
-        self._fitter.forget()
-
     @property
-    def way(self) -> WayState | None:
-        """How far a fault has been followed: what is remembered beside the rows."""
-        return self._fitter.state
+    def progress(self) -> ProgressState | None:
+        """Progress of earlier looks with a large fault, from which the next look resumes."""
+        return None if self._fitter.progress is None else self._fitter.progress.state
 
-    @way.setter
-    def way(self, state: WayState | None) -> None:
-        self._fitter.restore(state)
-
-    @property
-    def steps(self) -> int:
-        """Filter steps that a look at the present rows may take."""
-        return LOOK_STEPS + LOOK_STEPS_A_ROW * (self._rows.maxlen or len(self._rows))
+    @progress.setter
+    def progress(self, state: ProgressState | None) -> None:
+        self._fitter.progress = None if state is None else Progress.from_state(state, self._effects)
 
     @property
     def preparations(self) -> list[Callable[[], None]]:
-        """Make all functions and machine code that looks need, so that the first look takes as long as any other.
+        """Functions that compile all that looks need, so that the first look takes as long as any other.
 
-        They are parts, of some hundredths of a second each, for the first isolation of a model in this process.
+        Each takes some hundredths of a second for the first isolation of a model in this process.
         """
-        return [self._nominal.prepare, self._bank.prepare, *(item.prepare for item in self._fitter.hypotheses)]
+        return [self._nominal.prepare, self._scan.prepare, *self._fitter.preparations]
 
-    def suspects(self, not_before_min: float = -inf, since_rows: int = 0) -> list[Suspect]:
-        """The causes that come into question, likeliest first, and `UNKNOWN` among them.
+    def suspects(self, rows: Sequence[Row], since_rows: int = 0, not_before_min: float = -inf) -> list[Suspect]:
+        """Compute the plausible causes, most likely first, `UNKNOWN` among them.
 
         A look stops at a budget of filter steps. `UNKNOWN` is then the only suspect, and `stopped` is set.
 
         Args:
-            not_before_min: nothing was wrong before.
+            rows: rows, oldest first.
             since_rows: number of rows since the first alarm. Of rows that are far apart older ones are left out, but
-                not those in which the fault may have set in.
+                not those in which the fault may have begun.
+            not_before_min: time before which nothing was wrong.
         """
         self.budget, self.stopped = StepBudget(self.steps), False
         try:
-            return self._compared(newest_rows(tuple(self._rows), LEAST_ROWS + 2 * since_rows), not_before_min)
-        except BudgetExceededError:  # hypotheses of which some were fitted and some were not cannot be compared
+            return self._compare(newest_rows(rows, LEAST_ROWS + 2 * since_rows), not_before_min)
+        except BudgetExceededError:  # fitted hypotheses cannot be compared with others that are not
             self.stopped = True
             return [_unknown(1.0)]
 
-    def _compared(self, rows: Sequence[Row], not_before_min: float) -> list[Suspect]:
+    def _compare(self, rows: Sequence[Row], not_before_min: float) -> list[Suspect]:
         self._nominal.budget = self.budget
         window = window_of(rows, self._nominal, not_before_min)
         if window is None:
             return [_unknown(1.0)]
-        found_by_bank = self._bank.scan(window)
-        fits = [fit for fit in self._fitter.fit(window, *found_by_bank, self.budget) if isfinite(fit.gain)]
-        if not fits:  # nothing was measured in which a cause would show, or none can be followed through it
+        scans = self._scan.scan(window)
+        candidates = [item for item in self._fitter.fit(window, *scans, self.budget) if isfinite(item.gain)]
+        if not candidates:  # no measurement would show a cause, or every filter diverged
             return [_unknown(1.0)]
-        evidence = [self._evidence(fit) for fit in fits]
-        none = evidence[0] + _left(fits[0], window)
+        evidence = [_log_evidence(item) for item in candidates]
+        none = evidence[0] + log_evidence_of_residual(*candidates[0].residual(window))
         top = max(*evidence, none, 0.0)
         weights = [exp(value - top) for value in evidence]
         unknown = exp(none - top) + exp(-top)
         total = sum(weights) + unknown
-        found = [_unknown(unknown / total)]
+        suspects = [_unknown(unknown / total)]
         for effect in self._effects:
-            of_cause = [
-                place for place, fit in enumerate(fits) if self._fitter.hypotheses[fit.hypothesis].effect is effect
-            ]
-            if of_cause:
-                likeliest = fits[max(of_cause, key=weights.__getitem__)]
-                share = sum(weights[place] for place in of_cause) / total
-                found.append(_suspect(self._fitter.hypotheses[likeliest.hypothesis], likeliest, share))
-        return sorted(found, key=lambda item: -item.probability)
-
-    def _evidence(self, fit: Fit) -> float:
-        """Logarithm of how much likelier the rows are with a cause, over all its sizes and onsets."""
-        is_ramp = self._fitter.hypotheses[fit.hypothesis].profile is RAMP
-        return fit.gain + fit.log_volume + log(SHARE_OF_RAMPS if is_ramp else 1.0 - SHARE_OF_RAMPS)
+            indices = [index for index, item in enumerate(candidates) if item.effect is effect]
+            if indices:
+                likeliest = candidates[max(indices, key=weights.__getitem__)]
+                suspects.append(_suspect(likeliest, sum(weights[index] for index in indices) / total))
+        return sorted(suspects, key=lambda item: -item.probability)
 
 
-def _left(fit: Fit, window: Window) -> float:
-    """Logarithm of the evidence that more than noise is left since the onset of the best cause, over that of noise."""
-    since = int(np.sum(window.time_min < fit.onset_min)) - (window.time_min.size - len(fit.w))
-    w = fit.w[max(since, 0) :]
-    known = np.isfinite(window.measured[window.time_min.size - len(w) :])
-    found = []
-    for rows in SUMMED_ROWS:
-        whole = slice(len(w) // rows * rows)
-        counts = np.sum(known[whole].reshape(-1, rows, w.shape[1]), axis=1)
-        sums = np.sum(np.clip(w[whole], -HUBER, HUBER).reshape(-1, rows, w.shape[1]), axis=1)
-        n = int(np.sum(counts > 0))
-        square = float(np.sum(sums[counts > 0] ** 2 / counts[counts > 0]))
-        if n:
-            larger = 0.5 * (square - n - n * log(square / n)) if square > n else 0.0
-            found.append(larger - 0.5 * log(n))
-    return max(found, default=0.0) - log(len(SUMMED_ROWS))
-
-
-def _suspect(hypothesis: Hypothesis, fit: Fit, probability: float) -> Suspect:
-    effect = hypothesis.effect
-    kind = SENSOR if effect.location.endswith("_sensor") else PROCESS
-    return Suspect(
-        effect.name,
-        hypothesis.profile.name,
-        probability,
-        fit.reached,
-        fit.reached_sd,
-        fit.onset_min,
-        fit.onset_sd_min,
-        kind,
+def _log_evidence(item: Candidate) -> float:
+    """Logarithm of the likelihood ratio of a cause to no fault, integrated over sizes and onsets."""
+    return (
+        item.gain
+        + item.log_volume
+        + item.end_log_volume
+        + log(1.0 - SHARE_OF_RAMPS if item.profile is Step else SHARE_OF_RAMPS)
     )
+
+
+def _suspect(item: Candidate, probability: float) -> Suspect:
+    kind = SENSOR if item.effect.location.endswith("_sensor") else PROCESS
+    size, onset_min = item.parameters[:2].tolist()
+    profile = (Step if item.profile is Step else Ramp).name
+    return Suspect(item.effect.name, profile, probability, size, item.size_sd, onset_min, item.onset_sd_min, kind)
 
 
 def _unknown(probability: float) -> Suspect:

@@ -1,24 +1,29 @@
-"""From an alarm to its cause: when the causes are compared, and what is told of it.
+"""Search of the cause of an alarm: the schedule of its looks, the rows they use, and their publication.
 
-Comparing all causes takes tenths of a second, so it is not done at every row but some rows after the first alarm of an
-incident, and again when three times as many have come, as long as an alarm stands that does not say itself what it
-is. What is then told follows from the samples alone. While the likeliest suspect is a sensor, it is also told what that
-sensor would read were it right.
+A look at all causes takes tenths of a second. So it is taken some rows after the first alarm of an incident and again
+when three times as many have come, as long as an alarm is active that does not name its cause itself. A slow fault, or
+one that others imitate, is only distinguished by many rows: the last looks follow after more than a thousand. Until
+then the rows since the alarm are kept, and `ROWS_BEFORE` before it: a slow ramp is noticed hundreds of rows after its
+onset. A plant without an unexplained alarm keeps `isolation_rows` rows.
+
+The result depends on the samples alone. While the most likely cause is a sensor, its true reading is reconstructed.
 """
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from math import inf
+from contextlib import suppress
+
+import msgspec
 
 from monitor_node.alarms.alarms import STUCK_SENSOR, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.references import ProcessReference, output_indices
 from monitor_node.config import MonitorConfig
+from monitor_node.isolation.candidate import ProgressState
 from monitor_node.isolation.causes import CAUSES
-from monitor_node.isolation.fit import WayState
 from monitor_node.isolation.isolation import UNKNOWN, Isolation, Suspect
 from monitor_node.isolation.reconstruction import Reconstruction, ReconstructionState
-from monitor_node.isolation.window import Row
+from monitor_node.isolation.window import Row, newest_rows
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Reconstruction as ReconstructionMessage
@@ -29,27 +34,33 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
 
-LOOKS = (10, 30, 100, 300)
-"""Rows after the first alarm of an incident at which the causes are compared."""
+LOOKS = (10, 30, 100, 300, 1000, 1300)
+"""Numbers of rows after the first alarm of an incident at which the causes are compared."""
+
+FEW_ROWS = 300
+"""Later looks are left out if rows are so far apart that not all since the alarm could be used (`newest_rows`)."""
+
+ROWS_BEFORE = 400
+"""Number of rows before the first alarm that late looks use."""
 
 LEAST = 0.01
-"""Suspects that are less likely are not told."""
+"""Probability below which a suspect is not published."""
 
 CONVINCED = 0.5
-"""A sensor that is at least so likely the cause is reconstructed."""
+"""Probability from which a suspected sensor is reconstructed."""
 
 UNITS = {effect.name: effect.unit for effect in CAUSES}
 OUTPUTS = {effect.name: effect.output for effect in CAUSES if isinstance(effect, SensorEffect)}
 
 
 def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[None]:
-    """Make, part by part, what the first look for causes would make; one is made for each item that is asked for.
+    """Compile what the first look for causes would compile, one part for each item of the iterator.
 
-    In all it takes about a second of the processor, or ten if nothing is on the disk.
+    All parts take about a second of processor time, or ten if nothing is in the cache on the disk.
 
     Args:
-        config: of the monitor.
-        model: that the plant may be watched by; None: there is none.
+        config: settings of the monitor.
+        model: process model of the plant; None without one.
     """
     if model is None or not has_causes(config, model):
         return
@@ -58,52 +69,53 @@ def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[N
         for prepare in Isolation(model, noise, config.isolation_rows).preparations:
             prepare()
             yield
-    except Exception:  # noqa: BLE001 # the first look meets it again, at the plant's border, which counts and logs it
+    except Exception:  # noqa: BLE001 # the first look raises it again, at the stage's border, which counts and logs it
         return
 
 
 def has_causes(config: MonitorConfig, model: ProcessModel) -> bool:
-    """True if causes are looked for where rows are judged by this model; the causes are those of the reactor."""
+    """Return true if causes are searched with this model; the catalogue of causes is that of the reactor."""
     return config.isolation and model.name == cstr().name
 
 
 class SuspicionState(StoredState, frozen=True):
-    """All that is remembered.
+    """State of the search for causes.
 
     Attributes:
-        rows: the newest, doubles: time in minutes, input, outputs of the model.
-        incident: that was looked at last.
-        since: rows since its first alarm; None: no alarm stands that has to be explained.
-        way: how far its fault has been followed.
-        output: output of the newest reconstruction.
-        cause: and why.
-        reconstruction: None: there is none.
+        rows: newest rows as doubles: time in minutes, input, outputs of the model.
+        incident: number of the latest incident with a search.
+        since: number of rows since its first alarm; None: no active alarm has an unknown cause.
+        way: `ProgressState` of a large fault; None without one. Earlier versions stored another structure, which is
+            ignored: the fault is then followed from its start again.
+        output: output output of the newest reconstruction.
+        cause: cause of the reconstruction.
+        reconstruction: state of the reconstruction; None without one.
     """
 
     rows: bytes
     incident: int
     since: int | None
-    way: WayState | None
+    way: object
     output: str
     cause: str
     reconstruction: ReconstructionState | None
 
 
 class Suspicion:
-    """Looks for the causes of one plant's alarms.
+    """Searches the causes of one plant's alarms.
 
     Args:
-        config: of the monitor.
-        board: the alarms of the plant.
-        reference: what its rows are expected by.
+        config: settings of the monitor.
+        board: annunciator of the plant.
+        reference: reference by which the rows are predicted.
     """
 
     def __init__(self, config: MonitorConfig, board: Annunciator, reference: ProcessReference) -> None:
         self._config, self._board, self._reference = config, board, reference
-        self._places = output_indices(reference.model, config.outputs)
-        self._all_watched = self._places == list(range(len(reference.model.outputs)))
+        self._indices = output_indices(reference.model, config.outputs)
+        self._all_watched = self._indices == list(range(len(reference.model.outputs)))
         self._isolation: Isolation | None = None
-        self._rows: deque[tuple[float, float, list[float]]] = deque(maxlen=config.isolation_rows)
+        self._rows: deque[Row] = deque(maxlen=config.isolation_rows)
         self._incident = 0
         self._since: int | None = None
         self._reconstruction: Reconstruction | None = None
@@ -111,29 +123,32 @@ class Suspicion:
 
     @property
     def state(self) -> SuspicionState:
-        """A copy of all that is remembered."""
+        """A copy of the state."""
+        progress = None if self._isolation is None else self._isolation.progress
         return SuspicionState(
             pack_numbers([(time_min, input_value, *measured) for time_min, input_value, measured in self._rows]),
             self._incident,
             self._since,
-            None if self._isolation is None else self._isolation.way,
+            None if progress is None else msgspec.to_builtins(progress),
             self._output,
             self._cause,
             None if self._reconstruction is None else self._reconstruction.state,
         )
 
     def restore(self, state: SuspicionState) -> None:
-        """Go on where another of the same plant was when `state` was taken.
+        """Resume from the state of another search for the same plant.
 
         Raises:
             ValueError: the state is damaged.
         """
         model = self._reference.model
+        self._incident = state.incident
+        self._set_since(state.since)
         rows = unpack_numbers(state.rows, 2 + len(model.outputs)).tolist()
         self._rows.extend((row[0], row[1], row[2:]) for row in rows)
-        self._incident, self._since = state.incident, state.since
         if state.way is not None:
-            self._compared().way = state.way
+            with suppress(msgspec.ValidationError):  # stored by an earlier version
+                self._made_isolation().progress = msgspec.convert(state.way, ProgressState)
         if state.reconstruction is not None:
             self._reconstruct(state.output, state.cause, 0.0, ())
             assert self._reconstruction is not None
@@ -143,65 +158,89 @@ class Suspicion:
     def update(
         self, time_ns: int, input_value: float, values: list[float], units: list[str], stuck: list[bool]
     ) -> list[Publication]:
-        """Take a row in, after its alarms.
+        """Process a row after its alarms.
 
         Args:
-            time_ns: of the row.
-            input_value: NaN if missing.
-            values: of the outputs; NaN where missing.
-            units: of the outputs.
-            stuck: outputs whose sensors are stuck; their values are missing.
+            time_ns: time of the row.
+            input_value: input; NaN if missing.
+            values: outputs; NaN where missing.
+            units: units of the outputs.
+            stuck: flags of the outputs whose sensors are stuck; their values are missing.
         """
-        time_min, measured = time_ns / MINUTE_NS, self._measured(values)
+        time_min, measured = time_ns / MINUTE_NS, self._model_outputs(values)
         if self._rows and time_min <= self._rows[-1][0]:  # the plant's clock was set back
             self._rows.clear()
             self._isolation = None
         self._rows.append((time_min, input_value, measured))
-        if self._isolation is not None:
-            self._isolation.add(time_min, input_value, measured)
         board = self._board
-        if not board.has_unexplained and True not in stuck:  # as mostly
-            self._reconstruction = self._since = None
+        if not board.has_unexplained and True not in stuck:  # the usual case
+            self._reconstruction = None
+            if self._since is not None:
+                self._set_since(None)
             return []
         if True in stuck:
             self._reconstruct(self._config.outputs[stuck.index(True)], STUCK_SENSOR, time_min, list(self._rows)[:-1])
         elif self._cause == STUCK_SENSOR or not board.has_unexplained:
             self._reconstruction = None
-        publications = self._reconstructed(time_ns, input_value, measured, values, units)
+        publications = self._publish_reconstruction(time_ns, input_value, measured, values, units)
         if not board.has_unexplained:
-            self._since = None
+            self._set_since(None)
             return publications
-        if self._since is None or board.incident != self._incident:
-            self._since, self._incident = 0, board.incident
-        self._since += 1
-        if self._since in LOOKS:
-            isolation = self._compared()
-            suspects = isolation.suspects(-inf, self._since)
-            told = [_told(item) for item in suspects if item.probability >= LEAST]
-            publications += board.set_suspects(time_ns, told, stopped=isolation.stopped)
-            self._follow(suspects[0])
+        is_new = self._since is None or board.incident != self._incident
+        self._incident = board.incident
+        if is_new and self._isolation is not None:
+            self._isolation.progress = None
+        self._set_since(1 if is_new or self._since is None else self._since + 1)
+        if self._since is not None and self._is_look_due(self._since):
+            publications += self._look(time_ns, self._since)
         return publications
 
-    def _compared(self) -> Isolation:
-        """With the newest rows in it. It is made at the first alarm: of thousands of plants few ever have one."""
+    def _set_since(self, since: int | None) -> None:
+        """Set the number of rows since the first alarm; more rows are kept as long as looks follow."""
+        self._since = since
+        usual = self._config.isolation_rows
+        if since is not None and since <= LOOKS[-1]:
+            usual = max(usual, min(usual, ROWS_BEFORE) + LOOKS[-1])
+        elif self._isolation is not None:
+            self._isolation.progress = None
+        if self._rows.maxlen != usual:
+            self._rows = deque(self._rows, maxlen=usual)
+
+    def _is_look_due(self, since: int) -> bool:
+        """Return true for a row with a look; late looks need rows that are not far apart."""
+        return since in LOOKS and (since <= FEW_ROWS or len(newest_rows(self._rows_of_look(since))) > since)
+
+    def _rows_of_look(self, since: int) -> list[Row]:
+        """Rows for a look: the usual number, and later `ROWS_BEFORE` rows before the first alarm and all since."""
+        usual = self._config.isolation_rows
+        return list(self._rows)[-max(usual, min(usual, ROWS_BEFORE) + since) :]
+
+    def _look(self, time_ns: int, since: int) -> list[Publication]:
+        isolation = self._made_isolation()
+        suspects = isolation.suspects(self._rows_of_look(since), min(since, FEW_ROWS))
+        causes = [_suspected_cause(item) for item in suspects if item.probability >= LEAST]
+        publications = self._board.set_suspects(time_ns, causes, stopped=isolation.stopped)
+        self._follow(suspects[0])
+        return publications
+
+    def _made_isolation(self) -> Isolation:
+        """Make the isolation at the first alarm: few of thousands of plants ever have one."""
         if self._isolation is None:
             reference = self._reference
             self._isolation = Isolation(reference.model, reference.noise, self._config.isolation_rows)
-            for row in self._rows:
-                self._isolation.add(*row)
         return self._isolation
 
-    def _measured(self, values: list[float]) -> list[float]:
-        """The outputs of the model; NaN for those that are not watched."""
+    def _model_outputs(self, values: list[float]) -> list[float]:
+        """Outputs of the model; NaN for those that are not monitored."""
         if self._all_watched:
             return values
         measured = [float("nan")] * len(self._reference.model.outputs)
-        for place, value in zip(self._places, values, strict=True):
-            measured[place] = value
+        for index, value in zip(self._indices, values, strict=True):
+            measured[index] = value
         return measured
 
     def _follow(self, suspect: Suspect) -> None:
-        """Begin, or cease, to reconstruct."""
+        """Start or stop the reconstruction of a sensor."""
         output = OUTPUTS.get(suspect.cause, "")
         if suspect.probability >= CONVINCED and output in self._config.outputs:
             self._reconstruct(output, suspect.cause, suspect.onset_min, self._rows)
@@ -209,27 +248,27 @@ class Suspicion:
             self._reconstruction = None
 
     def _reconstruct(self, output: str, cause: str, onset_min: float, rows: Iterable[Row]) -> None:
-        """Tell after these rows what the sensor of an output should read, as long as that is not done already."""
+        """Start to reconstruct the sensor of an output after these rows, unless that is done already."""
         if self._reconstruction is None or (output, cause) != (self._output, self._cause):
             model, noise = self._reference.model, self._reference.noise
-            place = model.output_names.index(output)
-            self._reconstruction = Reconstruction(model, noise, place, rows, onset_min)
+            index = model.output_names.index(output)
+            self._reconstruction = Reconstruction(model, noise, index, rows, onset_min)
         self._output, self._cause = output, cause
 
-    def _reconstructed(
+    def _publish_reconstruction(
         self, time_ns: int, input_value: float, measured: list[float], values: list[float], units: list[str]
     ) -> list[Publication]:
         if self._reconstruction is None:
             return []
         value, sd = self._reconstruction.update(time_ns / MINUTE_NS, input_value, measured)
-        place = self._config.outputs.index(self._output)
+        index = self._config.outputs.index(self._output)
         message = ReconstructionMessage(
-            time_ns=time_ns, value=value, sd=sd, unit=units[place], measured=values[place], cause=self._cause
+            time_ns=time_ns, value=value, sd=sd, unit=units[index], measured=values[index], cause=self._cause
         )
         return [Publication(keys.key(self._config.plant, keys.RECONSTRUCTION, self._output), message)]
 
 
-def _told(suspect: Suspect) -> SuspectedCause:
+def _suspected_cause(suspect: Suspect) -> SuspectedCause:
     if suspect.cause == UNKNOWN:
         return SuspectedCause(UNKNOWN, suspect.probability)
     return SuspectedCause(

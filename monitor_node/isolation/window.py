@@ -1,61 +1,65 @@
-"""The rows that a cause is looked for in, and what the filter makes of them if nothing is wrong.
+"""The rows in which a cause is sought, and the run of a filter without a fault over them.
 
-Every hypothesis is compared on the same rows, so what counts is settled here. The filter follows values that are far
-off from the second one on, as the monitor's own does. A value is an outlier, and counts as missing whatever the cause,
-if it stands out, alone or with its neighbour, from those before and after, which agree with each other. So is the
-newest one, if it is far off and the one before was not: nothing confirms it yet.
+All hypotheses are compared on the same rows, so rows and outliers are decided here. The filter ignores a value that is
+far off unless the one before was, too; so does the monitor's own. A value is an outlier, and counts as missing for
+every cause, if it stands out, alone or with its neighbour, from those before and after, which agree with each other. So
+is the newest one if it is far off and the one before was not: nothing confirms it yet.
 
-Where rows are missing and the input behind them is another, it is not known when it changed (see
-`kalman.input_uncertainty`): no cause may be found in what a lost row leaves.
+Where rows are missing and the input after them differs, the time of the change is unknown (see
+`kalman.input_uncertainty`): no cause may be inferred from a lost row.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf, isfinite, nan
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.ingest.sampling import missing_rows
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.ekf import LONGEST_GAP_MIN, Filter, FilterState
-from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
+from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.kalman.input_uncertainty import InputUncertainty
 
 Row: TypeAlias = tuple[float, float, Sequence[float]]
-"""Time in minutes, input, outputs; NaN where missing."""
+"""Time in minutes, input, outputs; missing values are NaN."""
 
 BURN_IN_ROWS = 20
-"""Rows at the start in which the filter still finds its state: nothing is said to set in there."""
+"""Number of rows at the start in which the filter settles: no onset is sought there."""
 
 GATE = 6.0
-"""A value so many standard deviations off has to be confirmed."""
+"""Standard deviations beyond which a value has to be confirmed."""
 
-_OF_THREE = 1.5**0.5  # standard deviation of a value less the mean of its neighbours, for white noise
+_OF_THREE = 1.5**0.5  # standard deviation of a value minus the mean of its neighbours, for white noise
 
 GAP_PERIODS = 5.0
-"""Rows that are so many usual periods apart have a gap between them, in which nobody knows what the input was."""
-
+"""Median periods beyond which an interval is a gap, in which the input is unknown."""
 
 MOST_PIECES = 6_000
-"""Pieces of two integration steps that the way through a window has at most, beside one for each row: 600 rows that are
-a minute apart. A filter takes some microseconds for each, so of rows that are farther apart fewer are looked at."""
+"""Largest number of additional pieces of two integration steps in the intervals of a window: 600 rows that are a minute
+apart. A filter takes some microseconds for each piece, so fewer rows are used if they are farther apart."""
+
+_CHUNK_ROWS = 16
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Rows without a long gap, and the filter's run over them.
+    """Rows without a long gap, and the run of the filter over them.
 
     Attributes:
         time_min: shape (rows,).
         inputs: shape (rows, 1).
         measured: shape (rows, n_y); NaN where missing or an outlier.
-        residual: what the filter was off by, shape (rows, n_y); NaN where missing or an outlier.
-        used: whether a value corrected the filter, shape (rows, n_y).
-        states: of the filter after each row.
-        first_onset: the first row at which something may set in; at least 1.
-        uncertainty: ways on which the input changed at an unknown time; None: there are none.
+        residual: innovations, shape (rows, n_y); NaN where missing or an outlier.
+        used: mask of values that corrected the filter, shape (rows, n_y).
+        x: filtered state, shape (rows, n_x).
+        covariance: covariance of the filtered state, shape (rows, n_x, n_x).
+        first_onset: index of the first row at which an onset is sought; at least 1.
+        missing: number of missing rows before each row whose input changed at an unknown time, else 0; None: none.
     """
 
     time_min: Array
@@ -63,9 +67,20 @@ class Window:
     measured: Array
     residual: Array
     used: NDArray[np.bool_]
-    states: list[FilterState]
+    x: Array
+    covariance: Array
     first_onset: int
-    uncertainty: InputUncertainty | None = None
+    missing: NDArray[np.intp] | None = None
+
+    @cached_property
+    def run(self) -> Run:
+        """The rows as hypotheses are fitted to them."""
+        return Run(self.time_min, self.inputs, self.measured, missing=self.missing)
+
+    @property
+    def period_min(self) -> float:
+        """Median sampling period."""
+        return float(np.median(np.diff(self.time_min)))
 
     @property
     def earliest_min(self) -> float:
@@ -74,81 +89,89 @@ class Window:
 
     @property
     def span_min(self) -> float:
-        """How long the time is in which something may set in."""
+        """Length of the time in which an onset is sought."""
         return float(self.time_min[-1] - self.time_min[self.first_onset - 1])
-
-    @property
-    def x(self) -> Array:
-        """Of the filter after each row, shape (rows, n_x)."""
-        return np.array([state.x for state in self.states])
-
-    @property
-    def covariance(self) -> Array:
-        """Of the filter's state after each row, shape (rows, n_x, n_x)."""
-        x = len(self.states[0].x)
-        return np.array([state.P for state in self.states]).reshape(len(self.states), x, x)
 
 
 def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf) -> Window | None:
-    """The newest rows without a gap; None if there are none in which something may set in.
+    """Make a window of the newest rows without a gap; None if no onset can be sought in them.
 
     Args:
-        rows: oldest first; where the input is missing it is taken to be as it was.
-        kalman: of the plant without a fault; begins anew.
-        not_before_min: nothing was wrong before.
+        rows: rows, oldest first; a missing input is taken to be the last known one.
+        kalman: filter of the plant without a fault; it is restarted.
+        not_before_min: time before which nothing was wrong.
     """
     kept = _since_gap(_running_on(rows))
     times, inputs = np.array([row[0] for row in kept]), np.array([[row[1]] for row in kept])
-    uncertainty = _doubt(times, inputs)
     first_onset = max(BURN_IN_ROWS, int(np.searchsorted(times, not_before_min)))
     if first_onset >= times.size:
         return None
-    measured = np.array([row[2] for row in kept], dtype=float)
-    n_y = measured.shape[1]
-    residual, off = np.full(measured.shape, nan), np.zeros(measured.shape, dtype=bool)
-    used = np.zeros(measured.shape, dtype=bool)
-    states: list[FilterState] = []
-    sd: list[tuple[float, ...]] = []
-    accept = [False] * n_y
+    measured, missing = np.array([row[2] for row in kept], dtype=float), _count_missing(times, inputs)
+    run = _run_filter(kalman, times, inputs, measured, missing)
+    # A filter that soon follows a step leaves only its first rows far off; one of a plant that moves a lot, any row.
+    outlier = _stands_out(run.residual, run.sd) & _stands_out(measured, run.sd)
+    outlier[-1] = run.far[-1] & ~run.far[-2]
+    measured, residual = np.where(outlier, np.nan, measured), np.where(outlier, np.nan, run.residual)
+    return Window(times, inputs, measured, residual, run.used, run.x, run.covariance, first_onset, missing)
+
+
+class _FilterRun(NamedTuple):
+    residual: Array
+    sd: Array
+    far: NDArray[np.bool_]
+    used: NDArray[np.bool_]
+    x: Array
+    covariance: Array
+
+
+def _run_filter(
+    kalman: Filter, times: Array, inputs: Array, measured: Array, missing: NDArray[np.intp] | None
+) -> _FilterRun:
+    """Filter the rows; a value beyond the gate corrects the filter only if the one before was beyond it, too.
+
+    Rows are filtered in chunks, and one by one only where values are beyond the gate.
+    """
+    uncertainty = None if missing is None else InputUncertainty.for_missing_rows(times, inputs, missing)
+    (rows, n_y), n_x = measured.shape, len(kalman.model.states)
+    nothing, no_flags = np.full((rows, n_y), nan), np.zeros((rows, n_y), dtype=bool)
+    states = np.zeros((rows, n_x)), np.zeros((rows, n_x, n_x))
+    run = _FilterRun(nothing, nothing.copy(), no_flags, no_flags.copy(), *states)
     kalman.restart()
-    for place, (time_min, value, outputs) in enumerate(kept):
-        other = (
-            ((value,), uncertainty.change_times_min(place))
-            if uncertainty is not None and uncertainty.rows[place]
-            else None
-        )
-        found = kalman.update(time_min, (value,), outputs, gate=GATE, accept=accept, uncertainty=other)
-        far = [abs(size) > GATE * sd for size, sd in zip(found.residual, found.sd, strict=True)]
-        off[place] = far
-        used[place] = [
-            isfinite(size) and (follow or not out)
-            for size, follow, out in zip(found.residual, accept, far, strict=True)
-        ]
-        residual[place] = found.residual
-        sd.append(found.sd)
-        accept = far
-        states.append(kalman.state)
-    # A filter that soon follows a step leaves its first rows standing alone; a plant that moves a lot, any row.
-    outlier = _standing_out(residual, np.array(sd)) & _standing_out(measured, np.array(sd))
-    outlier[-1] = off[-1] & ~off[-2]
-    return Window(
-        times,
-        inputs,
-        np.where(outlier, np.nan, measured),
-        np.where(outlier, np.nan, residual),
-        used,
-        states,
-        first_onset,
-        uncertainty,
-    )
+    row, chunk, accept = 0, _CHUNK_ROWS, np.zeros(n_y, dtype=bool)
+    while row < rows:
+        part = slice(row, row + 1 if accept.any() else min(row + chunk, rows))
+        later = None if uncertainty is None else uncertainty.select(part)
+        if accept.any():
+            other = None if later is None or not later.rows[0] else (inputs[row].tolist(), later.change_times_min(0))
+            values = inputs[row].tolist(), measured[row].tolist()
+            one = kalman.update(times[row], *values, gate=GATE, accept=accept.tolist(), uncertainty=other)
+            run.residual[row], run.sd[row] = one.residual, one.sd
+            run.x[row], run.covariance[row] = kalman.state.x, np.reshape(kalman.state.P, (n_x, n_x))
+        else:
+            record = FilterRecord.of(times[part], inputs[part], measured[part], GATE, None, later)
+            result = kalman.run_record(record, kalman.state if row else None)
+            run.residual[part], run.sd[part] = result.residual, result.sd
+            run.x[part], run.covariance[part] = result.x, result.P
+            for index in (row + np.flatnonzero(np.isnan(result.x).any(axis=1))).tolist():  # the filter has not started
+                before = max(index - 1, 0)
+                run.x[index], run.covariance[index] = (run.x[before], run.covariance[before]) if index else (0.0, 0.0)
+        run.far[part] = np.abs(run.residual[part]) > GATE * run.sd[part]
+        run.used[part] = np.isfinite(run.residual[part]) & (~run.far[part] | accept)
+        beyond = np.flatnonzero(run.far[part].any(axis=1))
+        last = row + int(beyond[0]) if beyond.size else part.stop - 1
+        if last + 1 < part.stop:
+            belief = tuple(run.x[last].tolist()), tuple(run.covariance[last].ravel().tolist())
+            kalman.state = FilterState(float(times[last]), tuple(inputs[last].tolist()), *belief)
+        row, accept, chunk = last + 1, run.far[last], _CHUNK_ROWS if beyond.size else 2 * chunk
+    return run
 
 
 def newest_rows(rows: Sequence[Row], least: int = 0) -> Sequence[Row]:
-    """The newest rows between which there are no more than `MOST_PIECES` pieces.
+    """Select the newest rows whose intervals have at most `MOST_PIECES` additional pieces.
 
     Args:
-        rows: oldest first.
-        least: number of rows that are kept in any case.
+        rows: rows, oldest first.
+        least: number of rows to keep in any case.
     """
     apart = np.diff([row[0] for row in rows])
     pieces = np.where((apart > 0.0) & (apart <= LONGEST_GAP_MIN), np.ceil(apart / LONGEST_ROW_MIN) - 1.0, 0.0)
@@ -156,35 +179,35 @@ def newest_rows(rows: Sequence[Row], least: int = 0) -> Sequence[Row]:
     return rows[-max(before, least, 1) :]
 
 
-def _doubt(time_min: Array, inputs: Array) -> InputUncertainty | None:
-    """Ways to rows behind missing rows whose input is another than that of the row before; None: there are none."""
+def _count_missing(time_min: Array, inputs: Array) -> NDArray[np.intp] | None:
+    """Number of missing rows before each row whose input differs from the row before; None if none are missing."""
     if time_min.size < 2:
         return None
     spacing, changed = np.diff(time_min), inputs[1:, 0] != inputs[:-1, 0]
     period, missing = float(np.median(spacing)), np.zeros(time_min.size, dtype=np.intp)
-    for place in np.flatnonzero(changed).tolist():
-        missing[place + 1] = missing_rows(float(spacing[place]) / period)
-    return InputUncertainty.for_missing_rows(time_min, inputs, missing) if missing.any() else None
+    for row in np.flatnonzero(changed).tolist():
+        missing[row + 1] = missing_rows(float(spacing[row]) / period)
+    return missing if missing.any() else None
 
 
-def _standing_out(values: Array, sd: Array) -> NDArray[np.bool_]:
-    """Which, alone or two in a row, stand out from those before and after them, shape (rows, n_y)."""
-    found = np.zeros(values.shape, dtype=bool)
-    for column, sizes, out in zip(values.T, sd.T, found.T, strict=True):
-        known = np.flatnonzero(np.isfinite(column))
+def _stands_out(values: Array, sd: Array) -> NDArray[np.bool_]:
+    """Mask of values that, alone or two in a row, stand out from those before and after them, shape (rows, n_y)."""
+    result = np.zeros(values.shape, dtype=bool)
+    for column, sizes, out in zip(values.T, sd.T, result.T, strict=True):
+        finite = np.flatnonzero(np.isfinite(column))
         for count in (1, 2):
-            before, after = column[known[: -count - 1]], column[known[count + 1 :]]
-            between = [known[place : known.size - count - 1 + place] for place in range(1, count + 1)]
+            before, after = column[finite[: -count - 1]], column[finite[count + 1 :]]
+            between = [finite[index : finite.size - count - 1 + index] for index in range(1, count + 1)]
             usual, apart = 0.5 * (before + after), np.abs(after - before)
             least = [np.maximum(GATE * _OF_THREE * sizes[now], apart) for now in between]
             far = [np.abs(column[now] - usual) > size for now, size in zip(between, least, strict=True)]
             for now in between:
                 out[now[np.logical_and.reduce(far)]] = True
-    return found
+    return result
 
 
 def _running_on(rows: Sequence[Row]) -> list[Row]:
-    """The newest rows whose times increase, every input known, from one on in which something is measured."""
+    """Select the newest rows with increasing times, inputs filled, from the first row with a measurement on."""
     kept: list[Row] = []
     flow = nan
     for row in rows:
@@ -197,7 +220,7 @@ def _running_on(rows: Sequence[Row]) -> list[Row]:
 
 
 def _since_gap(rows: list[Row]) -> list[Row]:
-    """The rows since the last gap."""
+    """Select the rows since the last gap."""
     if len(rows) < 2:
         return rows
     apart = np.diff([row[0] for row in rows])

@@ -5,6 +5,7 @@ kept beside it (`Rest`), and shared between plants where it is the same.
 """
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import NamedTuple
 
 import msgspec
@@ -16,6 +17,7 @@ from monitor_node.alarms.incidents import Incident
 from monitor_node.alarms.kpis import KpiState
 from monitor_node.alarms.states import State
 from monitor_node.baseline.references import ProcessReferenceState
+from monitor_node.baseline.training import TrainingState
 from monitor_node.chart_stage import ChartsState, alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -78,6 +80,7 @@ class Rest(NamedTuple):
         refusals: trainings that were refused.
         until_drift: rows until the next look at the drift.
         cause: what was looked for last: number of the incident, output and cause.
+        undiagnosed: rows of the training while its diagnosis is pending, then empty.
     """
 
     board: Annunciator | None
@@ -89,6 +92,7 @@ class Rest(NamedTuple):
     refusals: int
     until_drift: int
     cause: tuple[int, str, str]
+    undiagnosed: TrainingState
 
 
 class QuietForm:
@@ -162,17 +166,17 @@ class QuietForm:
             monitor: of the plant.
             record: shape (1,).
         """
-        receive_stats = monitor.receive_stats
         if monitor.is_replaying_history or monitor.phase != "watching":
             return None
-        if receive_stats.received_ns is None or receive_stats.counted_ns is None:
+        received_ns, counted_ns = monitor.receipts_ns
+        if received_ns is None or counted_ns is None:
             return None
         state = monitor.state
         watched, alignment = state.watch.watched, state.alignment
         board = msgspec.msgpack.decode(state.board, type=AnnunciatorState)
         if watched is None or not isinstance(watched.reference, ProcessReferenceState):
             return None
-        if watched.left_out or set(watched.charts.charts) != self._charts_made:
+        if watched.left_out or watched.baseline or set(watched.charts.charts) != self._charts_made:
             return None
         if not _is_at_rest(board, self._alarms) or not is_in_order(alignment) or not run_on(state.runs, alignment):
             return None
@@ -181,7 +185,8 @@ class QuietForm:
             return None
         record[:] = np.zeros(1, self.record)
         p = record[0]
-        for name, known in receive_stats._asdict().items():
+        p["received_ns"], p["counted_ns"] = received_ns, counted_ns
+        for name, known in asdict(monitor.stats).items():
             p[name] = known
         write_runs(p, state.runs)
         p["received"], p["published"] = state.received, state.published
@@ -213,6 +218,7 @@ class QuietForm:
             state.watch.refusals,
             watched.until_drift,
             (0, "", "") if looked is None else (looked.incident, looked.output, looked.cause),
+            state.watch.training if state.watch.training.times_ns else self._training,
         )
         return rest, rows
 
@@ -291,7 +297,7 @@ class QuietForm:
             self._predictors,
             rest.refusals,
             int(p["began_ns"]),
-            self._training,
+            rest.undiagnosed,
             watched,
         )
         return MonitorState(

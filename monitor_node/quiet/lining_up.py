@@ -1,5 +1,7 @@
 """Between a record and what is remembered of samples on their way into rows."""
 
+from dataclasses import astuple
+
 import numpy as np
 
 from monitor_node.ingest.alignment import AlignmentState, Counts, PendingRow
@@ -7,8 +9,6 @@ from monitor_node.ingest.sampling import Spacing
 from monitor_node.ingest.sequence_check import MEMORY as FULL_RUN
 from monitor_node.ingest.sequence_check import SequenceCheck
 from reactorwatch.runtime.delivery.gap_tracker import GapTracker
-
-COUNTS = ("rows", "incomplete_rows", "late", "duplicated", "out_of_order", "lost", "restarts")
 
 
 def is_in_order(alignment: AlignmentState) -> bool:
@@ -60,7 +60,7 @@ def write_alignment(p: np.void, alignment: AlignmentState) -> None:
     """Note samples on their way into rows."""
     p["expected"] = [numbering.expected or 0 for numbering in alignment.sequences]
     p["left"], p["left_ns"] = len(alignment.left), alignment.newest_left_ns or 0
-    p["counts"] = [getattr(alignment.counts, name) for name in COUNTS]
+    p["counts"] = astuple(alignment.counts)
     for pending_ns, waiting in alignment.pending.items():
         p["pending_ns"], p["values"] = pending_ns, waiting.values
         p["have"] = sum(1 << place for place, number in enumerate(waiting.numbers) if number is not None)
@@ -90,5 +90,5 @@ def alignment_of(p: np.void, times_ns: list[int]) -> AlignmentState:
     numbering = [
         GapTracker(number, pending_ns if here else left_ns) for number, here in zip(expected, have, strict=True)
     ]
-    counts = Counts(**dict(zip(COUNTS, p["counts"].tolist(), strict=True)))
+    counts = Counts(*p["counts"].tolist())
     return AlignmentState(pending, left, left_ns, list(newest), numbering, False, counts)

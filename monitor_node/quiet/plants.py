@@ -1,5 +1,6 @@
 """The quiet plants as a fleet sees them: they come and go, samples come in, and what is to be said goes out."""
 
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import msgspec
@@ -10,12 +11,11 @@ from monitor_node.baseline.references import GATE, ProcessReference
 from monitor_node.baseline.signal_range import signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.health import NODE, health_message
+from monitor_node.health import NODE, Processed, health_message
 from monitor_node.ingest.alignment import Counts, Row
 from monitor_node.ingest.receive_stats import STALL_NS, ReceiveStats
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE, USABLE
 from monitor_node.quiet.form import QuietForm
-from monitor_node.quiet.lining_up import COUNTS
 from monitor_node.quiet.ring import kept_spacings, kept_values
 from monitor_node.quiet.rows import NEW_MINUTE, judge
 from monitor_node.quiet.samples import silent_from, take_samples
@@ -168,7 +168,7 @@ class QuietPlants:
             monitor.failures.add("promotion", error, "the plant is learned again")
         monitor.on_history_end()
         p["health_due_ns"] = self._slots.health_due_ns[slot]
-        monitor.receive_stats = ReceiveStats(*(p[name].item() for name in ReceiveStats._fields))
+        monitor.stats, monitor.receipts_ns = _receive_stats(p), (int(p["received_ns"]), int(p["counted_ns"]))
         self._slots.leave(plant)
         return monitor
 
@@ -314,16 +314,15 @@ class QuietPlants:
         health = health_message(
             now_ns,
             phase,
-            int(p["start_ns"]),
-            Counts(**dict(zip(COUNTS, p["counts"].tolist(), strict=True))),
-            rest.refused or {},
-            received=int(p["received"]),
-            published=int(p["published"]),
-            lag_ns=int(p["lag_ns"]),
-            heard_from_ns=dict(zip(self._signals, p["heard_from_ns"].tolist(), strict=True)),
-            not_stored=int(p["not_stored"]),
-            stalls=int(p["stalls"]),
-            failures=rest.failures or {},
+            Processed(
+                Counts(*p["counts"].tolist()),
+                int(p["received"]),
+                int(p["published"]),
+                rest.refused or {},
+                rest.failures or {},
+                dict(zip(self._signals, p["heard_from_ns"].tolist(), strict=True)),
+            ),
+            _receive_stats(p),
             reference=ProcessReference.kind,
             training=1.0,
         )
@@ -347,3 +346,8 @@ class _Rows(NamedTuple):
     def first(self, count: int) -> "_Rows":
         """So many of them."""
         return _Rows(self.slots[:count], self.times_ns[:count], self.values[:count])
+
+
+def _receive_stats(p: np.void) -> ReceiveStats:
+    """Statistics by receive time of a record."""
+    return ReceiveStats(*(p[field.name].item() for field in fields(ReceiveStats)))

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from monitor_node.alarms.states import Event
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from monitor_node.diagnosis_worker import find_deviations
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.runtime.model_file import read_model_on_bus_clock
 
@@ -37,6 +38,8 @@ class Backtest:
         reference: kind of the reference, `equations` or `arx`; None if no row was evaluated.
         noise_levels: standard deviations of the equations' filter: of each sensor in its unit (`sensors`), of each
             state in its unit per square root of a minute (`states`); None with another reference.
+        baseline: change of the model after the diagnosis of the training; None: rows were evaluated by the equations as
+            given.
     """
 
     input: str
@@ -55,6 +58,7 @@ class Backtest:
     refused_trainings: int
     reference: str | None = None
     noise_levels: dict[str, dict[str, float]] | None = None
+    baseline: Baseline | None = None
 
     @property
     def raised_alarms(self) -> list[tuple[Alarm, int | None]]:
@@ -94,7 +98,7 @@ def run(
     """
     prefix = keys.key(config.plant, keys.SAMPLE, "")
     model = model or read_model_on_bus_clock(config.model, zero_ns)
-    monitor = Monitor(config, start_ns=0, points=False, model=model)
+    monitor = Monitor(config, start_ns=0, points=False, model=model, diagnose=find_deviations)
     alarms: list[Alarm] = []
     first_ns: int | None = None
 
@@ -124,4 +128,5 @@ def run(
         refused_trainings=monitor.refused_trainings,
         reference=monitor.reference or None,
         noise_levels=monitor.noise_levels,
+        baseline=monitor.baseline,
     )

@@ -18,7 +18,7 @@ from monitor_node.alarms.states import Event
 from monitor_node.signal_checks.timeout import DataTimeout
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
-from reactorwatch.contract.messages_pb2 import Alarm, Health
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Health
 from reactorwatch.errors import InputError
 
 MONITOR = "monitor"
@@ -45,6 +45,7 @@ class Session:
         heard_from_ns: time of the first sample by signal; empty if unknown.
         lost: number of lost samples that the monitor reported.
         events: operators' actions and data timeouts, in order.
+        baselines: changes of the baseline, in order.
     """
 
     starts_s: list[float]
@@ -54,6 +55,7 @@ class Session:
     heard_from_ns: dict[str, int] = field(default_factory=dict)
     lost: int = 0
     events: deque[Alarm] = field(default_factory=deque)
+    baselines: list[Baseline] = field(default_factory=list)
 
 
 def find_sessions(messages: Iterable[Encoded], plant: str) -> list[Session]:
@@ -66,11 +68,13 @@ def find_sessions(messages: Iterable[Encoded], plant: str) -> list[Session]:
     Raises:
         InputError: there is no health message of a monitor, or those of two monitors at the same time.
     """
-    health_key, alarms = keys.key(plant, keys.HEALTH, MONITOR), keys.key(plant, keys.ALARM, "")
+    wanted = {keys.key(plant, kind, MONITOR) for kind in (keys.HEALTH, keys.BASELINE)}
+    alarms = keys.key(plant, keys.ALARM, "")
     sessions: list[Session] = []
     before: deque[Alarm] = deque()  # of a monitor without a health message so far
+    early: list[Baseline] = []  # of the same
     for number, message in enumerate(messages):
-        if message.key != health_key and not message.key.startswith(alarms):
+        if message.key not in wanted and not message.key.startswith(alarms):
             continue
         try:
             body: Any = decode(message.payload, message.encoding)
@@ -78,12 +82,17 @@ def find_sessions(messages: Iterable[Encoded], plant: str) -> list[Session]:
             continue
         if isinstance(body, Health):
             _report(sessions, body, number)
+        elif isinstance(body, Baseline):
+            baselines = sessions[-1].baselines if sessions else early
+            if body not in baselines:  # a monitor that resumes publishes it again
+                baselines.append(body)
         elif isinstance(body, Alarm) and _is_from_monitor(body) and (body.event in ACTIONS or is_timeout(body)):
             (sessions[-1].events if sessions else before).append(body)
     if not sessions:
         raise InputError(f"holds no report of health of a monitor of plant {plant!r}, so there is nothing to verify")
     sessions[0].first = 0
     sessions[0].events = before + sessions[0].events
+    sessions[0].baselines[:0] = [item for item in early if item not in sessions[0].baselines]
     return sessions
 
 

@@ -1,7 +1,8 @@
 """Verify a recording: replay its samples through the monitor's core, and compare the publications.
 
-A monitor's publications follow from its settings, its samples, operators' actions, and data timeouts in receive time.
-Actions and timeouts are read from the recording (`recorded_sessions`). The samples are those of the recording in the
+A monitor's publications follow from its settings, its samples, operators' actions, data timeouts in receive time, and
+the row at which the diagnosis of the training changed the model. Actions, timeouts and the change are read from the
+recording (`recorded_sessions`). The samples are those of the recording in the
 order of receipt, which is the publisher's order for every subscriber. The monitor's first sample is known from its
 health messages. If it is not in the recording, the monitor was trained on samples that were not recorded, and cannot be
 verified.
@@ -27,7 +28,9 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.model_file import read_model_on_bus_clock
 
-COMPARED = frozenset({keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.ALARM_KPIS, keys.RECONSTRUCTION})
+COMPARED = frozenset(
+    {keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.ALARM_KPIS, keys.RECONSTRUCTION, keys.BASELINE}
+)
 """Kinds of messages that follow from the samples; health does not."""
 
 MOST_REPEATED = 10_000
@@ -124,6 +127,8 @@ class _Replay:
 
     def __init__(self, config: MonitorConfig, model: ProcessModel | None, session: Session, diff: MessageDiff) -> None:
         self.monitor = Monitor(config, start_ns=0, model=model)
+        for baseline in session.baselines:
+            self.monitor.schedule(baseline)
         self._config = config
         self._session = session
         self._diff = diff

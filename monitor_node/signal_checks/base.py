@@ -75,7 +75,6 @@ class SignalCheck:
         """Check the outputs of a row."""
         return []
 
-    @property
     def invalid(self) -> list[bool]:
         """The outputs whose readings, by their alarms, are no measurements."""
         return [False] * len(self.outputs)
@@ -115,10 +114,9 @@ class SignalCheck:
             signal: signal of the alarm.
             cause: suspected cause of the alarm.
         """
-
-        def explain(_: Judgement) -> Explanation:
-            return Explanation(
-                text, {} if signal == PLANT else {signal: 1.0}, [SuspectedCause(cause, 1.0, kind=SENSOR)]
-            )
-
-        return self.board.evaluate(alarm, time_ns, judgement, unit, explain)
+        raised = alarm.update(judgement)
+        if raised is None:
+            return []
+        shares = {} if signal == PLANT else {signal: 1.0}
+        explanation = Explanation(text, shares, [SuspectedCause(cause, 1.0, kind=SENSOR)]) if raised else None
+        return [self.board.record_change(alarm, time_ns, judgement, unit, explanation)]

@@ -40,8 +40,8 @@ class RangeCheck(SignalCheck):
             if alarm is None or value != value:
                 continue
             lower, upper, unit = self._ranges[index]
-            out = not lower <= value <= upper
-            if not out and alarm.is_idle:
+            out, rule = not lower <= value <= upper, alarm.memory.rule
+            if not (out or rule.standing or rule.recent):
                 continue
             name = self._names[index]
             text = (

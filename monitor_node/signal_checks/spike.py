@@ -281,7 +281,7 @@ class SpikeCheck(SignalCheck):
             alarm, verdict = self._alarms[index], spike.update(e[index], is_moved=is_moved)
             if verdict.quarantine:
                 flags = (*flags[:index], True, *flags[index + 1 :])
-            if verdict.spike or not alarm.is_idle:
+            if verdict.spike or alarm.memory.rule.standing or alarm.memory.rule.recent:
                 name = self.outputs[index]
                 size = verdict.size if verdict.spike else 0.0
                 judgement = Judgement(size, 0.0, -spike.limit, spike.limit, verdict.spike)

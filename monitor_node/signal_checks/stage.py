@@ -55,35 +55,33 @@ class SignalChecks:
     """Number of an output's alarms that can be false alarms."""
 
     def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange] | None = None) -> None:
-        self._board, self._outputs = board, config.outputs
+        self._outputs = config.outputs
         known = ranges or [ANY] * (1 + len(config.outputs))
         self._checks = [check(config, board, known) for check in CHECKS]
-        self._silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
-        self._on_row: list[Callable[..., list[Publication]]] = self._hooks("on_row")
-        self._measured: list[Callable[..., tuple[float, ...]]] = self._hooks("measured_values")
-        self._on_values: list[Callable[..., list[Publication]]] = self._hooks("on_values")
-        self._on_residuals: list[Callable[..., Flags]] = self._hooks("on_residuals")
-        self._invalid = [check for check in self._checks if type(check).invalid is not SignalCheck.invalid]
+        self.silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
+        """The check for missing data, which a receive time can decide as well."""
+        self.check_row: Callable[[int, tuple[float, ...]], list[Publication]]
+        self.check_row = self._only("on_row", _in_one_list)
+        """Checks a row, see `SignalCheck.on_row`."""
+        self.mask_values: Callable[[int, tuple[float, ...], list[Publication]], tuple[float, ...]]
+        self.mask_values = self._only("measured_values", _one_after_the_other)
+        """Masks the values of a row, see `SignalCheck.measured_values`."""
+        self.check_values: Callable[[int, list[float], list[str]], list[Publication]]
+        self.check_values = self._only("on_values", _in_one_list)
+        """Checks the outputs of a row, see `SignalCheck.on_values`."""
+        self.check_residuals: Callable[..., Flags] = self._only("on_residuals", _any_of_all)
+        """Checks the residuals of a row, see `SignalCheck.on_residuals`."""
+        self.invalid: Callable[[], Sequence[bool]] = self._only("invalid", _any_of_all)
+        """Outputs whose readings are no measurements, see `SignalCheck.invalid`."""
 
-    def _hooks(self, name: str) -> list[Callable[..., Any]]:
-        """A hook of those checks that have it."""
-        return [
+    def _only(self, name: str, combine: Callable[[list[Callable[..., Any]]], Callable[..., Any]]) -> Callable[..., Any]:
+        """A hook of the checks that have it; of a single one the hook itself, since every row passes there."""
+        hooks = [
             getattr(check, name)
             for check in self._checks
             if getattr(type(check), name) is not getattr(SignalCheck, name)
         ]
-
-    @property
-    def timeout_flags(self) -> list[bool]:
-        """Flags of the signals without data, the input first."""
-        return self._silence.silent
-
-    @property
-    def invalid_outputs(self) -> list[bool]:
-        """Outputs whose sensors are stuck: their readings are no measurements."""
-        if len(self._invalid) == 1:
-            return self._invalid[0].invalid
-        return [any(flags) for flags in zip(*(check.invalid for check in self._invalid), strict=True)]
+        return hooks[0] if len(hooks) == 1 else combine(hooks)
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """Learn from the training; arguments as for `SignalCheck.start`."""
@@ -121,41 +119,9 @@ class SignalChecks:
                 check.restore(getattr(state, FIELDS[check.name]))
             elif check.name in others:
                 check.restore(state.others[check.name])
-        self._silence.arm(now_ns)
+        self.silence.arm(now_ns)
 
     # --- rows ------------------------------------------------------------------------------------------------
-
-    def check_row(self, time_ns: int, values: tuple[float, ...]) -> list[Publication]:
-        """Check a row, input first; values are NaN where missing."""
-        if len(self._on_row) == 1:  # as mostly: a row passes here
-            return self._on_row[0](time_ns, values)
-        return [item for on_row in self._on_row for item in on_row(time_ns, values)]
-
-    def mask_values(
-        self, time_ns: int, values: tuple[float, ...], publications: list[Publication]
-    ) -> tuple[float, ...]:
-        """The values of a row, with NaN in place of those that are no measurements; see `SignalCheck.measured`."""
-        for measured in self._measured:
-            values = measured(time_ns, values, publications)
-        return values
-
-    def check_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
-        """Check the outputs of a row."""
-        if len(self._on_values) == 1:
-            return self._on_values[0](time_ns, values, units)
-        return [item for on_values in self._on_values for item in on_values(time_ns, values, units)]
-
-    def check_residuals(
-        self, time_ns: int, e: list[float], scales: list[float], units: list[str], publications: list[Publication]
-    ) -> Flags:
-        """Check the residuals of a row; returns the outputs whose value is quarantined.
-
-        Arguments as for `SignalCheck.on_residuals`.
-        """
-        if len(self._on_residuals) == 1:
-            return self._on_residuals[0](time_ns, e, scales, units, publications)
-        flags = [on_residuals(time_ns, e, scales, units, publications) for on_residuals in self._on_residuals]
-        return tuple(any(each) for each in zip(*flags, strict=True))
 
     def restart(self) -> None:
         """Forget what is withheld, as after a gap."""
@@ -167,38 +133,22 @@ class SignalChecks:
         for check in self._checks:
             check.on_restart()
 
-    def resume_from_alarms(self) -> None:
-        """Take as silent what the alarms say is silent: the next sample ends it."""
-        self._silence.resume_from_alarms()
 
-    # --- receive time ----------------------------------------------------------------------------------------
+def _in_one_list(hooks: list[Callable[..., list[Publication]]]) -> Callable[..., list[Publication]]:
+    return lambda *row: [item for hook in hooks for item in hook(*row)]
 
-    def on_receipt(self, now_ns: int) -> None:
-        """Note that something came from the plant."""
-        self._silence.of_plant.on_receipt(now_ns)
 
-    @property
-    def receipts_ns(self) -> tuple[int | None, int | None]:
-        """Receive time of the newest sample, and start of the next spacing; None before the first."""
-        return self._silence.of_plant.receipts_ns
+def _any_of_all(hooks: list[Callable[..., Flags]]) -> Callable[..., Flags]:
+    def check(*row: Any) -> Flags:
+        return tuple(any(flags) for flags in zip(*[hook(*row) for hook in hooks], strict=True))
 
-    @receipts_ns.setter
-    def receipts_ns(self, receipts_ns: tuple[int | None, int | None]) -> None:
-        self._silence.of_plant.receipts_ns = receipts_ns
+    return check
 
-    def due_ns(self) -> int | None:
-        """Time of the next `check` without samples; None: there is nothing to wait for."""
-        return self._silence.of_plant.due_ns()
 
-    @property
-    def deadline_ns(self) -> int | None:
-        """Latest allowed time of the next row, in the time of the samples."""
-        return self._silence.of_plant.deadline_ns()
+def _one_after_the_other(hooks: list[Callable[..., tuple[float, ...]]]) -> Callable[..., tuple[float, ...]]:
+    def mask(time_ns: int, values: tuple[float, ...], publications: list[Publication]) -> tuple[float, ...]:
+        for hook in hooks:
+            values = hook(time_ns, values, publications)
+        return values
 
-    def check(self, now_ns: int) -> list[Publication]:
-        """Check for a silence of the plant, by the clock of receipt."""
-        return self._silence.publish(0, self._silence.of_plant.check(now_ns))
-
-    def declare_timeout(self) -> list[Publication]:
-        """Declare the plant silent, as the clock of receipt did when this was recorded."""
-        return self._silence.publish(0, self._silence.of_plant.declare_timeout())
+    return mask

@@ -312,7 +312,7 @@ class StuckCheck(SignalCheck):
             if not isfinite(value):
                 continue
             alarm, judgement = self._alarms[index], self._stuck[index].update(value)
-            if judgement.out or not alarm.is_idle:
+            if judgement.out or alarm.memory.rule.standing or alarm.memory.rule.recent:
                 name, times = self.outputs[index], judgement.statistic
                 reading = format_quantity(value, units[index], ".6g")
                 text = f"{name} is stuck: it has read {reading} {times:.0f} times in a row"
@@ -320,7 +320,6 @@ class StuckCheck(SignalCheck):
                 self._note_alarms()
         return publications
 
-    @property
     def invalid(self) -> list[bool]:
         """See `SignalCheck`."""
         return self._invalid

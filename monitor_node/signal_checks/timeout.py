@@ -342,6 +342,14 @@ class SilenceCheck(SignalCheck):
                 publications += self.publish(index, change)
         return publications
 
+    def check(self, now_ns: int) -> list[Publication]:
+        """Check the plant's timeout in receive time."""
+        return self.publish(0, self.of_plant.check(now_ns))
+
+    def declare_timeout(self) -> list[Publication]:
+        """Declare a timeout of the plant that was recorded, where the receive time expired it."""
+        return self.publish(0, self.of_plant.declare_timeout())
+
     def publish(self, index: int, change: Change) -> list[Publication]:
         """The alarm of the plant (index 0) or of a signal, if it changes."""
         name, alarm = self._names[index], self._alarms[index]

@@ -17,14 +17,18 @@ from monitor_node.state import version_2
 from monitor_node.state.pipeline_state import PipelineState
 from monitor_node.state.seal import DIGEST_BYTES, Seal
 from reactorwatch.errors import InputError
+from reactorwatch.process import effects_of
+from reactorwatch.process.extended_model import extended_model_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import StoredState
 
 MAGIC = b"reactorwatch monitor"
 SEAL = Seal(MAGIC, 3, "state of a monitor", {2: version_2.upgrade})
 
-NOT_LEARNED_BY = frozenset({"model", "alarm_state_file", "state_file", "state_every_s", "health_period_s"})
-"""Settings that do not change the state; the model is identified by its equations, not by its file."""
+NOT_LEARNED_BY = frozenset(
+    {"model", "alarm_state_file", "state_file", "state_every_s", "health_period_s", "diagnose_training"}
+)
+"""Settings that do not change what was learned; the model is identified by its equations, not by its file."""
 
 
 class OtherSettingsError(InputError):
@@ -94,6 +98,16 @@ def fingerprint(model: ProcessModel | None) -> str:
     texts = (*words, *model.breakpoints, *model.at_rest, *model.resets, model.function().serialize())
     values = model.values().tobytes()
     return blake2b("\0".join((*texts, function.serialize())).encode() + values, digest_size=DIGEST_BYTES).hexdigest()
+
+
+def equations_text(model: ProcessModel | None) -> str:
+    """JSON of a model as `diagnose` writes it; empty if the catalogue does not have the model, or no causes for it."""
+    if model is None or not effects_of(model):
+        return ""
+    extended = extended_model_of(model)
+    if fingerprint(extended.build()) != fingerprint(model):
+        return ""
+    return msgspec.json.encode(extended.to_object()).decode()
 
 
 def seal_state(state: MonitorState) -> bytes:

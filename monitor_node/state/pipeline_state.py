@@ -25,6 +25,7 @@ class TrainedState(StoredState, frozen=True):
         withheld: one flag an output: its newest value is quarantined as a possible spike.
         rows_watched: number of evaluated rows.
         until_drift: number of rows until the next drift point.
+        baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
     """
 
     reference: ProcessReferenceState | ArxReferenceState
@@ -37,6 +38,7 @@ class TrainedState(StoredState, frozen=True):
     withheld: list[bool]
     rows_watched: int
     until_drift: int
+    baseline: bytes = b""
 
 
 class PipelineState(StoredState, frozen=True):
@@ -48,7 +50,7 @@ class PipelineState(StoredState, frozen=True):
         predictors: identified models, one an output.
         refusals: number of refused trainings.
         began_ns: start of the present or last training; None before its first row.
-        training: rows of the training; empty after it.
+        training: rows of the training; after it while its diagnosis is pending, then empty.
         watched: state after the training; None before its end.
     """
 

@@ -62,13 +62,13 @@ class StateFile:
         return None if self._monitor.received == self._heard_stored else self._due_ns
 
     def is_due(self, now_ns: int) -> bool:
-        """True if an alarm has changed, or messages were received and the interval is over."""
+        """True if an alarm or the baseline has changed, or messages were received and the interval is over."""
         if self._due_ns is None or now_ns < self._due_ns - self._every_ns:  # the first time, or the clock was set back
             self._due_ns = now_ns + self._every_ns
-        if self._monitor.alarms.changes == self._alarms_stored and now_ns < self._due_ns:
+        if self._monitor.changes == self._alarms_stored and now_ns < self._due_ns:
             return False
         self._due_ns = now_ns + self._every_ns
-        return self._monitor.alarms.changes != self._alarms_stored or self._monitor.received != self._heard_stored
+        return self._monitor.changes != self._alarms_stored or self._monitor.received != self._heard_stored
 
     def store(self) -> None:
         """Write the present state.
@@ -76,7 +76,7 @@ class StateFile:
         Raises:
             InputError: the file cannot be written; it is unchanged. The next try is after the interval.
         """
-        self._alarms_stored, self._heard_stored = self._monitor.alarms.changes, None
+        self._alarms_stored, self._heard_stored = self._monitor.changes, None
         self._write()
         self._heard_stored = self._monitor.received
 
@@ -87,10 +87,10 @@ class StateFile:
                 file.flush()
                 os.fsync(file.fileno())
         except InputError:
-            self._monitor.not_stored += 1
+            self._monitor.stats.not_stored += 1
             raise
         except OSError as error:
-            self._monitor.not_stored += 1
+            self._monitor.stats.not_stored += 1
             raise InputError(f"state_file {self._path}: cannot be written: {error.strerror}") from error
 
     def _restore(self, data: bytes | None) -> str:

@@ -84,9 +84,9 @@ def open_messages(
     """Open a file as messages.
 
     Args:
-        path: as for `record`.
-        plant: as for `record`.
-        columns: as for `record`.
+        path: a table, an .mcap or a folder of recordings.
+        plant: plant in a recording.
+        columns: names of a table's columns, by signal.
         units: units of the signals; None: those of the columns.
 
     Raises:

@@ -1,7 +1,10 @@
 """Output of `backtest`: a JSON object, or lines for people."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from monitor_node.replay.backtest import Backtest
 from reactorwatch.contract.alarm_text import priority_word, suspects_text
@@ -35,6 +38,7 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
         },
         "reference": result.reference,
         "noise_levels": result.noise_levels,
+        "baseline": _baseline(result, minutes),
         "alarms": [
             {
                 "alarm": alarm.alarm,
@@ -47,6 +51,15 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
             for alarm, cleared_ns in result.raised_alarms
         ],
     }
+
+
+def _baseline(result: Backtest, minutes: Callable[[int], float | None]) -> dict[str, Any] | None:
+    """Change of the model after the diagnosis of the training; None without one."""
+    change = result.baseline
+    if change is None:
+        return None
+    model = msgspec.json.decode(change.model)
+    return {"what": change.what, "from_min": minutes(change.time_ns), "why": change.why, "extended_model": model}
 
 
 def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:

@@ -26,6 +26,7 @@ MESSAGES: tuple[type[Message], ...] = (
     messages.Alarm,
     messages.AlarmKpis,
     messages.Reconstruction,
+    messages.Baseline,
     messages.Health,
     messages.Fault,
     messages.Audit,
@@ -47,6 +48,7 @@ Body: TypeAlias = (
     | messages.Alarm
     | messages.AlarmKpis
     | messages.Reconstruction
+    | messages.Baseline
     | messages.Health
     | messages.Fault
     | messages.Audit

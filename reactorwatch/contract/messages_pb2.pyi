@@ -337,6 +337,22 @@ class Health(_message.Message):
     failures: _containers.ScalarMap[str, int]
     def __init__(self, time_ns: _Optional[int] = ..., node: _Optional[str] = ..., version: _Optional[str] = ..., phase: _Optional[str] = ..., uptime_s: _Optional[float] = ..., received: _Optional[int] = ..., lost: _Optional[int] = ..., late: _Optional[int] = ..., refused: _Optional[int] = ..., refused_by_reason: _Optional[_Mapping[str, int]] = ..., lag_ms: _Optional[float] = ..., duplicated: _Optional[int] = ..., out_of_order: _Optional[int] = ..., published: _Optional[int] = ..., rows: _Optional[int] = ..., incomplete_rows: _Optional[int] = ..., heard_from_ns: _Optional[_Mapping[str, int]] = ..., not_stored: _Optional[int] = ..., stalls: _Optional[int] = ..., reference: _Optional[str] = ..., training: _Optional[float] = ..., failures: _Optional[_Mapping[str, int]] = ...) -> None: ...
 
+class Baseline(_message.Message):
+    __slots__ = ("time_ns", "what", "by", "why", "id", "model")
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    WHAT_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
+    WHY_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    time_ns: int
+    what: str
+    by: str
+    why: str
+    id: int
+    model: str
+    def __init__(self, time_ns: _Optional[int] = ..., what: _Optional[str] = ..., by: _Optional[str] = ..., why: _Optional[str] = ..., id: _Optional[int] = ..., model: _Optional[str] = ...) -> None: ...
+
 class Fault(_message.Message):
     __slots__ = ("time_ns", "cause", "specification", "active", "onset_ns")
     TIME_NS_FIELD_NUMBER: _ClassVar[int]

@@ -54,7 +54,7 @@ class ProcessChoice:
         """Load the process.
 
         Args:
-            zero_ns: as for `find_process`.
+            zero_ns: time from which the minutes of an extended model count; 0: the one that its file states.
 
         Raises:
             InputError: as `find_process`.
@@ -73,7 +73,7 @@ class ProcessChoice:
         """Load the equations of the process.
 
         Args:
-            zero_ns: as for `find_process`.
+            zero_ns: time from which the minutes of an extended model count; 0: the one that its file states.
 
         Raises:
             InputError: as `find_process`; or the process has no equations.

@@ -21,7 +21,7 @@ class Signal:
     """A measured quantity.
 
     Attributes:
-        name: its name on the bus, in settings and in reports.
+        name: name on the bus, in settings and in reports.
         unit: unit of its values; empty: unknown.
         role: `input` acts on the process, `output` is watched, `setpoint` is what a controller aims at, `mode` says how
             the process is operated, `label` is carried along and not watched.
@@ -62,7 +62,7 @@ class KnownParameter:
     """A constant of the equations with its uncertainty.
 
     Attributes:
-        value: its value.
+        value: the value.
         sd: standard deviation of the value, in the same unit; 0: it is exact.
         unit: unit of both.
     """
@@ -77,9 +77,9 @@ class Process:
     """A process as a user describes it.
 
     Attributes:
-        name: its name.
-        signals: its signals, each name once; at least one of them an output.
-        equations: its model, in the units of the equations; None: it is learned from data.
+        name: name of the process.
+        signals: the signals, each name once; at least one of them an output.
+        equations: the model, in the units of the equations; None: it is learned from data.
         effects: what can be named as a cause and injected as a fault.
         controllers: controllers of its inputs, for a simulation.
         parameters: constants of the equations that are given, by name: value, standard deviation and unit.

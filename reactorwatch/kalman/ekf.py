@@ -114,6 +114,8 @@ class Filter:
 
     Attributes:
         budget: filter steps that it may take; None: unlimited.
+        stops_at_restart: if true, a run of a record ends where the filter has diverged and would start again; the
+            results of the remaining rows are NaN.
     """
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, changes: Mapping[str, float] | None = None) -> None:
@@ -134,12 +136,14 @@ class Filter:
         self._breaks: tuple[float, ...] = ()
         self.noise = noise
         self.budget: StepBudget | None = None
+        self.stops_at_restart, self._started = False, False
         self.set_parameters(changes or {})
 
     def clone(self) -> "Filter":
-        """Make another filter of the same model, noise and changes, not yet started; for the same thread."""
+        """Make another filter of the same model, noise, changes and limits, not yet started; for the same thread."""
         other = Filter(self.model, self._noise, self._changes)
         other._initial_state = self._initial_state  # costs more to make than to use
+        other.budget, other.stops_at_restart = self.budget, self.stops_at_restart
         return other
 
     @property
@@ -274,6 +278,7 @@ class Filter:
             self.restart()
         else:
             self.state = start
+        self._started = self._time_min is not None
         self._spend(STEPS_PER_RUN)
         rows, near = record.following(self._time_min, self._inputs, self._breaks)
         count, n, n_x = len(rows), self._n_y, self._n_x
@@ -292,6 +297,9 @@ class Filter:
                 self._belief[:] = beliefs[row + done - 1]
                 row += done
                 self._set_row(float(record.time_min[row - 1]), record.inputs[row - 1].tolist())
+            elif self.stops_at_restart and self._started and self._time_min is None:
+                outputs[row:], beliefs[row:] = nan, nan
+                break
             else:
                 self._run_row(record, row, outputs, beliefs)
                 row += 1
@@ -417,6 +425,8 @@ class Filter:
     def _start(self, time_min: float, inputs: Sequence[float], measured: Sequence[float]) -> Innovation:
         """Start at the measurements, if there are any."""
         self._time_min = None
+        if self.stops_at_restart and self._started:
+            return self._nothing
         searches = self._initial_state.searches
         found = self._initial_state.estimate(time_min, inputs, measured, self._noise.measurement_sd, self._changes)
         self._spend(STEPS_PER_SEARCH * (self._initial_state.searches - searches))
@@ -428,6 +438,7 @@ class Filter:
             self._learned = True
             self._belief[:] = [*x, *P.ravel()]
             self._set_row(time_min, inputs)
+            self._started = True
         return self._nothing
 
     def _restore_constant_states(self, x: Array, P: Array) -> None:

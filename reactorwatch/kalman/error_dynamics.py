@@ -135,6 +135,7 @@ class ErrorLinearization:
             p = self.model.values(self.changes)
             predicted, F, G, spread = self._predict(x[:-1], inputs[:-1], time_min, p, uncertainty)
             H, D = self._code.outputs_by.map(predicted, inputs[1:], p, time_min[1:])
+            P, residual = np.ascontiguousarray(P), np.ascontiguousarray(residual)  # one kernel is compiled for all
             whitening, w, K = _normalize(F, H, P, q, np.diff(time_min), spread, R, residual, used)
         if began is not None:
             restarted = began[1:, None, None]

@@ -40,6 +40,12 @@ class ResampledRecord(NamedTuple):
         return FilterResult(*(item[self.original_index] for item in result))
 
 
+def count_pieces(time_min: Array) -> Array:
+    """Number of pieces of two integration steps in each interval, shape (rows - 1,); 1 in a long gap."""
+    step = np.diff(time_min)
+    return np.where((step > LONGEST_ROW_MIN) & (step <= LONGEST_GAP_MIN), np.ceil(step / LONGEST_ROW_MIN), 1.0)
+
+
 def insert_rows(
     time_min: Array, inputs: Array, measured: Array, uncertainty: InputUncertainty | None = None
 ) -> ResampledRecord:
@@ -54,7 +60,7 @@ def insert_rows(
     step = np.diff(time_min)
     if not np.any(step > LONGEST_ROW_MIN):
         return ResampledRecord(time_min, inputs, measured, uncertainty, np.arange(time_min.size))
-    pieces = np.where((step > LONGEST_ROW_MIN) & (step <= LONGEST_GAP_MIN), np.ceil(step / LONGEST_ROW_MIN), 1.0)
+    pieces = count_pieces(time_min)
     if uncertainty is not None:
         pieces[uncertainty.rows[1:]] = 1.0
     counts = np.append(pieces.astype(np.intp), 1)

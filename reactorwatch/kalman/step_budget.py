@@ -8,6 +8,9 @@ other work counts as many units as it took rows' time when it was measured.
 STEPS_PER_RUN = 100
 """Steps for a run of a filter over a record of any length: its set-up and its results."""
 
+STEPS_PER_LINEARISATION = 300
+"""Steps for a linearisation of a filter about its run, besides one for each row."""
+
 STEPS_PER_ROW = 25
 """Steps for a row that is filtered by itself."""
 
@@ -44,8 +47,8 @@ class StepBudget:
         """Count steps.
 
         Raises:
-            BudgetExceededError: the budget is exceeded.
+            BudgetExceededError: the budget would be exceeded; then nothing is counted, as nothing is done.
         """
-        self.spent += steps
-        if self.spent > self._steps:
+        if self.spent + steps > self._steps:
             raise BudgetExceededError(f"the budget of {self._steps} filter steps is spent")
+        self.spent += steps

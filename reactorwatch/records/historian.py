@@ -81,7 +81,7 @@ def read_tags(
 
     Args:
         layout: the table.
-        long: its columns.
+        long: columns of the table.
         stated: statements of the user.
         wanted: tags to read; None: all.
 

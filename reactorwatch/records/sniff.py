@@ -36,7 +36,7 @@ def sniff(path: Path, text: bytes, stated: FileFormat) -> Layout:
 
     Args:
         path: the file, for messages.
-        text: its text, UTF-8.
+        text: text of the file, UTF-8.
         stated: what need not be guessed.
 
     Raises:

@@ -50,7 +50,7 @@ class TextTable:
         """Some of the rows.
 
         Args:
-            rows: their indices, shape (rows of the part,).
+            rows: indices of the rows, shape (rows of the part,).
         """
         part = copy(self)
         part._table, part._known, part._chosen = self._table.take(rows), {}, rows

@@ -134,7 +134,7 @@ def parse(cells: Any, pattern: Pattern) -> tuple[Instants, str]:
 
     Args:
         cells: strings, a pyarrow array of shape (rows,).
-        pattern: their form.
+        pattern: form of the timestamps.
 
     Returns:
         The times, and the name of the pattern with the order of day and month.

@@ -145,7 +145,7 @@ class Bank(Generic[Kind]):
 
     def _hold(self, columns: Array) -> None:
         self._columns = np.ascontiguousarray(columns)
-        self._plants = plants = columns.shape[1]
+        plants = columns.shape[1]
         self._numbers = self._columns.reshape(-1).data  # all of them, one row after the other
         self._come, self._out = Struct(f"{2 * plants}d").pack_into, Struct(f"{plants}d").unpack_from
         self._out_offset = OUT * plants * self._columns.itemsize
@@ -185,27 +185,30 @@ class Bank(Generic[Kind]):
         points[:, ~present] = np.nan
         return Judgements(points[0], points[1], points[2], points[3], present & (columns[OUT] > 0.0))
 
-    def judge(self, values: list[float], present: list[bool]) -> bool:
-        """Update the few charts of one plant; returns True if any is out. `judgement` has the points.
+    def judge(self, values: list[float], present: list[bool], *, always: bool) -> list[Judgement | None] | None:
+        """Update the few charts of one plant, as at every row.
 
         Args:
             values: one a chart, finite where present.
             present: False leaves a chart as it is.
+            always: True to return the judgements of charts within their limits as well.
+
+        Returns:
+            Judgement of each chart, None where it has no value; None in place of all if no chart is out.
         """
         self._come(self._numbers, 0, *values, *present)  # X and PRESENT are the first rows
         self._kind.kernel(self._columns)
         out = self._out(self._numbers, self._out_offset)
-        return any(out) and any(here and much > 0.0 for here, much in zip(present, out, strict=True))
+        if not (always or (any(out) and any(here and much > 0.0 for here, much in zip(present, out, strict=True)))):
+            return None
+        columns = self._columns[STATISTIC:SETTINGS].T.tolist()
+        return [
+            Judgement(statistic, centre, lower, upper, much > 0.0) if here else None
+            for here, (statistic, centre, lower, upper, much) in zip(present, columns, strict=True)
+        ]
 
-    def judgement(self, plant: int) -> Judgement:
-        """Judgement of the newest value of a chart."""
-        plants = self._plants
-        columns = self._numbers[STATISTIC * plants + plant : SETTINGS * plants : plants].tolist()
-        statistic, centre, lower, upper, out = columns
-        return Judgement(statistic, centre, lower, upper, out > 0.0)
-
-    def restart(self, plants: NDArray[np.bool_] | None = None) -> None:
-        """Forget the values seen, of all plants or of those that are True."""
+    def restart(self, plants: NDArray[np.bool_] | int | None = None) -> None:
+        """Forget the values seen: of all plants, of those that are True, or of one by its index."""
         _restart(self._columns, self._kind.memories, slice(None) if plants is None else plants)
 
     def chart(self, plant: int) -> Kind:

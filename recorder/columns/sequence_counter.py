@@ -117,9 +117,8 @@ class SequenceCounter:
             run = self._run = _PublisherRun()
             run.advance(sequence, time_ns)
             return RunTransition.SAME_RUN
-        if run.is_next(sequence, time_ns) and len(run.points) > 1:
+        if len(run.points) > 1 and run.accept_next(sequence, time_ns):
             self._checkpoint = None  # derived from the points when needed
-            run.advance(sequence, time_ns)
             return RunTransition.SAME_RUN
         if self._checkpoint is None and len(run.points) > 1:
             number, then_ns = run.points[-2]

@@ -38,6 +38,7 @@ EVERYTHING = frozenset(
         keys.ALARM,
         keys.ALARM_KPIS,
         keys.RECONSTRUCTION,
+        keys.BASELINE,
         keys.FAULT,
     }
 )

@@ -1,6 +1,7 @@
 """A monitor that is killed goes on where it was: the alarms are those of one that was never stopped."""
 
 from pathlib import Path
+from typing import Any
 
 from monitor_node.replay.verification import verify
 from reactorwatch.cli.read_record import messages
@@ -16,7 +17,7 @@ def test_three_kills_change_no_alarm(tmp_path: Path) -> None:
 
     The recording replays, value for value, as that of a monitor that was never stopped.
     """
-    state = {"state_file": str(tmp_path / "monitor.state"), "state_every_s": 0.5}
+    state: dict[str, Any] = {"state_file": str(tmp_path / "monitor.state"), "state_every_s": 0.5}
     # The plant lasts for 22 s after the last kill: a monitor on a busy machine takes long to start.
     with LiveRun(tmp_path, duration_min=100.0, speed=100.0, **state) as run:
         monitor, plant = run.start_all()

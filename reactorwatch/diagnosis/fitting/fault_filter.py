@@ -28,7 +28,8 @@ from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.kalman.noise_estimation import estimate_noise_and_parameters
-from reactorwatch.kalman.resampling import ResampledRecord, insert_rows
+from reactorwatch.kalman.resampling import ResampledRecord, count_pieces, insert_rows
+from reactorwatch.kalman.step_budget import STEPS_PER_LINEARISATION, StepBudget
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
@@ -136,6 +137,21 @@ class FaultFilter:
         """Noise levels of all of the filter's states."""
         return self._filters[0].noise
 
+    @property
+    def budget(self) -> StepBudget | None:
+        """Budget of filter steps for runs and linearisations; None: they are not counted."""
+        return self._filters[0].budget
+
+    def limit(self, budget: StepBudget | None) -> None:
+        """Count filter steps against a budget, and end each run where the filter diverges."""
+        for item in self._filters:
+            item.budget, item.stops_at_restart = budget, True
+
+    def prepare(self) -> None:
+        """Compile now what the first run and the first linearisation would compile."""
+        self._filters[0].prepare()
+        self._errors.prepare()
+
     def size_symbols(self, effect: Effect) -> tuple[ca.SX, ca.SX] | None:
         """Symbols of an effect's interval and sample inputs; None if the filter's model does not have it."""
         names = [item for item in self.effects if item.delays_output is None]
@@ -203,29 +219,33 @@ class FaultFilter:
         self, several: Sequence[ResampledRecord], shared: Sequence[SharedPrefix | None]
     ) -> list[FilterResult]:
         """Filter as many records at once as there are lanes, all from the same row on."""
-        first = min(_count_shared_rows(prefix, rows) for prefix, rows in zip(shared, several, strict=True))
-        if first == several[0].time_min.size:
+        index = several[0].original_index
+        same = min(_count_shared_rows(prefix, rows) for prefix, rows in zip(shared, several, strict=True))
+        if same == index.size:
             return [prefix.innovations for prefix in shared if prefix is not None]
         while len(self._filters) < len(several):
             self._filters.append(self._filters[0].clone())
+        last = int(index[same - 1]) if same else -1
+        first = last + 1
         runs = []
         for filtering, (time_min, inputs, measured, uncertainty, _), prefix in zip(
             self._filters, several, shared, strict=False
         ):
             remaining, start = slice(first, None), None
-            if prefix is not None and first:
-                x, P = prefix.innovations.x[first - 1].tolist(), prefix.innovations.P[first - 1].ravel().tolist()
-                start = FilterState(float(time_min[first - 1]), tuple(inputs[first - 1].tolist()), tuple(x), tuple(P))
+            if prefix is not None and same:
+                x, P = prefix.innovations.x[same - 1].tolist(), prefix.innovations.P[same - 1].ravel().tolist()
+                start = FilterState(float(time_min[last]), tuple(inputs[last].tolist()), tuple(x), tuple(P))
             later = None if uncertainty is None else uncertainty.select(remaining)
             record = FilterRecord.of(time_min[remaining], inputs[remaining], measured[remaining], uncertainty=later)
             runs.append(filtering.run_batched(record, start))
         innovations = []
         for rows, prefix, new in zip(several, shared, run_together(runs), strict=True):
-            if prefix is None or not first:
+            if prefix is None or not same:
                 innovations.append(rows.at_original_rows(new))
                 continue
             both = zip(prefix.innovations, new, strict=True)
-            innovations.append(FilterResult(*(np.concatenate([before[:first], more]) for before, more in both)))
+            rest = index[same:] - first
+            innovations.append(FilterResult(*(np.concatenate([before[:same], more[rest]]) for before, more in both)))
         return innovations
 
     def estimate_noise(
@@ -259,6 +279,8 @@ class FaultFilter:
 
     def error_dynamics(self, run: Run, signals: Sequence[Signal], innovations: FilterResult) -> ErrorDynamics:
         """Error equations about a filter run, from the second row on, the first one that is predicted."""
+        if self.budget is not None:  # to linearise a row takes about as long as to filter it
+            self.budget.spend(STEPS_PER_LINEARISATION + int(np.sum(count_pieces(run.time_min))))
         return error_dynamics_between(self._errors, run, self.inputs(run, signals), innovations, self.used_values(run))
 
     def used_values(self, run: Run) -> NDArray[np.bool_]:
@@ -316,10 +338,10 @@ def error_dynamics_between(
 
 def _count_shared_rows(prefix: SharedPrefix | None, rows: ResampledRecord) -> int:
     """Number of rows that can be copied from a shared prefix; the filter resumes after the last of them."""
-    if prefix is None or rows.original_index.size != rows.time_min.size:
+    if prefix is None or not prefix.rows:
         return 0
-    last = prefix.rows - 1
-    if last < 0 or not np.all(np.isfinite(prefix.innovations.x[last])) or not np.all(np.isfinite(rows.inputs[last])):
+    last, resumed = prefix.rows - 1, rows.original_index[prefix.rows - 1]
+    if not np.all(np.isfinite(prefix.innovations.x[last])) or not np.all(np.isfinite(rows.inputs[resumed])):
         return 0
     return prefix.rows
 

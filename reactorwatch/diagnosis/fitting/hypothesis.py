@@ -102,15 +102,16 @@ class Hypothesis:
             for profile, values, effect in zip(self.profiles, parameters, self.filter.effects, strict=True)
         )
 
-    def fit(self, run: Run, start: Sequence[Array], steps: int = MOST_STEPS) -> Fit:
+    def fit(self, run: Run, start: Sequence[Array], steps: int = MOST_STEPS, like: Fit | None = None) -> Fit:
         """Fit the parameters by least squares; magnitudes of discontinuous effects stay.
 
         Args:
             run: the record.
             start: initial parameters of each effect.
             steps: maximum number of steps; fewer than `MOST_STEPS` are for a rough fit.
+            like: see `evaluate`.
         """
-        best = self.evaluate(run, start)
+        best = self.evaluate(run, start, like)
         damping, enough = _DAMPING, WELL_CONVERGED if steps == MOST_STEPS else CONVERGED
         differences = self._difference_steps()
         for _ in range(steps):
@@ -130,7 +131,7 @@ class Hypothesis:
                 promised = float(scaled @ (gradient - 0.5 * information @ scaled))
                 if promised < enough:
                     break
-                trial = self.evaluate(run, self._shift(best.parameters, scaled / scale))
+                trial = self.evaluate(run, self._shift(best.parameters, scaled / scale), like)
                 if trial.loss < best.loss:
                     best, damping = trial, damping * _LESS_DAMPING
                     break
@@ -143,16 +144,16 @@ class Hypothesis:
                 differences = self._widen(self._covariance(g), differences)
         return best
 
-    def covariance(self, run: Run, fit: Fit) -> Array:
+    def covariance(self, run: Run, fit: Fit, first_difference: float = 0.0) -> Array:
         """Covariance of all parameters, shape (n_parameters, n_parameters).
 
         An onset matters only where something happens, so the derivative by it depends on the difference step. The step
-        is about one standard deviation.
+        is about one standard deviation, and at least `first_difference`.
         """
         dynamics = None
         if self.filter.delay_index is None:
             dynamics = self.filter.error_dynamics(run, self._signals(fit.parameters), fit.innovations)
-        differences = self._difference_steps()
+        differences = [np.maximum(item, first_difference) for item in self._difference_steps()]
         for _ in range(_WIDENINGS):
             result = self._covariance(self._jacobian(run, fit, differences, dynamics))
             before, differences = differences, self._widen(result, differences)

@@ -203,6 +203,29 @@ class Ramp(FittedProfile):
         return super().profile_values(parameters) | {"end": self.end_min}
 
 
+class EndedRamp(Ramp):
+    """Linear growth from the onset to an end, constant afterwards."""
+
+    name = "ended_ramp"
+
+    @property
+    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
+        """See `FittedProfile`."""
+        first, last = self.start_min + 2.0 * self.period_min, self.end_min
+        return (self._onset(), NonlinearParameter("end", "min", first, last, self.period_min / 2))
+
+    def basis_functions(self, shape: Array) -> tuple[Array, Array]:
+        """See `FittedProfile`."""
+        span = max(shape[1] - shape[0], self.period_min)
+        age = np.maximum(self.time_min - shape[0], 0.0)
+        after = np.maximum(age - span, 0.0)
+        return ((age - after) / span)[:, None], (0.5 * (age**2 - after**2) / span)[:, None]
+
+    def profile_values(self, parameters: Array) -> dict[str, float]:
+        """See `FittedProfile`."""
+        return super(Ramp, self).profile_values(parameters)
+
+
 class Decay(FittedProfile):
     """First-order approach to the final magnitude."""
 

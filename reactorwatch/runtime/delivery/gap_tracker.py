@@ -41,9 +41,12 @@ class GapTracker:
         """The highest number so far; None before the first."""
         return None if self.expected is None else self.expected - 1
 
-    def is_next(self, number: int, time_ns: int) -> bool:
-        """True for the expected number at a later time than the newest."""
-        return number == self.expected and time_ns > self.newest_ns
+    def accept_next(self, number: int, time_ns: int) -> bool:
+        """Move to the expected number, at a later time than the newest; False: it is not that one. The usual case."""
+        if number != self.expected or time_ns <= self.newest_ns:
+            return False
+        self.advance(number, time_ns)
+        return True
 
     def is_past(self, number: int, time_ns: int) -> bool:
         """True if neither number nor time is beyond the newest."""

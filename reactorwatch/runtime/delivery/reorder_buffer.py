@@ -86,10 +86,9 @@ class ReorderBuffer(Generic[Item]):
 
     def push(self, publisher: int, stream: str, key: str, number: int, item: Item, now_ns: int) -> Iterator[Item | Gap]:
         """Add a message; yields the messages that it releases, and the gaps between them."""
-        name = publisher, stream
-        state = self._streams.get(name)
+        state = self._streams.get((publisher, stream))
         if state is None:
-            state = self._add_stream(name, now_ns)
+            state = self._add_stream((publisher, stream), now_ns)
             if not number and not self._await_history:
                 state.expected = 0
         state.last_arrival_ns = now_ns
@@ -107,11 +106,9 @@ class ReorderBuffer(Generic[Item]):
             if state.fill(number):
                 yield item  # given up before, and arrived after all
             return
-        yield from self._hold(name, state, number, item, now_ns)
+        yield from self._hold(state, number, item, now_ns)
 
-    def _hold(
-        self, name: tuple[int, str], state: StreamState[Item], number: int, item: Item, now_ns: int
-    ) -> Iterator[Item | Gap]:
+    def _hold(self, state: StreamState[Item], number: int, item: Item, now_ns: int) -> Iterator[Item | Gap]:
         """Hold a message while others before it are missing; yields the messages released nevertheless."""
         hold = state.hold_state()
         if self._await_history and hold.is_full:
@@ -125,15 +122,15 @@ class ReorderBuffer(Generic[Item]):
         if hold.due_ns is None or number < hold.newest:  # the first message is held, or a missing one has arrived
             hold.due_ns = now_ns + timeout_ns
             hold.recovered_ns = now_ns
-            self._holding[name] = state
+            self._holding[state.name] = state
         hold.newest = max(hold.newest, number)
         yield from self._release_contiguous(state, hold)
         if hold.is_full:
-            yield from self._give_up(name, state, hold, now_ns, now_ns, hold.newest)
+            yield from self._give_up(state, hold, now_ns, now_ns, hold.newest)
 
     def release_overdue(self, now_ns: int) -> Iterator[Item | Gap]:
         """Give up missing messages whose timeout is over; yields the gaps and the messages released."""
-        for name, state in list(self._holding.items()):
+        for state in list(self._holding.values()):
             hold = state.hold
             if hold is None or hold.due_ns is None or now_ns < hold.due_ns:
                 continue
@@ -141,7 +138,7 @@ class ReorderBuffer(Generic[Item]):
             reached = hold.newest if now_ns >= recovery_end_ns else state.reached_by_all
             if state.expected is None or state.expected < reached:
                 since_ns = now_ns if state.expected is None else now_ns - TIMEOUT_NS
-                yield from self._give_up(name, state, hold, since_ns, now_ns, reached)
+                yield from self._give_up(state, hold, since_ns, now_ns, reached)
             else:
                 hold.due_ns = min(now_ns + POLL_NS, recovery_end_ns)
 
@@ -170,7 +167,7 @@ class ReorderBuffer(Generic[Item]):
     def end_history(self, now_ns: int) -> Iterator[Item | Gap]:
         """End the wait for history; yields the messages released."""
         self._await_history = False
-        for name, state in self._streams.items():
+        for state in self._streams.values():
             hold = state.hold_state()
             live = {number: held for number, held in hold.held.items() if number > state.last_before}
             hold.held = {number: (now_ns, item) for number, item in hold.history.items()} | live
@@ -180,7 +177,7 @@ class ReorderBuffer(Generic[Item]):
                 yield self._release(hold, number)
             hold.newest = max(hold.held, default=state.last_before)
             if hold.held:
-                yield from self._give_up(name, state, hold, now_ns, now_ns, hold.newest)
+                yield from self._give_up(state, hold, now_ns, now_ns, hold.newest)
             elif state.last_before >= 0:
                 state.advance(state.last_before)
             state.drop_hold_state()
@@ -223,7 +220,7 @@ class ReorderBuffer(Generic[Item]):
             idle = [(state.last_arrival_ns, other) for other, state in self._streams.items() if state.hold is None]
             for _, longest_idle in sorted(idle)[: MAX_STREAMS // 10]:
                 self._evict(longest_idle)
-        state: StreamState[Item] = StreamState(publisher=name[0])
+        state: StreamState[Item] = StreamState(publisher=name[0], stream=name[1])
         self._streams[name] = state
         self._unconfirmed.append((now_ns, name))
         return state
@@ -248,13 +245,7 @@ class ReorderBuffer(Generic[Item]):
             state.drop_hold_state()
 
     def _give_up(
-        self,
-        name: tuple[int, str],
-        state: StreamState[Item],
-        hold: HoldState[Item],
-        since_ns: int,
-        now_ns: int,
-        reached: int,
+        self, state: StreamState[Item], hold: HoldState[Item], since_ns: int, now_ns: int, reached: int
     ) -> Iterator[Item | Gap]:
         """Give up, as one gap, all that is missing before messages that arrived until `since_ns`.
 
@@ -277,10 +268,10 @@ class ReorderBuffer(Generic[Item]):
         if hold.held:
             first_ns = min(arrival for arrival, _ in hold.held.values())
             hold.due_ns = first_ns + TIMEOUT_NS
-            self._holding[name] = state
+            self._holding[state.name] = state
             hold.recovered_ns = max(hold.recovered_ns, first_ns)
         state.drop_hold_state()
         if lost:
             count = sum(last - first + 1 for first, last in lost)
-            yield Gap(name[1], name[0], lost[0][0], lost[-1][1], count, now_ns)
+            yield Gap(state.stream, state.publisher, lost[0][0], lost[-1][1], count, now_ns)
         yield from items

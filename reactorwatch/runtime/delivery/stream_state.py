@@ -57,11 +57,17 @@ class StreamState(GapTracker, Generic[Item]):
     max_gaps = MAX_LOST_RANGES
 
     publisher: int
+    stream: str
     first: int = -1  # number of the first message released
     last_before: int = -1  # last number published before the subscription
     last_arrival_ns: int = 0
     keys: tuple[str, ...] = ()
     hold: HoldState[Item] | None = None
+
+    @property
+    def name(self) -> tuple[int, str]:
+        """Publisher and stream."""
+        return self.publisher, self.stream
 
     def record_key(self, key: str, number: int) -> None:
         """Record that a key has reached a number."""

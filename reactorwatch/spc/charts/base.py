@@ -80,6 +80,19 @@ class Shown(NamedTuple):
     scale: float
     passed: float
 
+    def describe(self, judgement: Judgement, size: float, allowed: float | None = None, lead: str = "") -> str:
+        """Text of a deviation from the model: "T is 3.1 K above what the model expects (allowed: 2 K)".
+
+        Args:
+            judgement: point of the chart.
+            size: size of the deviation.
+            allowed: largest size within the limits; None: not shown.
+            lead: words before the size, with a space behind them.
+        """
+        side = "above" if judgement.statistic > judgement.centre else "below"
+        text = f"{self.name} is {lead}{format_quantity(size, self.unit)} {side} what the model expects"
+        return text if allowed is None else f"{text} (allowed: {format_quantity(allowed, self.unit)})"
+
 
 class Chart(ABC):
     """A control chart: a `SignalChart`, a `JointChart`, or one of the parameters of models.

@@ -29,7 +29,7 @@ from scipy import special
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.base import Array, Judgement, Shown, finite, format_quantity, positive
+from reactorwatch.spc.charts.base import Array, Judgement, Shown, finite, positive
 from reactorwatch.spc.compiled_chart import (
     CENTRE,
     LOWER,
@@ -126,10 +126,8 @@ class Shewhart(CompiledChart):
 
     def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`."""
-        size = format_quantity(abs(judgement.statistic) * signal.scale, signal.unit)
-        allowed = format_quantity(judgement.upper_limit * signal.scale, signal.unit)
-        text = f"{signal.name} is {size} {judgement.side} what the model expects (allowed: {allowed})"
-        return text, {signal.name: 1.0}
+        size, allowed = abs(judgement.statistic) * signal.scale, judgement.upper_limit * signal.scale
+        return signal.describe(judgement, size, allowed), {signal.name: 1.0}
 
     @property
     def mean(self) -> float:

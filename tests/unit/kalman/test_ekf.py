@@ -337,6 +337,23 @@ def test_where_the_equations_leave_all_bounds_or_explode_it_begins_anew_at_once(
         assert kalman.state.x == pytest.approx((1.0, -0.5), abs=1e-2)
 
 
+def test_a_run_may_end_where_the_filter_diverges_instead_of_restarting() -> None:
+    """The rows before are those of a filter that restarts, and no search for an initial state is charged."""
+    model = linear_model(bound=50.0)
+    time_min, inputs, measured = linear_record(rows=60)
+    inputs[30:] = 1e6  # leads out of the bounds
+    record = FilterRecord.of(time_min, inputs, measured)
+    kalman, stopping = Filter(model, NOISE), Filter(model, NOISE)
+    stopping.stops_at_restart = True
+    restarted, stopped = kalman.run_record(record), stopping.run_record(record)
+    end = int(np.argmax(np.isnan(restarted.prediction[1:, 0]))) + 1
+    assert 30 <= end < 60
+    for one, other in zip(restarted, stopped, strict=True):
+        np.testing.assert_array_equal(one[:end], other[:end])
+        assert np.all(np.isnan(other[end:]))
+    assert np.all(np.isfinite(restarted.x[end]))
+
+
 def test_a_correction_is_cut_off_at_the_bounds() -> None:
     kalman = Filter(cstr(), SENSORS)
     kalman.state = FilterState(0.0, (OPERATING_COOLANT_FLOW,), OPERATING_STATE, (0.1, 0.0, 0.0, 1e-9))

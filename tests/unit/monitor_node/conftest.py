@@ -5,6 +5,7 @@ import pytest
 from reactorwatch.contract.codec import Encoded, Publication
 
 from .fleets import alone, run_of
+from .warm_plant import Run, watch_warm_plant
 
 
 @pytest.fixture(scope="session")
@@ -16,3 +17,8 @@ def runs() -> dict[str, list[Encoded]]:
 @pytest.fixture(scope="session")
 def expected(runs: dict[str, list[Encoded]]) -> dict[str, list[Publication]]:
     return {plant: alone(plant, run) for plant, run in runs.items()}
+
+
+@pytest.fixture(scope="session")
+def warm() -> Run:
+    return watch_warm_plant()

@@ -10,13 +10,14 @@ from monitor_node.chart_stage import ChartWatch
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.failures import Failures
-from monitor_node.isolation.fit import _begun
+from monitor_node.isolation.candidate import scan_candidates
+from monitor_node.isolation.causes import CAUSES
 from monitor_node.isolation.glr_scan import Scan
 from monitor_node.isolation.isolation import Isolation
 from monitor_node.isolation.window import Window
 from monitor_node.pipeline import PlantPipeline
 from monitor_node.quiet.form import QuietForm
-from monitor_node.signal_checks.stage import SignalChecks
+from monitor_node.signal_checks.timeout import SilenceCheck
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError
@@ -33,7 +34,7 @@ def fail_from(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, from_ns: 
     method = getattr(owner, name)
 
     def failing(self: Any, *arguments: Any, **others: Any) -> Any:
-        config = self._board._config if isinstance(self, SignalChecks) else self._config
+        config = (self.board if isinstance(self, SilenceCheck) else self)._config
         times = [item for item in arguments if isinstance(item, int) and not isinstance(item, bool)]
         times += [item.time_ns for item in arguments if hasattr(item, "time_ns")]
         if config.plant == BROKEN and max(times, default=from_ns) >= from_ns:
@@ -54,7 +55,7 @@ def health_message(said: list[Publication], plant: str) -> Health:
     [
         (PlantPipeline, "update", "row"),
         (ChartWatch, "update", "row"),
-        (SignalChecks, "check_row", "row"),
+        (SilenceCheck, "on_row", "row"),
         (Annunciator, "end_row", "row"),
         (PlantPipeline, "snapshots", "models"),
         (QuietForm, "written", "demotion"),
@@ -134,7 +135,7 @@ def test_an_error_in_the_search_for_causes_costs_no_alarm_and_no_restart(
 ) -> None:
     """It is counted at each look and reported once; alarms are those of a monitor that does not look for causes."""
 
-    def failing(_: Isolation) -> list[Any]:
+    def failing(_: Isolation, *__: Any) -> list[Any]:
         raise ValueError("min() arg is an empty sequence")
 
     monkeypatch.setattr(Isolation, "suspects", failing)
@@ -154,7 +155,7 @@ def test_a_silence_that_cannot_be_checked_ends_no_monitor(
     monitor = Monitor(MonitorConfig(plant=BROKEN, training_min=20.0, isolation=False), 0, points=False)
     for message in runs[BROKEN][:900]:
         monitor.on_message(message, 0)
-    fail_from(monkeypatch, SignalChecks, "check", 0)
+    fail_from(monkeypatch, SilenceCheck, "check", 0)
     said = monitor.on_tick(10**18)
     assert health_message(said, BROKEN).failures == {"silence": 1}
 
@@ -182,12 +183,21 @@ def test_errors_from_different_places_are_each_reported_once() -> None:
 
 
 def test_no_hypothesis_that_overflowed_is_followed() -> None:
-    """The linearised bank may leave numbers that overflow; then nothing comes into question, and nothing is raised."""
+    """The linearised scan may leave numbers that overflow; then nothing comes into question, and nothing is raised."""
     shape = (3, 2, 13)
     scan = Scan(30, np.array([1.0, 2.0, 3.0]), np.full(shape, np.nan), np.full(shape, -np.inf), np.ones(shape))
     times = np.arange(30) / 10
-    window = Window(times, times[:, None], np.zeros((30, 2)), np.zeros((30, 2)), np.ones((30, 2), bool), [], 20)
-    assert _begun(scan, window) == []
+    window = Window(
+        times,
+        times[:, None],
+        np.zeros((30, 2)),
+        np.zeros((30, 2)),
+        np.ones((30, 2), bool),
+        times[:, None],
+        times[:, None, None],
+        20,
+    )
+    assert scan_candidates(CAUSES, scan, window) == []
 
 
 def test_settings_that_cannot_be_kept_end_the_monitor_of_one_plant_and_no_fleet() -> None:

@@ -13,7 +13,7 @@ from monitor_node.fleet import node as fleet_node
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.isolation import stage
 from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
-from monitor_node.isolation.window import MOST_PIECES, newest_rows
+from monitor_node.isolation.window import MOST_PIECES, Row, newest_rows
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.codegen.array_function import ArrayFunction
@@ -80,16 +80,15 @@ def work(monkeypatch: pytest.MonkeyPatch) -> Work:
     return Work(monkeypatch)
 
 
-def looked_at(fault: str, period_min: float, after: int) -> Isolation:
-    """An isolation with the rows of a record with a fault, up to some rows after its onset."""
+def faulty_rows(fault: str, period_min: float, after: int) -> list[Row]:
+    """The newest rows of a record with a fault, up to some rows after its onset."""
     onset_min = ROWS * period_min
     config = PlantConfig(seed=4, period_min=period_min, faults=(f"{fault}@{onset_min}min",))
     record = simulate_record(config, ROWS + after)
     columns = (record.time_min, record.columns["qc"], record.columns["C"], record.columns["T"])
-    isolation = Isolation(cstr(), SENSORS, ROWS)
-    for time_min, flow, concentration, temperature in zip(*(item.tolist() for item in columns), strict=True):
-        isolation.add(time_min, flow, (concentration, temperature))
-    return isolation
+    rows = zip(*(item.tolist() for item in columns), strict=True)
+    faulty: list[Row] = [(time_min, flow, (C, T)) for time_min, flow, C, T in rows]
+    return faulty[-ROWS:]
 
 
 def test_looks_of_a_monitor_that_is_prepared_compile_nothing(work: Work, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,9 +124,9 @@ def test_an_error_in_what_is_prepared_is_left_to_the_first_look(monkeypatch: pyt
     def fail(_: object) -> None:
         raise RuntimeError("made on purpose")
 
-    monkeypatch.setattr("monitor_node.isolation.hypothesis.Hypothesis.prepare", fail)
+    monkeypatch.setattr("monitor_node.isolation.fit.Fitter._prepare", fail)
     assert len(list(stage.preparation(CONFIG, cstr()))) == 2
-    monkeypatch.setattr("monitor_node.isolation.isolation.Bank", fail)
+    monkeypatch.setattr("monitor_node.isolation.isolation.GlrScan", fail)
     assert list(stage.preparation(CONFIG, cstr())) == []
     monitor = Monitor(CONFIG, 0, points=False)
     for message in samples(*leaking_run(-0.2, 18.0, 20.0, seed=3)):
@@ -177,9 +176,9 @@ def test_a_fleet_prepares_before_it_joins_the_bus(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize("period_min", [0.1, 0.2, 1.0, 15.0])
 def test_a_look_takes_no_more_steps_where_rows_are_far_apart(period_min: float, work: Work) -> None:
     """What is counted as a step is at least a row of machine code, or a third of a call on the way to a single row."""
-    isolation = looked_at("coolant_flow:step:-0.3", period_min, 100)
+    isolation, rows = Isolation(cstr(), SENSORS), faulty_rows("coolant_flow:step:-0.3", period_min, 100)
     work.forget()
-    isolation.suspects(since_rows=100)
+    isolation.suspects(rows, since_rows=100)
     spent, limit = isolation.budget.spent, LOOK_STEPS + LOOK_STEPS_A_ROW * ROWS
     assert spent <= limit + STEPS_PER_SEARCH + MOST_PIECES + ROWS
     assert work.machine_rows + 3 * work.calls <= spent
@@ -194,8 +193,8 @@ def test_a_look_takes_no_more_steps_where_rows_are_far_apart(period_min: float, 
     ],
 )
 def test_a_fault_is_found_within_the_budget_where_rows_are_far_apart(fault: str, period_min: float, after: int) -> None:
-    isolation = looked_at(fault, period_min, after)
-    likeliest = isolation.suspects(since_rows=after)[0]
+    isolation = Isolation(cstr(), SENSORS)
+    likeliest = isolation.suspects(faulty_rows(fault, period_min, after), since_rows=after)[0]
     assert not isolation.stopped
     assert (likeliest.cause, likeliest.probability > 0.5) == (fault.split(":")[0], True)
 

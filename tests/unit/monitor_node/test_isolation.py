@@ -39,10 +39,8 @@ def isolation() -> Isolation:
 
 
 def suspects_of(isolation: Isolation, rows: Iterable[Row]) -> list[Suspect]:
-    isolation.clear()
-    for row in rows:
-        isolation.add(*row)
-    return isolation.suspects()
+    isolation.progress = None
+    return isolation.suspects(list(rows))
 
 
 def of_cause(suspects: list[Suspect], cause: str) -> Suspect:
@@ -161,12 +159,10 @@ def test_it_follows_from_the_rows_and_from_when_it_was_asked_before_but_hardly_f
     at_once = suspects_of(isolation, rows)
     found = []
     for _ in range(2):
-        isolation.clear()
-        for place, row in enumerate(rows):
-            isolation.add(*row)
-            if place in (620, 640):
-                isolation.suspects()
-        found.append(isolation.suspects())
+        isolation.progress = None
+        for count in (621, 641):
+            isolation.suspects(rows[:count])
+        found.append(isolation.suspects(rows))
     assert found[0] == found[1]
     assert [(item.cause, item.profile) for item in found[0]] == [(item.cause, item.profile) for item in at_once]
     for now, once in zip(found[0], at_once, strict=True):
@@ -240,9 +236,9 @@ def test_in_a_noisy_process_and_slow_samples_too() -> None:
 def test_nothing_sets_in_before_it_may(isolation: Isolation) -> None:
     rows = rows_of("temperature_bias:step:2", seed=13, after_min=10.0)
     suspects_of(isolation, rows)
-    for item in isolation.suspects(not_before_min=ONSET_MIN + 2.0):
+    for item in isolation.suspects(rows, not_before_min=ONSET_MIN + 2.0):
         assert item.cause == UNKNOWN or item.onset_min > ONSET_MIN + 1.9
-    assert [item.cause for item in isolation.suspects(not_before_min=1e6)] == [UNKNOWN]
+    assert [item.cause for item in isolation.suspects(rows, not_before_min=1e6)] == [UNKNOWN]
 
 
 class NewState(Effect):
@@ -275,9 +271,3 @@ def test_excluded_causes_and_those_with_states_of_their_own_are_not_suspected() 
     isolation = Isolation(cstr(), SENSORS, effects=chosen, excluded=("concentration_bias",))
     suspects = suspects_of(isolation, rows_of("concentration_bias:step:0.02", seed=14, after_min=5.0))
     assert {item.cause for item in suspects} <= {"temperature_bias", "concentration_gain", UNKNOWN}
-
-
-def test_only_the_newest_rows_are_kept() -> None:
-    rows = rows_of("temperature_bias:step:2", seed=15, after_min=5.0)
-    small = Isolation(cstr(), SENSORS, window_rows=200)
-    assert suspects_of(small, rows) == suspects_of(small, rows[-200:])

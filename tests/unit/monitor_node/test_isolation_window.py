@@ -5,7 +5,7 @@ from math import nan
 import numpy as np
 import pytest
 
-from monitor_node.isolation.window import BURN_IN_ROWS, Row, Window, window_of
+from monitor_node.isolation.window import BURN_IN_ROWS, GATE, Row, Window, window_of
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
@@ -91,3 +91,18 @@ def test_nothing_sets_in_before_it_may(rows: list[Row]) -> None:
     assert window_of(rows, Filter(cstr(), SENSORS), rows[-1][0] + 1.0) is None
     assert window_of(rows[:BURN_IN_ROWS], Filter(cstr(), SENSORS)) is None
     assert window_of([], Filter(cstr(), SENSORS)) is None
+
+
+@pytest.mark.parametrize("fault", ["", "coolant_flow:step:-0.3", "temperature_bias:step:30"])
+def test_rows_filtered_in_chunks_are_those_of_a_filter_that_takes_row_by_row(fault: str) -> None:
+    """A value beyond the gate corrects the filter only if the one before was beyond it, too; some values are wild."""
+    rows = rows_of(*([fault] if fault else []), seed=3, after_min=5.0, begin_min=45.0)
+    rows = shifted(rows, [40, 41, 60, 90, 91, 92, 93], 1, 60.0)
+    rows[100] = (rows[100][0], rows[100][1], (nan, nan))
+    window, kalman = settled(rows), Filter(cstr(), SENSORS)
+    accept = [False, False]
+    for index, (time_min, flow, values) in enumerate(rows):
+        result = kalman.update(time_min, (flow,), values, gate=GATE, accept=accept)
+        accept = [abs(size) > GATE * sd for size, sd in zip(result.residual, result.sd, strict=True)]
+        assert tuple(window.x[index].tolist()) == kalman.state.x
+        assert tuple(window.covariance[index].ravel().tolist()) == kalman.state.P

@@ -235,9 +235,6 @@ def test_no_cause_is_found_in_what_lost_rows_leave(fault: str) -> None:
     rows = rows_of(*([fault] if fault else []), seed=4, after_min=10.0)
     moves = [place for place in range(40, len(rows)) if rows[place][1] != rows[place - 1][1]][::3]
     isolation = Isolation(cstr(), SENSORS)
-    for place, row in enumerate(rows):
-        if place not in moves:
-            isolation.add(*row)
-    likeliest = isolation.suspects()[0]
+    likeliest = isolation.suspects([row for place, row in enumerate(rows) if place not in moves])[0]
     assert likeliest.cause == (fault.split(":")[0] or UNKNOWN)
     assert not isolation.stopped

@@ -4,7 +4,7 @@ from typing import TypeVar
 
 from google.protobuf.message import Message
 
-from monitor_node.alarms.alarms import ChartAlarm
+from monitor_node.alarms.alarms import ChartAlarm, Explanation
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract.codec import Publication
@@ -34,8 +34,15 @@ class Desk:
         """A row: the statistic of each signal named."""
         for signal, value in values.items():
             judgement = Judgement(value, 0.0, -3.0, 3.0, abs(value) > 3.0)
-            self.said += self.board.evaluate(self.alarms[signal], to_time_ns(minutes), judgement, "K")
+            self.judge(self.alarms[signal], minutes, judgement)
         self.said += self.board.end_row(to_time_ns(minutes))
+
+    def judge(self, alarm: ChartAlarm, minutes: float, judgement: Judgement) -> None:
+        """A point of an alarm's chart."""
+        raised = alarm.update(judgement)
+        if raised is not None:
+            explanation = Explanation(f"{alarm.name} is out", {}) if raised else None
+            self.said.append(self.board.record_change(alarm, to_time_ns(minutes), judgement, "K", explanation))
 
     def told(self, kind: type[M]) -> list[M]:
         """The messages of a kind."""

@@ -94,7 +94,7 @@ def test_a_spike_takes_no_suspects_away_from_the_incident_that_stands(spike_min:
     desk.board.set_suspects(to_time_ns(1.0), [SuspectedCause("coolant_flow", 0.9)])
     for minute, out in ((spike_min, True), (spike_min + 0.1, False)):
         judgement = Judgement(9.0 if out else 0.0, 0.0, -6.0, 6.0, out)
-        desk.said += desk.board.evaluate(spike, to_time_ns(minute), judgement, "sd")
+        desk.judge(spike, minute, judgement)
     desk.board.set_suspects(to_time_ns(spike_min + 1.0), [SuspectedCause("coolant_flow", 0.95)])
     assert [item.probability for item in desk.board.alarm("shewhart/T").suspects] == [0.95]
     assert desk.board.alarm("spike/T").incident == desk.board.incident == 1
@@ -108,7 +108,7 @@ def test_a_spike_takes_no_suspects_away_from_the_incident_that_stands(spike_min:
 def test_a_spike_alone_is_an_incident() -> None:
     desk = Desk()
     spike = desk.board.declare("spike", "T", without_on_delay=True, names_cause=True, is_transient=True)
-    desk.said += desk.board.evaluate(spike, to_time_ns(1.0), Judgement(9.0, 0.0, -6.0, 6.0, True), "sd")
+    desk.judge(spike, 1.0, Judgement(9.0, 0.0, -6.0, 6.0, True))
     assert (desk.board.incident, desk.board.alarm("spike/T").first_in) == (1, True)
 
 

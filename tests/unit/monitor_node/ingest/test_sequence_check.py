@@ -20,7 +20,7 @@ def taken(samples: list[HeldSample], run: SequenceCheck | None = None) -> tuple[
     run = run or SequenceCheck()
     believed, refused = list[HeldSample](), list[HeldSample]()
     for sample in samples:
-        if run.accept_next(sample.time_ns, sample.number):
+        if run.accept_next(sample.number, sample.time_ns):
             believed.append(sample)
         else:
             of_run, strange = run.update(sample, REORDER_ROWS)

@@ -1,0 +1,120 @@
+"""Diagnosis of a plant's training: deviations from the equations that the plant had from the start. Pure.
+
+A plant whose feed has always been a little warmer than in the simulation is sound. Its training is diagnosed like any
+record (`reactorwatch.diagnosis`), and the plant is then judged by the equations with these deviations in them. A
+diagnosis takes far longer than a row, so a job and its finding are values, and another process can do the work between
+them.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from monitor_node.baseline.training import TrainingState
+from reactorwatch.contract.messages_pb2 import Baseline
+from reactorwatch.diagnosis.result import AMBIGUOUS, NAMED, NOMINAL, Cause, Diagnosis
+from reactorwatch.process.extended_model import parse_extended_model
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import MINUTE_NS, Record
+from reactorwatch.stored_state import unpack_numbers, unpack_times
+
+DIAGNOSED = "diagnosed"
+"""`Baseline.what` of a change after a diagnosis of the training."""
+
+FAILED = "failed"
+"""Verdict of a diagnosis that could not be made."""
+
+
+class DiagnosisJob(NamedTuple):
+    """A training to be diagnosed.
+
+    Attributes:
+        rows: the rows of the training.
+        signals: names of the signals in a row, the input first.
+        equations: the model as JSON (`ExtendedModel.to_object`), times in minutes since 1970-01-01 UTC.
+    """
+
+    rows: TrainingState
+    signals: tuple[str, ...]
+    equations: str
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the first row, which identifies the training."""
+        return unpack_times(self.rows.times_ns[:8])[0]
+
+
+class Finding(NamedTuple):
+    """Result of a job.
+
+    Attributes:
+        first_ns: time of the first row of the training.
+        verdict: verdict of the diagnosis, or `FAILED`.
+        why: what was found, or why nothing could be, as a sentence without its full stop.
+        equations: the extended model as JSON, with its own zero; empty: the equations stay as they are.
+    """
+
+    first_ns: int
+    verdict: str
+    why: str
+    equations: str = ""
+
+    @property
+    def baseline(self) -> Baseline:
+        """The change of the baseline that follows, without its time and number."""
+        return Baseline(what=DIAGNOSED, by="monitor", why=self.why, model=self.equations)
+
+
+def diagnose_training(job: DiagnosisJob) -> Finding:
+    """Diagnose a training.
+
+    Where the rows cannot rank the explanations, the best of them is taken.
+
+    Raises:
+        InputError: the rows cannot be diagnosed: too few, or without movement of the input.
+    """
+    times_ns, columns = np.array(unpack_times(job.rows.times_ns)), unpack_numbers(job.rows.rows, len(job.signals)).T
+    record = Record(
+        (times_ns - job.first_ns) / MINUTE_NS,
+        dict(zip(job.signals, columns, strict=True)),
+        "training",
+        zero_ns=job.first_ns,
+    )
+    from reactorwatch.diagnosis.diagnose import diagnose  # a quarter of a second, which no other row needs
+
+    given = parse_extended_model(job.equations)
+    given = replace(given, effects=tuple(item.shift(-job.first_ns / MINUTE_NS) for item in given.effects))
+    found = diagnose(record, given.build())
+    extends = found.verdict in (NAMED, AMBIGUOUS)
+    return Finding(job.first_ns, found.verdict, _reason(found), _json(found.extended_model) if extends else "")
+
+
+def read_equations(text: str) -> ProcessModel:
+    """The model in `Baseline.model`, its clock that of samples on the bus: minutes since 1970-01-01 UTC.
+
+    Raises:
+        InputError: it is no model of this software.
+    """
+    return parse_extended_model(text).rebase(0).build()
+
+
+def _reason(found: Diagnosis) -> str:
+    if found.verdict == NOMINAL:
+        return "the training agrees with the equations"
+    if not found.causes:
+        return f"the training deviates from the equations ({found.location}), and no cause of the catalogue explains it"
+    text = f"the training deviates from the equations by {' and '.join(map(_text, found.causes))}"
+    others = [" and ".join(map(_text, item.explanation)) for item in found.alternatives]
+    return f"{text}; its rows do not rule out {', or '.join(others)}" if found.verdict == AMBIGUOUS else text
+
+
+def _text(cause: Cause) -> str:
+    size = cause.parameters["size"]
+    unit = "" if size.unit == "1" else f" {size.unit}"
+    return f"{cause.label} ({cause.cause}, {cause.profile}) of {size.value:+.3g}{unit}"
+
+
+def _json(extended: dict[str, Any]) -> str:
+    return msgspec.json.encode(extended).decode()

@@ -1,0 +1,115 @@
+"""Worker that diagnoses trainings beside the watch: one process at low priority, which lives while there are jobs."""
+
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from queue import Empty, SimpleQueue
+from typing import NamedTuple, TypeVar
+
+from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, Finding, diagnose_training
+from reactorwatch.runtime.parallel.jobs import Executor, Failed, run_job
+from reactorwatch.runtime.parallel.process_pool import ProcessExecutor
+
+NICENESS = 10
+
+Item = TypeVar("Item")
+
+
+class PlantJob(NamedTuple):
+    """A plant and the diagnosis of its training."""
+
+    plant: str
+    job: DiagnosisJob
+
+
+class PlantFinding(NamedTuple):
+    """A plant and the result of its diagnosis."""
+
+    plant: str
+    finding: Finding
+
+
+def find_deviations(job: DiagnosisJob) -> Finding:
+    """Diagnose a training in this process; a failure is a finding, too."""
+    return _finding(job, run_job(diagnose_training, job))
+
+
+def diagnose_beside(job: DiagnosisJob) -> Finding:
+    """Diagnose a training in a process of its own, which gives way to the monitor."""
+    os.setpriority(os.PRIO_PROCESS, 0, max(NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))
+    return diagnose_training(job)
+
+
+def _finding(job: DiagnosisJob, outcome: Finding | Failed) -> Finding:
+    return Finding(job.first_ns, FAILED, outcome.reason) if isinstance(outcome, Failed) else outcome
+
+
+class DiagnosisWorker:
+    """Queue of diagnoses, made one after the other by a thread and its process.
+
+    A diagnosis at which two processes die has failed. An unfinished diagnosis is dropped when the program ends; the
+    training's rows are still in the plant's state.
+
+    Args:
+        executor: runs the jobs; None: a process of this machine.
+    """
+
+    def __init__(self, executor: Executor | None = None) -> None:
+        self._executor = ProcessExecutor(1, retries=1) if executor is None else executor
+        self._jobs: SimpleQueue[PlantJob | None] = SimpleQueue()
+        self._findings: SimpleQueue[PlantFinding] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._submitted: dict[str, int] = {}
+        self._is_closed = False
+
+    def submit(self, plant: str, job: DiagnosisJob) -> None:
+        """Queue the diagnosis of a plant's training, unless it is queued already."""
+        if self._submitted.get(plant) == job.first_ns:
+            return
+        self._submitted[plant] = job.first_ns
+        self._jobs.put(PlantJob(plant, job))
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._work, name="diagnosis of trainings", daemon=True)
+            self._thread.start()
+
+    @property
+    def is_busy(self) -> bool:
+        """True while findings are to be expected."""
+        return bool(self._submitted)
+
+    def is_queued(self, plant: str) -> bool:
+        """True while a finding about a plant is to be expected."""
+        return plant in self._submitted
+
+    def pop_findings(self) -> list[PlantFinding]:
+        """Findings since the last call."""
+        found = list(_drain(self._findings))
+        for plant, finding in found:
+            if self._submitted.get(plant) == finding.first_ns:
+                del self._submitted[plant]
+        return found
+
+    def close(self) -> None:
+        """Start no further diagnosis."""
+        self._is_closed = True
+        self._jobs.put(None)
+
+    def _work(self) -> None:
+        while not self._is_closed:
+            first = self._jobs.get()
+            batch = [item for item in (first, *_drain(self._jobs)) if item is not None]
+            self._run(batch)
+
+    def _run(self, batch: Sequence[PlantJob]) -> None:
+        for index, outcome in self._executor.map_unordered(diagnose_beside, [item.job for item in batch]):
+            self._findings.put(PlantFinding(batch[index].plant, _finding(batch[index].job, outcome)))
+            if self._is_closed:
+                return
+
+
+def _drain(queue: "SimpleQueue[Item]") -> Iterator[Item]:
+    while True:
+        try:
+            yield queue.get_nowait()
+        except Empty:
+            return

@@ -1,0 +1,232 @@
+"""Candidates: causes with their profiles, sizes and onsets, as a scan or a fit finds them."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from math import inf, log, nan, pi, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monitor_node.isolation.glr_scan import Scan
+from monitor_node.isolation.window import Window
+from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.hypothesis import Fit
+from reactorwatch.diagnosis.fitting.profiles import EndedRamp, FittedProfile, Ramp, Step
+from reactorwatch.process.effect import Effect, SensorEffect
+from reactorwatch.stored_state import StoredState
+
+BEHIND = 15.0
+"""Log likelihood by which a hypothesis may be worse than the best one before it is dropped."""
+
+MOST = 8
+"""Maximum number of hypotheses of a small fault that are fitted."""
+
+LEAST_GAIN = 5.0
+"""Log likelihood that the end of a ramp has to gain: half the logarithm of some thousand values, and its onset's."""
+
+PROFILES: tuple[type[FittedProfile], ...] = (Step, Ramp)
+"""Profiles in the order of the scan."""
+
+ALL_PROFILES: tuple[type[FittedProfile], ...] = (*PROFILES, EndedRamp)
+"""Profiles that are fitted."""
+
+_FIRST_ROWS = 6
+_WELL_INSIDE = 0.6  # fraction of a bound at which a fit starts if the linear size is beyond the bound
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A cause with a profile, and its fit.
+
+    Attributes:
+        effect: effect of the cause.
+        profile: kind of profile.
+        parameters: size, for a ramp the size in the last row, onset, and for an ended ramp its end.
+        gain: gain in log likelihood over a plant without a fault.
+        w: normalised innovations of the newest rows, from before the onset on; 0 where nothing was measured.
+        log_volume: logarithm of the posterior volume of sizes and onsets, relative to the prior's (see `isolation`).
+        size_sd: standard deviation of the size.
+        onset_sd_min: standard deviation of the onset.
+        end_log_volume: logarithm of the posterior volume of a ramp's end, relative to the prior's; else 0.
+        fit: result of the fit; None if it was not fitted.
+    """
+
+    effect: Effect
+    profile: type[FittedProfile]
+    parameters: Array
+    gain: float
+    w: Array = field(default_factory=lambda: np.empty((0, 0)))
+    log_volume: float = 0.0
+    size_sd: float = nan
+    onset_sd_min: float = nan
+    end_log_volume: float = 0.0
+    fit: Fit | None = None
+
+    @property
+    def onset_min(self) -> float:
+        """Onset in minutes."""
+        return float(self.parameters[1])
+
+    def residual(self, window: Window) -> tuple[Array, NDArray[np.bool_]]:
+        """Normalised innovations since the onset, 0 where not measured, and a mask of measured values."""
+        since = int(np.sum(window.time_min < self.onset_min)) - (window.time_min.size - len(self.w))
+        w = self.w[max(since, 0) :]
+        return w, np.isfinite(window.measured[window.time_min.size - len(w) :])
+
+    def extrapolate(self, before_min: float, after_min: float) -> Array:
+        """Parameters for rows that end at another time: a ramp keeps its slope if its size stays possible."""
+        if self.profile is not Ramp:
+            return self.parameters
+        slope = self.parameters[0] / max(before_min - self.onset_min, 1e-9)
+        size = slope * (after_min - self.onset_min)
+        is_possible = self.effect.lower < size < self.effect.upper  # beyond, the filter may diverge again and again
+        return np.array([size, self.onset_min]) if is_possible else self.parameters
+
+
+class CandidateState(StoredState, frozen=True):
+    """Stored candidate: its cause, profile, parameters and gain."""
+
+    cause: str
+    profile: str
+    parameters: list[float]
+    gain: float
+
+
+class ProgressState(StoredState, frozen=True):
+    """Stored progress; the fields of `Progress`."""
+
+    onset_min: float
+    end_min: float
+    rounds: int
+    candidates: list[CandidateState]
+
+
+@dataclass(frozen=True, eq=False)
+class Progress:
+    """Progress of following a large fault.
+
+    Attributes:
+        onset_min: approximate onset.
+        end_min: time of the last row so far.
+        rounds: number of rounds of fits so far.
+        candidates: the remaining candidates, best first.
+    """
+
+    onset_min: float
+    end_min: float
+    rounds: int
+    candidates: list[Candidate]
+
+    def is_of(self, stands_out_min: float, earliest_min: float) -> bool:
+        """Return true if this is of the fault that stands out then, and the best onset is not before the earliest."""
+        return earliest_min <= self.candidates[0].onset_min and self.onset_min < stands_out_min <= self.end_min
+
+    def next_end(self, times: Array) -> int:
+        """Index after the last row of the next round; the more candidates remain, the fewer rows are added."""
+        onset, end = np.searchsorted(times, (self.onset_min, self.end_min)).tolist()
+        age = end + 1 - onset
+        growth = 2 if age < 2 * _FIRST_ROWS or len(self.candidates) > MOST else 4
+        return int(min(onset + max(growth * age, _FIRST_ROWS), times.size))
+
+    @property
+    def state(self) -> "ProgressState":
+        """The progress in a form that can be stored."""
+        candidates = [
+            CandidateState(item.effect.name, item.profile.name, item.parameters.tolist(), item.gain)
+            for item in self.candidates
+        ]
+        return ProgressState(self.onset_min, self.end_min, self.rounds, candidates)
+
+    @classmethod
+    def from_state(cls, state: "ProgressState", effects: Sequence[Effect]) -> "Progress | None":
+        """Restore the progress; None if a cause or a profile is not known."""
+        by_name = {item.name: item for item in effects}
+        profiles: dict[str, type[FittedProfile]] = {item.name: item for item in ALL_PROFILES}
+        if not state.candidates or any(
+            item.cause not in by_name or item.profile not in profiles for item in state.candidates
+        ):
+            return None
+        candidates = [
+            Candidate(by_name[item.cause], profiles[item.profile], np.array(item.parameters), item.gain)
+            for item in state.candidates
+        ]
+        return cls(state.onset_min, state.end_min, state.rounds, candidates)
+
+
+def best_first(candidates: Iterable[Candidate]) -> list[Candidate]:
+    """Sort by gain, largest first."""
+    return sorted(candidates, key=lambda item: -item.gain)
+
+
+def drop_needless_ends(candidates: list[Candidate]) -> list[Candidate]:
+    """Candidates without the ended ramps that explain no more than a step of the same cause."""
+    of_steps = {item.effect: item.gain for item in candidates if item.profile is Step}
+    return [
+        item
+        for item in candidates
+        if item.profile is not EndedRamp or item.gain > of_steps.get(item.effect, -inf) + LEAST_GAIN
+    ]
+
+
+def select_plausible(candidates: list[Candidate], share: float) -> list[Candidate]:
+    """Candidates that are not worse than the first, the best, by more than `BEHIND` and a share of its gain."""
+    least = candidates[0].gain - share * abs(candidates[0].gain) - BEHIND if candidates else 0.0
+    return [item for item in candidates if item.gain >= least] or candidates[:1]  # a gain may be NaN
+
+
+def scan_candidates(effects: Sequence[Effect], scan: Scan, window: Window) -> list[Candidate]:
+    """Candidates of a scan with a positive finite gain, best first, each at its likeliest onset."""
+    ratio = scan.ratio.reshape(scan.onset_min.size, -1)
+    size, information = scan.size.reshape(ratio.shape), scan.information.reshape(ratio.shape)
+    likeliest = np.argmax(ratio, axis=0)
+    widths = np.gradient(scan.onset_min) if scan.onset_min.size > 1 else np.ones(1)
+    highest = np.max(ratio, axis=0)
+    density = np.exp(0.5 * (ratio - np.where(np.isfinite(highest), highest, 0.0))) * widths[:, None]
+    distance = scan.onset_min[:, None] - scan.onset_min[likeliest]
+    onset_sd_min = np.sqrt(np.sum(density * distance**2, axis=0) / np.maximum(np.sum(density, axis=0), 1e-300))
+    values = _count_values_since(window, scan.onset_min)
+    volume = np.sum(density / np.sqrt(1.0 + values)[:, None], axis=0) / window.span_min
+    log_volume = np.log(np.maximum(volume, 1e-300))
+    end_min, candidates = float(window.time_min[scan.rows - 1]), []
+    for column, row in enumerate(likeliest.tolist()):
+        if information[row, column] > 0.0 and 0.0 < ratio[row, column] < inf:
+            effect, profile = effects[column % len(effects)], PROFILES[column // len(effects)]
+            onset_min = float(scan.onset_min[row])
+            if profile is Step and isinstance(effect, SensorEffect):
+                onset_min = interval_middle(window.time_min, onset_min)
+            span = end_min - onset_min if profile is Ramp else 1.0
+            final = float(size[row, column]) * span
+            if not effect.lower <= final <= effect.upper:
+                final = _WELL_INSIDE * min(max(final, effect.lower), effect.upper)
+            parameters, gain = np.array([final, onset_min]), 0.5 * float(ratio[row, column])
+            sds = span * float(information[row, column]) ** -0.5, float(onset_sd_min[column])
+            candidates.append(
+                Candidate(effect, profile, parameters, gain, np.empty((0, 0)), float(log_volume[column]), *sds)
+            )
+    return best_first(candidates)
+
+
+def interval_middle(times: Array, onset_min: float) -> float:
+    """Middle of the interval of an onset: a sensor's step shows in the next row wherever in the interval it occurs.
+
+    An onset at the time of a row is taken to be right after it.
+    """
+    row = int(np.clip(np.searchsorted(times, onset_min, side="right"), 1, times.size - 1))
+    return float(0.5 * (times[row - 1] + times[row]))
+
+
+def _count_values_since(window: Window, onset_min: Array) -> Array:
+    """Number of values measured since each onset."""
+    counts = np.append(np.cumsum(np.sum(np.isfinite(window.measured), axis=1)[::-1])[::-1], 0)
+    return np.asarray(counts[np.searchsorted(window.time_min, onset_min)])
+
+
+def log_volume_of(candidate: Candidate, window: Window) -> float:
+    """Logarithm of the posterior volume of a fit whose onset is about normal."""
+    values = float(_count_values_since(window, np.array([candidate.onset_min]))[0])
+    return log_share(candidate.onset_sd_min, window.span_min) - 0.5 * log(1.0 + values)
+
+
+def log_share(sd: float, span: float) -> float:
+    """Logarithm of the volume of a normal density of height 1 relative to a uniform prior, at most 0."""
+    return log(min(max(sqrt(2 * pi) * sd / span, 1e-300), 1.0))

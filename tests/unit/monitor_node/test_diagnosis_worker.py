@@ -1,0 +1,74 @@
+"""Trainings are diagnosed beside the watch, one after the other; a failure is a finding."""
+
+import time
+
+from monitor_node.__main__ import MonitorNode
+from monitor_node.baseline.training import TrainingState
+from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob
+from monitor_node.diagnosis_worker import DiagnosisWorker, PlantFinding
+from reactorwatch.contract.codec import Publication
+from reactorwatch.diagnosis.result import NAMED
+from reactorwatch.runtime.parallel.jobs import SerialExecutor
+from reactorwatch.stored_state import pack_numbers, pack_times
+
+from ...running import WITHIN_S
+from .warm_plant import CONFIG, LATE, TRAINED, Run, changes
+
+SHORT = DiagnosisJob(
+    TrainingState(pack_times([7, 8]), pack_numbers([[1.0] * 3] * 2), [2, 2]),
+    ("qc", "C", "T"),
+    '{"format": "reactorwatch.model.v1", "model": "cstr"}',
+)
+
+
+def has_preparation(node: MonitorNode) -> bool:
+    return node.preparation is not None
+
+
+def wait_for_findings(worker: DiagnosisWorker) -> list[PlantFinding]:
+    until_s, found = time.monotonic() + WITHIN_S, list[PlantFinding]()
+    while worker.is_busy:
+        assert time.monotonic() < until_s
+        found += worker.pop_findings()
+    return found
+
+
+def test_a_training_that_cannot_be_diagnosed_is_a_finding_and_the_next_is_diagnosed() -> None:
+    worker = DiagnosisWorker(SerialExecutor())
+    for name in ("a", "b", "a"):
+        worker.submit(name, SHORT)
+    found = wait_for_findings(worker)
+    worker.close()
+    assert [item.plant for item in found] == ["a", "b"]
+    for _, finding in found:
+        assert (finding.first_ns, finding.verdict, finding.equations) == (7, FAILED, "")
+        assert finding.why == "training: a diagnosis needs at least 200 rows, got 2; record for longer"
+
+
+def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_model_at_the_next_row(
+    warm: Run,
+) -> None:
+    node, published = MonitorNode(CONFIG, 0), list[Publication]()
+    node._worker = DiagnosisWorker(SerialExecutor())
+    for message in warm.messages[:TRAINED]:
+        published += node.on_message(message, 0)
+    assert not node._worker.is_busy
+    assert not has_preparation(node)
+    for message in warm.messages[TRAINED:LATE]:
+        published += node.on_message(message, 0)
+    assert node.rows == LATE // 3
+    assert not changes(published)
+    now_ns, until_s = 0, time.monotonic() + WITHIN_S
+    while node.awaits_diagnosis:
+        assert time.monotonic() < until_s
+        assert node.next_tick_ns() <= now_ns + 100_000_000  # it looks for the finding soon
+        now_ns += 100_000_000
+        published += node.on_tick(now_ns)
+    assert has_preparation(node)  # for looks for causes with the extended model
+    for message in warm.messages[LATE : LATE + 30]:
+        published += node.on_message(message, now_ns)
+    node.on_stop(now_ns)
+    (change,) = changes(published)
+    assert change == changes(warm.published)[0]
+    assert warm.finding.verdict == NAMED
+    assert not node._worker.is_busy
