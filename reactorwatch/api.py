@@ -21,9 +21,10 @@ from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.replay.backtest import run as run_backtest
 from reactorwatch.cli.read_record import DEFAULT_PLANT
 from reactorwatch.cli.read_record import record as read_file
-from reactorwatch.cli.reports import backtest_object, backtest_text, priority_word
+from reactorwatch.cli.reports import backtest_object, backtest_text
 from reactorwatch.cli.simulation import simulate_along
 from reactorwatch.contract import keys
+from reactorwatch.contract.alarm_text import priority_word
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
 from reactorwatch.description.find import find_process
@@ -404,7 +405,9 @@ class Monitor:
 
 def _change(alarm: Alarm) -> AlarmChange:
     suspects = [Suspect(item.cause, item.probability) for item in alarm.suspects]
-    return AlarmChange(to_minutes(alarm.time_ns), alarm.alarm, alarm.event, priority_word(alarm), alarm.text, suspects)
+    return AlarmChange(
+        to_minutes(alarm.time_ns), alarm.alarm, alarm.event, priority_word(alarm.priority), alarm.text, suspects
+    )
 
 
 def _settings(process: ProcessLike | None, settings: Mapping[str, Any]) -> MonitorConfig:

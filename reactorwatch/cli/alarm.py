@@ -124,12 +124,12 @@ def _show(reply: "CommandReply", *, json: bool) -> None:
 
 
 def _object(alarm: "Alarm") -> dict[str, object]:
-    from reactorwatch.cli.reports import priority_word
+    from reactorwatch.contract.alarm_text import priority_word, state_word
 
     return {
         "alarm": alarm.alarm,
-        "state": _state(alarm),
-        "priority": priority_word(alarm),
+        "state": state_word(alarm.state),
+        "priority": priority_word(alarm.priority),
         "raised_ns": alarm.raised_ns or None,
         "cleared_ns": alarm.cleared_ns or None,
         "shelved_until_ns": alarm.shelved_until_ns or None,
@@ -143,15 +143,14 @@ def _object(alarm: "Alarm") -> dict[str, object]:
 
 
 def _line(alarm: "Alarm") -> str:
-    from reactorwatch.cli.reports import priority_word
-    from reactorwatch.contract.suspects import suspects_text
+    from reactorwatch.contract.alarm_text import format_moment, priority_word, state_word, suspects_text
 
-    parts = [f"{alarm.alarm} ({priority_word(alarm)}): {_state(alarm)}"]
+    parts = [f"{alarm.alarm} ({priority_word(alarm.priority)}): {state_word(alarm.state)}"]
     if alarm.shelved_until_ns:
-        parts.append(f"until {_moment(alarm.shelved_until_ns)}")
+        parts.append(f"until {format_moment(alarm.shelved_until_ns)}")
     if alarm.incident:
         first = ", first in" if alarm.first_in else ""
-        parts.append(f"raised {_moment(alarm.raised_ns)} (incident {alarm.incident}{first})")
+        parts.append(f"raised {format_moment(alarm.raised_ns)} (incident {alarm.incident}{first})")
     if alarm.text:
         parts.append(alarm.text)
     suspects = suspects_text(alarm.suspects)
@@ -160,15 +159,3 @@ def _line(alarm: "Alarm") -> str:
     if alarm.by:
         parts.append(f"{alarm.by}: {alarm.comment}" if alarm.comment else alarm.by)
     return "; ".join(parts)
-
-
-def _state(alarm: "Alarm") -> str:
-    from reactorwatch.contract.messages_pb2 import AlarmState
-
-    return AlarmState.Name(alarm.state).removeprefix("ALARM_STATE_").lower().replace("_", " ")
-
-
-def _moment(time_ns: int) -> str:
-    from datetime import UTC, datetime
-
-    return datetime.fromtimestamp(time_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

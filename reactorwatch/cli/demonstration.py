@@ -24,9 +24,9 @@ from reactorwatch.cli.processes import Processes, settings_text
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.read_record import messages
 from reactorwatch.contract import keys
+from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Fault, Sample
-from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.records.atomic import atomic_write

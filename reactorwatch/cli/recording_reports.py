@@ -1,10 +1,9 @@
 """Output of `recover` and `info`: a JSON object, or lines for people."""
 
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from reactorwatch.contract.messages_pb2 import Priority
+from reactorwatch.contract.alarm_text import format_moment, priority_word
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.terminal import printable_lines
 from recorder.storage.recover import RecoveryResult
@@ -34,7 +33,7 @@ def saved_text(saved: RecoveryResult, file: Path, out: Path) -> str:
     return printable_lines(
         [
             f"{file}: saved {saved.messages} messages of {len(saved.topics)} topics, received over {span_s:.1f} s "
-            f"({moment(saved.first_ns)} to {moment(saved.last_ns)})",
+            f"({format_moment(saved.first_ns)} to {format_moment(saved.last_ns)})",
             *(f"  {count:9d}  {topic}" for topic, count in sorted(saved.topics.items())),
             f"not saved: {saved.losses}" if saved.losses else "nothing was damaged",
             f"wrote {out}",
@@ -112,7 +111,7 @@ def info_text(seen: FileInfo, file: Path) -> str:
     report = info_object(seen, file)
     lines = [f"{file}: {report['messages']} messages of {len(report['topics'])} topics"]
     if report["messages"]:
-        first, last = moment(report["first_ns"]), moment(report["last_ns"])
+        first, last = format_moment(report["first_ns"]), format_moment(report["last_ns"])
         lines[0] += f", received over {report['span_s']:.1f} s ({first} to {last})"
     if report["from_min"] is not None:
         lines.append(f"samples from {report['from_min']:g} to {report['to_min']:g} min")
@@ -142,7 +141,7 @@ def info_text(seen: FileInfo, file: Path) -> str:
     if len(report["gaps"]) > MAX_LINES:
         lines.append(f"  and {len(report['gaps']) - MAX_LINES} more gaps (--json names them)")
     lines += [
-        f"lost on the way: {gap['messages']} messages of {gap['stream']}, noticed {moment(gap['noticed_ns'])}"
+        f"lost on the way: {gap['messages']} messages of {gap['stream']}, noticed {format_moment(gap['noticed_ns'])}"
         for gap in report["lost_on_the_way"][:MAX_LINES]
     ]
     if len(report["lost_on_the_way"]) > MAX_LINES:
@@ -162,19 +161,3 @@ def info_text(seen: FileInfo, file: Path) -> str:
     if seen.damages:
         lines.append(f"not whole: {'; '.join(seen.damages)}; `reactorwatch recover {file}` saves the rest")
     return printable_lines(lines)
-
-
-def moment(time_ns: int) -> str:
-    """Format a time in UTC for people."""
-    try:
-        return datetime.fromtimestamp(time_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    except (OverflowError, ValueError, OSError):
-        return f"{time_ns} ns"
-
-
-def priority_word(priority: int) -> str:
-    """Word of a priority: `high` for PRIORITY_HIGH; an unknown number is returned as text."""
-    try:
-        return Priority.Name(priority).removeprefix("PRIORITY_").lower()
-    except ValueError:
-        return str(priority)

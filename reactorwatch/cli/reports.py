@@ -7,8 +7,7 @@ from typing import Any
 import msgspec
 
 from monitor_node.replay.backtest import Backtest
-from reactorwatch.contract.messages_pb2 import Alarm, Priority
-from reactorwatch.contract.suspects import suspects_text
+from reactorwatch.contract.alarm_text import priority_word, suspects_text
 from reactorwatch.records.record import to_minutes
 from reactorwatch.terminal import printable_lines
 
@@ -43,7 +42,7 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
         "alarms": [
             {
                 "alarm": alarm.alarm,
-                "priority": priority_word(alarm),
+                "priority": priority_word(alarm.priority),
                 "raised_min": minutes(alarm.raised_ns),
                 "cleared_min": minutes(cleared_ns),
                 "signals": [item.signal for item in alarm.contributions],
@@ -87,7 +86,7 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
             "still standing at the end" if cleared_ns is None else f"cleared at {to_minutes(cleared_ns, zero_ns):g} min"
         )
         raised = f"{to_minutes(alarm.raised_ns, zero_ns):9g} min"
-        lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm)}), {end}: {alarm.text}")
+        lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm.priority)}), {end}: {alarm.text}")
     suspects = dict.fromkeys(
         filter(None, (suspects_text(alarm.suspects, zero_ns) for alarm, _ in result.raised_alarms))
     )
@@ -106,8 +105,3 @@ def _reference_line(result: Backtest) -> str:
         return "judged by identified models (ARX)"
     levels = (f"{name} {sd:.3g}" for name, sd in result.noise_levels["sensors"].items())
     return f"judged by the equations, with noise of the sensors (standard deviation) {', '.join(levels)}"
-
-
-def priority_word(alarm: Alarm) -> str:
-    """Word of an alarm's priority: `high` for PRIORITY_HIGH."""
-    return Priority.Name(alarm.priority).removeprefix("PRIORITY_").lower()

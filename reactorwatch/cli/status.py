@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from reactorwatch.cli.printing import print_text
-from reactorwatch.cli.reports import priority_word
 from reactorwatch.contract import keys
+from reactorwatch.contract.alarm_text import priority_word, state_word
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Health, ListAlarms, Sample
 from reactorwatch.errors import InputError
@@ -230,8 +230,8 @@ def _table(board: StatusBoard, now_ns: int) -> "Table":
 def _alarm(alarm: Alarm) -> dict[str, Any]:
     return {
         "alarm": alarm.alarm,
-        "state": AlarmState.Name(alarm.state).removeprefix("ALARM_STATE_").lower().replace("_", " "),
-        "priority": priority_word(alarm),
+        "state": state_word(alarm.state),
+        "priority": priority_word(alarm.priority),
         "text": alarm.text,
     }
 

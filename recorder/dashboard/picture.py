@@ -36,24 +36,6 @@ LEAST_PIXELS = 500
 """Least number of coloured pixels of a picture with plots; buttons alone have fewer."""
 
 
-def render_png(rrd: Path, png: Path, width: int = 1600, height: int = 1000, deadline_s: float = DEADLINE_S) -> None:
-    """Draw the initial view of a dashboard.
-
-    Args:
-        rrd: the dashboard.
-        png: the picture; an existing file is replaced.
-        width: width in pixels.
-        height: height in pixels.
-        deadline_s: largest duration, in seconds.
-
-    Raises:
-        InputError: the dashboard does not exist, the viewer does not run on this machine, or it shows no plots in time.
-    """
-    deadline = time.monotonic() + deadline_s
-    with atomic_write(png) as temporary, _HeadlessViewer.open(rrd, width, height, deadline) as studio:
-        temporary.write_bytes(studio.picture(deadline))
-
-
 def render_tabs(
     rrd: Path, folder: Path, width: int = 1600, height: int = 1000, deadline_s: float = DEADLINE_S
 ) -> list[Path]:
@@ -70,13 +52,14 @@ def render_tabs(
         The pictures, in the order of the tabs.
 
     Raises:
-        InputError: as `render_png`; or the folder cannot be created.
+        InputError: the dashboard does not exist, the viewer does not run on this machine, or it shows no plots in time;
+            or the folder cannot be created.
     """
-    make_folder(folder)
     pictures: list[Path] = []
     deadline = time.monotonic() + deadline_s
     with _HeadlessViewer.open(rrd, width, height, deadline) as studio:
         picture = studio.picture(deadline)
+        make_folder(folder)
         for index, (title, tab) in enumerate(studio.tabs().items()):
             if index:
                 studio.open_tab(tab)

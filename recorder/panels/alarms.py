@@ -1,7 +1,7 @@
 """Alarm states over time, and a log of alarms, suspects and injected faults."""
 
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.suspects import suspects_text
+from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.records.record import to_minutes
 from recorder.columns.run import AlarmChange, FaultChange, RunColumns
 from recorder.columns.run_reader import LISTED, SUSPECTED

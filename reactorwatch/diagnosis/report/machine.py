@@ -4,7 +4,9 @@ from math import isfinite
 from typing import Any
 
 from reactorwatch.diagnosis.difference import Difference
-from reactorwatch.diagnosis.result import Cause, Diagnosis, Estimate, Experiment, HeldOut
+from reactorwatch.diagnosis.result import Cause, Diagnosis, Experiment
+
+_ESTIMATE = ("value", "sd", "unit")
 
 
 def as_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None = None) -> dict[str, Any]:
@@ -38,7 +40,10 @@ def as_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None 
         "practical": bool(diagnosis.practical),
         "gain": {
             "delta_bic": _number(diagnosis.gain.delta_bic),
-            "held_out": {name: _holdout_gain(item) for name, item in diagnosis.gain.held_out.items()},
+            "held_out": {
+                name: _fields(item, "rmse_before", "rmse_after", "noise_sd", "unit")
+                for name, item in diagnosis.gain.held_out.items()
+            },
         },
         "adequacy": {name: {"minus_log10_p": _number(value)} for name, value in diagnosis.adequacy.items()},
         "experiment": None if experiment is None else _experiment(experiment),
@@ -49,19 +54,16 @@ def as_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None 
 
 def _cause(cause: Cause, runs: int) -> dict[str, Any]:
     return {
-        "cause": cause.cause,
-        "profile": cause.profile,
-        "label": cause.label,
-        "location": cause.location,
+        **_fields(cause, "cause", "profile", "label", "location"),
         **({"run": cause.run} if runs > 1 else {}),
-        "parameters": {name: _estimate(item) for name, item in cause.parameters.items()},
+        "parameters": {name: _fields(item, *_ESTIMATE) for name, item in cause.parameters.items()},
     }
 
 
 def _parameters(diagnosis: Diagnosis) -> dict[str, Any]:
     """Uncertain parameters."""
     return {
-        name: {"nominal": _number(item.nominal), "stated_sd": _number(item.stated_sd), **_estimate(item.estimate)}
+        name: _fields(item, "nominal", "stated_sd") | _fields(item.estimate, *_ESTIMATE)
         for name, item in diagnosis.parameters.items()
     }
 
@@ -96,17 +98,9 @@ def _experiment(experiment: Experiment) -> dict[str, Any]:
     }
 
 
-def _estimate(estimate: Estimate) -> dict[str, Any]:
-    return {"value": _number(estimate.value), "sd": _number(estimate.sd), "unit": estimate.unit}
-
-
 def _difference(item: Difference) -> dict[str, Any]:
     return {
-        "rmse": _number(item.rmse),
-        "noise_sd": _number(item.noise_sd),
-        "noise_share": _number(item.noise_share),
-        "one_step": _number(item.one_step),
-        "unit": item.unit,
+        **_fields(item, "rmse", "noise_sd", "noise_share", "one_step", "unit"),
         "along": {
             axis: [
                 {"from": part.lower, "to": part.upper, "mean": part.mean, "rmse": part.rmse, "rows": part.rows}
@@ -117,13 +111,10 @@ def _difference(item: Difference) -> dict[str, Any]:
     }
 
 
-def _holdout_gain(item: HeldOut) -> dict[str, Any]:
-    return {
-        "rmse_before": _number(item.rmse_before),
-        "rmse_after": _number(item.rmse_after),
-        "noise_sd": _number(item.noise_sd),
-        "unit": item.unit,
-    }
+def _fields(item: object, *names: str) -> dict[str, Any]:
+    """Texts and numbers of an object, by the names of its attributes."""
+    values = {name: getattr(item, name) for name in names}
+    return {name: value if isinstance(value, str) else _number(value) for name, value in values.items()}
 
 
 def _number(value: float) -> float | None:

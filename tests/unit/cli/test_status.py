@@ -2,6 +2,7 @@
 
 from google.protobuf.message import Message
 
+from reactorwatch.cli.alarm import _line as alarm_line
 from reactorwatch.cli.status import StatusBoard, _text
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Priority, Sample
@@ -93,3 +94,13 @@ def test_bytes_that_are_no_message_are_passed_over() -> None:
     board = StatusBoard(START_NS)
     board.on_message(Encoded("reactor/a/health/plant", b"\xff", "text/plain", START_NS))
     assert board.plants == []
+
+
+def test_an_alarm_of_a_priority_or_state_that_this_version_does_not_know_is_shown_by_its_number() -> None:
+    """Of a newer monitor: `status` and `alarm list` go on."""
+    odd = Alarm(alarm="x/T", priority=99, state=AlarmState.ALARM_STATE_UNACKNOWLEDGED)  # type: ignore[arg-type]
+    board = StatusBoard(START_NS)
+    board.on_message(said("a/alarm/x/T", odd))
+    assert [item["priority"] for item in board.plant("a", START_NS)["alarms"]] == ["99"]
+    odd.state = 88  # type: ignore[assignment]
+    assert alarm_line(odd).startswith("x/T (99): 88")

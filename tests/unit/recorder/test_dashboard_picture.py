@@ -15,7 +15,7 @@ from PIL import Image
 from reactorwatch.errors import InputError
 from recorder.columns.run_reader import read_run
 from recorder.dashboard.file import write_rrd, write_views
-from recorder.dashboard.picture import count_coloured, render_png, render_tabs
+from recorder.dashboard.picture import count_coloured, render_tabs
 from recorder.panels.base import ALARM, INPUT, MEASURED, PREDICTED, RESIDUAL, UNSTABLE, Colour, Series, TimePlot
 from tests.unit.recorder import golden
 
@@ -47,9 +47,9 @@ def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_picture_shows_the_lines_and_leaves_no_viewer_behind(
-    rrd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture(scope="module")
+def drawn(rrd: Path) -> tuple[list[Path], list[subprocess.Popen[bytes]]]:
+    """The pictures of all tabs, and the viewers that were started for them."""
     started: list[subprocess.Popen[bytes]] = []
 
     def start(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
@@ -57,11 +57,17 @@ def test_a_picture_shows_the_lines_and_leaves_no_viewer_behind(
         return started[-1]
 
     real = subprocess.Popen
-    monkeypatch.setattr(subprocess, "Popen", start)
-    png = tmp_path / "run.png"
-    with skipping_without_graphics():
-        render_png(rrd, png, 1000, 700)
-    pixels = pixels_of(png)
+    with pytest.MonkeyPatch.context() as patch, skipping_without_graphics():
+        patch.setattr(subprocess, "Popen", start)
+        pictures = render_tabs(rrd, rrd.with_name("tabs"), 1000, 700)
+    return pictures, started
+
+
+def test_a_picture_shows_the_lines_and_leaves_no_viewer_behind(
+    drawn: tuple[list[Path], list[subprocess.Popen[bytes]]],
+) -> None:
+    pictures, started = drawn
+    pixels = pixels_of(pictures[0])
     assert pixels.shape == (700, 1000, 3)
     for colour in (MEASURED, PREDICTED, INPUT):
         there = like(pixels, colour)
@@ -73,9 +79,8 @@ def test_a_picture_shows_the_lines_and_leaves_no_viewer_behind(
     assert viewer.args[viewer.args.index("--bind") + 1] == "127.0.0.1"
 
 
-def test_every_tab_gets_a_picture_of_its_own(rrd: Path, tmp_path: Path) -> None:
-    with skipping_without_graphics():
-        pictures = render_tabs(rrd, tmp_path / "tabs", 1000, 700)
+def test_every_tab_gets_a_picture_of_its_own(drawn: tuple[list[Path], list[subprocess.Popen[bytes]]]) -> None:
+    pictures, _ = drawn
     assert [path.name for path in pictures] == [
         "overview.png", "residuals-and-charts.png", "alarms.png", "phase-plane.png", "health.png",
     ]  # fmt: skip
@@ -118,12 +123,10 @@ def test_only_coloured_pixels_count() -> None:
     assert count_coloured(buffer.getvalue()) == 30
 
 
-def test_what_cannot_be_drawn_is_told_in_one_line(tmp_path: Path) -> None:
+def test_what_cannot_be_drawn_is_told_in_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no such file"):
-        render_png(tmp_path / "none.rrd", tmp_path / "run.png")
+        render_tabs(tmp_path / "none.rrd", tmp_path / "tabs")
     (tmp_path / "run.rrd").write_bytes(b"")
-    with pytest.raises(InputError, match=r"the folder .+ does not exist"):
-        render_png(tmp_path / "run.rrd", tmp_path / "no" / "run.png")
     with pytest.raises(InputError, match="the viewer did not show the plots in time"):
-        render_png(tmp_path / "run.rrd", tmp_path / "run.png", deadline_s=0.0)
+        render_tabs(tmp_path / "run.rrd", tmp_path / "tabs", deadline_s=0.0)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run.rrd"]
