@@ -70,7 +70,7 @@ def test_a_compressed_file_has_the_same_bytes_each_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "line"),
     [
-        ("a.csv.gz", gzip.compress(b"time_min,qc\n0,1\n" * 100)[:-9], "expected a complete gzip file"),
+        ("a.csv.gz", gzip.compress(b"time_min,qc\n0,1\n" * 100, mtime=0)[:-9], "expected a complete gzip file"),
         ("a.xlsx", b"PK\x03\x04 and no more", "expected a workbook"),
         ("a.parquet", b"PAR1 and no more", "expected a Parquet file with columns of plain values"),
         ("a.txt", b"\xff\xfet", "expected UTF-16 text"),
