@@ -17,15 +17,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode
-from reactorwatch.records.csv_file import read_csv, write_csv
-from reactorwatch.records.record import Record
 from reactorwatch.runtime import logs
 from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
@@ -203,21 +200,6 @@ def fsync(folder: Path) -> None:
         )
 
 
-def csv(folder: Path) -> None:
-    """Reading a million rows, over NumPy's own parser."""
-    path, rows = folder / "run.csv", 1_000_000
-    values = np.random.default_rng(1).normal(size=(rows, len(SIGNALS)))
-    columns = {signal: values[:, number] for number, signal in enumerate(SIGNALS)}
-    write_csv(path, Record(np.arange(rows) / 10, columns, "run"))
-    start = time.perf_counter()
-    np.loadtxt(path, delimiter=",", skiprows=1)
-    bare_s = time.perf_counter() - start
-    start = time.perf_counter()
-    read_csv(path)
-    seconds = time.perf_counter() - start
-    print(f"CSV, numpy.loadtxt / read_csv            {bare_s / seconds:5.2f}   ({seconds:.1f} s a million rows)")
-
-
 def main() -> None:
     """Print the table."""
     logs.configure()  # to standard error
@@ -230,7 +212,6 @@ def main() -> None:
             print(f"recorded / published, {asked:18s} {share:5.3f}   ({got:,.0f} messages/s, lag up to {lag_s:.2f} s)")
         files(folder)
         fsync(folder)
-        csv(folder)
 
 
 if __name__ == "__main__":

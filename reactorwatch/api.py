@@ -33,7 +33,7 @@ from reactorwatch.diagnosis.diagnose import diagnose as find_causes
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import report_object
 from reactorwatch.diagnosis.result import Diagnosis
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.identify import Identification
 from reactorwatch.identification.identify import identify as identify_model
 from reactorwatch.process import MODELS, effects_of
@@ -41,7 +41,9 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.record import Record, to_minutes, to_time_ns
+from reactorwatch.records.several_files import join_files
 from reactorwatch.runtime.config import section
 from reactorwatch.spc.charts import catalogue as charts  # noqa: F401 # a public name
 from recorder.tools.player import samples_of
@@ -65,24 +67,39 @@ def effects(process: ProcessLike = "cstr") -> tuple[Effect, ...]:
 
 
 def read_record(
-    file: str | Path,
+    file: str | Path | Sequence[str | Path],
     process: ProcessLike = "cstr",
     *,
     plant: str | None = None,
     columns: Mapping[str, str] | None = None,
+    **form: Any,
 ) -> Record:
     """Read a measured record.
 
     Args:
-        file: a table (`.csv`, `.xlsx`, `.parquet` and others), a recording (`.mcap`), or a folder of recordings.
+        file: a table (`.csv`, `.xlsx`, `.parquet` and others), a recording (`.mcap`), a folder of recordings, or
+            several files in a row.
         process: decides which signals the file must have, and how it is read.
         plant: name of the plant in a recording; None: the only one in it.
         columns: names of the columns in a table, by signal, where they differ.
+        form: what is not to be guessed about a table: `time`, `time_unit`, `time_format`, `zone`, `period`, `missing`,
+            `separator`, `decimal`, `header`, `transposed`, like the options of the commands.
+
+    Returns:
+        The record; `read_as` has the guesses about a table.
 
     Raises:
-        InputError: the file cannot be read, or a signal is missing.
+        InputError: the file cannot be read, a signal is missing, or `form` has another name.
     """
-    return read_file(Path(file), plant, dict(columns or {}), find_process(process))
+    known = [item.name for item in fields(FileFormat)]
+    for name in form:
+        if name not in known:
+            raise InputError(describe_unknown("argument", name, known))
+    missing = form.pop("missing", ())
+    words = (missing,) if isinstance(missing, str | float | int) else missing
+    stated, described = FileFormat(**form, missing=tuple(map(str, words))), find_process(process)
+    files = [file] if isinstance(file, str | Path) else file
+    return join_files([read_file(Path(item), plant, dict(columns or {}), described, stated) for item in files])
 
 
 def simulate(record: Record, process: ProcessLike = "cstr", faults: Sequence[str] = ()) -> Record:

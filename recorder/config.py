@@ -6,6 +6,7 @@ from typing import Annotated
 import msgspec
 
 from reactorwatch.contract import keys
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.runtime.setting_rules import check_bounds
 from recorder.policy.channel_budget import MAX_KEYS
 from recorder.policy.rotation import Fsync
@@ -92,7 +93,8 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         plant: name of the plant on the bus; empty keeps the recorded name (`cstr` for a CSV file).
         everything: True to play estimates, charts, alarms and faults too, not only samples.
         wait_for: names of nodes that must be alive before the first sample is published.
-        columns: names of the columns in a CSV file, by signal, where they differ.
+        columns: names of the columns in a table, by signal, where they differ.
+        table: form of a table, where it is not to be guessed.
     """
 
     file: str
@@ -104,6 +106,7 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     everything: bool = False
     wait_for: tuple[str, ...] = ()
     columns: dict[str, str] = {}
+    table: FileFormat = GUESS
 
     def __post_init__(self) -> None:
         if not self.rate > 0.0:

@@ -16,6 +16,7 @@ from reactorwatch.cli.reports import backtest_object, backtest_text
 from reactorwatch.cli.unit_remarks import FirstSamples
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.runtime.model_file import read_model_on_bus_clock
 
 
@@ -31,6 +32,7 @@ class Job:
         columns: names of columns by signal.
         as_json: format the result as JSON.
         among: name the file in the result, because there are others.
+        stated: statements about the form of a table.
     """
 
     file: Path
@@ -40,6 +42,7 @@ class Job:
     columns: dict[str, str]
     as_json: bool
     among: bool
+    stated: FileFormat = GUESS
 
 
 def make_jobs(
@@ -50,6 +53,7 @@ def make_jobs(
     *,
     as_json: bool,
     elsewhere: bool,
+    stated: FileFormat = GUESS,
 ) -> list[Job]:
     """Make a job for each file.
 
@@ -60,11 +64,12 @@ def make_jobs(
         columns: names of columns by signal.
         as_json: format the results as JSON.
         elsewhere: use absolute paths, for workers with another working folder.
+        stated: statements about the form of tables.
     """
     if elsewhere and settings.model is not None:
         settings = msgspec.structs.replace(settings, model=str(Path(settings.model).absolute()))
     return [
-        Job(file, file.absolute() if elsewhere else file, settings, plant, columns, as_json, len(files) > 1)
+        Job(file, file.absolute() if elsewhere else file, settings, plant, columns, as_json, len(files) > 1, stated)
         for file in files
     ]
 
@@ -77,7 +82,7 @@ def run_job(job: Job) -> JobResult:
     """
     plant = resolve_plant(check_recording(job.at), job.plant)
     settings = msgspec.structs.replace(job.settings, plant=plant)
-    recording, first = open_messages(job.at, plant, job.columns, _units(settings)), FirstSamples(plant)
+    recording, first = open_messages(job.at, plant, job.columns, _units(settings), job.stated), FirstSamples(plant)
     result = run(first.collect_samples(recording.messages), settings, recording.zero_ns or 0)
     if not result.rows:
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items()))
@@ -91,9 +96,9 @@ def run_job(job: Job) -> JobResult:
         text = msgspec.json.encode({"file": str(job.file), **found} if job.among else found).decode()
     else:
         text = backtest_text(result, zero_ns, job.file)
-    return JobResult(
-        text, _row(job.file, found), remark=first.unit_remark(read_model_on_bus_clock(settings.model) or cstr())
-    )
+    remarks = [f"read as: {recording.read_as}"] if recording.read_as else []
+    remarks += filter(None, [first.unit_remark(read_model_on_bus_clock(settings.model) or cstr())])
+    return JobResult(text, _row(job.file, found), remark="; ".join(remarks))
 
 
 def _units(settings: MonitorConfig) -> dict[str, str] | None:

@@ -20,6 +20,7 @@ from reactorwatch.process import effects_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.csv_file import write_csv
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.folder import fill_folder
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
@@ -50,6 +51,7 @@ class DiagnosisOptions:
         uncertain: parameters with a standard deviation, as text; None: none.
         tolerance: differences that do not matter, by output.
         limits: lowest and highest values of an experiment, by signal.
+        stated: statements about the form of a table.
     """
 
     plant: str | None = None
@@ -58,6 +60,7 @@ class DiagnosisOptions:
     uncertain: str | None = None
     tolerance: dict[str, float] = field(default_factory=dict)
     limits: Limits = field(default_factory=dict)
+    stated: FileFormat = GUESS
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,7 @@ def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path
         InputError: the file cannot be read or diagnosed, or an uncertain parameter does not exist.
     """
     described = asked.process.load()
-    measured = record(check_recording(at or file), asked.plant, asked.columns, described)
+    measured = record(check_recording(at or file), asked.plant, asked.columns, described, stated=asked.stated)
     model = asked.process.load_model(measured.zero_ns)
     known = described.uncertain
     if asked.uncertain is not None:

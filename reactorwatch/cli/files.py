@@ -8,7 +8,9 @@ import typer
 
 from reactorwatch.cli.options import Columns, Force, Plant, check_input, check_output, check_recording, parse_columns
 from reactorwatch.cli.printing import print_lines, print_text
+from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.output import check_output_folder
 
 if TYPE_CHECKING:
@@ -20,8 +22,8 @@ Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.", sho
 
 def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
-    app.command("dashboard")(dashboard)
-    app.command("import")(import_csv)
+    app.command("dashboard")(take_table_options(dashboard))
+    app.command("import")(take_table_options(import_csv))
     app.command("export")(export_csv)
 
 
@@ -39,6 +41,7 @@ def dashboard(
         Path | None, typer.Option(help="A folder for a picture of each tab, without a screen.", show_default=False)
     ] = None,
     force: Force = False,
+    stated: FileFormat = GUESS,
 ) -> None:
     """Draw a recording into a Rerun file, without a screen."""
     from reactorwatch.cli.diagnosis import DRAWING
@@ -55,10 +58,10 @@ def dashboard(
     if png is not None:
         check_output_folder(png, picture_names(), (file,), option="--png", force=force)
     with task(f"drawing {file.name}"):
-        recording = open_messages(check_recording(file), plant)
+        recording = open_messages(check_recording(file), plant, stated=stated)
         run = read_segments(recording.messages, given_zero_ns=recording.zero_ns)
         write_rrd(_check_samples(run, file), out, diagnosis=drawn)
-    print_lines(f"wrote {out}")
+    print_lines(f"wrote {out}", *([f"note: read as: {recording.read_as}"] if recording.read_as else []))
     if png is not None:
         with task("rendering"):
             pictures = render_tabs(out, png)
@@ -83,19 +86,23 @@ def _check_samples(runs: "Iterable[RunColumns]", file: Path) -> "Iterator[RunCol
 
 
 def import_csv(
-    file: Annotated[Path, typer.Argument(help="A record (.csv).", show_default=False)],
+    files: Annotated[
+        list[Path],
+        typer.Argument(help="A record (.csv or another table), or several in a row.", show_default=False),
+    ],
     out: Out,
     plant: Plant = None,
     column: Columns = None,
     force: Force = False,
+    stated: FileFormat = GUESS,
 ) -> None:
-    """Turn a record (.csv) into a recording (.mcap)."""
+    """Turn a record (.csv or another table), or several in a row, into a recording (.mcap)."""
     from reactorwatch.cli.progress import task
     from recorder.tools.convert import import_csv as convert
 
-    out = check_output(out, ".mcap", (file,), force=force)
-    with task(f"importing {file.name}"):
-        record = convert(check_input(file), out, plant or "cstr", parse_columns(column))
+    out = check_output(out, ".mcap", files, force=force)
+    with task(f"importing {files[0].name}"):
+        record = convert(list(map(check_input, files)), out, plant or "cstr", parse_columns(column), stated=stated)
     print_text(_report_text(out, record))
 
 
@@ -103,15 +110,17 @@ def export_csv(
     file: Annotated[Path, typer.Argument(help="A recording (.mcap), or a folder of them.", show_default=False)],
     out: Out,
     plant: Plant = None,
+    clock: Annotated[bool, typer.Option("--clock", help="Add a column with the clock time, ISO 8601 in UTC.")] = False,
     force: Force = False,
 ) -> None:
-    """Turn a recording (.mcap) into a record (.csv)."""
+    """Turn a recording (.mcap) into a record (.csv, .csv.gz, .xlsx or .parquet)."""
     from reactorwatch.cli.progress import task
+    from reactorwatch.records.write_table import WRITTEN_SUFFIXES
     from recorder.tools.convert import export_csv as convert
 
-    out = check_output(out, ".csv", (file,), force=force)
+    out = check_output(out, WRITTEN_SUFFIXES, (file,), force=force)
     with task(f"exporting {file.name}"):
-        record = convert(check_recording(file), out, plant)
+        record = convert(check_recording(file), out, plant, clock=clock)
     print_text(_report_text(out, record))
 
 

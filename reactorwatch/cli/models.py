@@ -7,12 +7,14 @@ import typer
 
 from reactorwatch.cli.options import Columns, Force, Json, Plant, Processes, Scheduler, check_recording, parse_columns
 from reactorwatch.cli.printing import print_text
+from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import GUESS, FileFormat
 
 
 def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
-    app.command("identify")(identify)
+    app.command("identify")(take_table_options(identify))
     app.command("linearise")(linearise)
     app.command("reproduce")(reproduce)
 
@@ -36,6 +38,7 @@ def identify(
     plant: Plant = None,
     column: Columns = None,
     as_json: Json = False,
+    stated: FileFormat = GUESS,
 ) -> None:
     """Fit a linear model to one half, validate it on the other."""
     from reactorwatch.cli import identification
@@ -45,7 +48,7 @@ def identify(
     from reactorwatch.cli.unit_remarks import unit_remark
     from reactorwatch.process.library.cstr.model import cstr
 
-    measured = record(check_recording(file), plant, parse_columns(column))
+    measured = record(check_recording(file), plant, parse_columns(column), stated=stated)
     remark = unit_remark(cstr(), measured.columns, measured.time_min)
     with task(f"identifying {file.name}"):
         if compare:

@@ -1,6 +1,7 @@
 """Commands that run one node until it is finished or stopped: `plant`, `monitor`, `record`, `replay`."""
 
 import logging
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +23,9 @@ from reactorwatch.cli.options import (
     parse_span_ns,
 )
 from reactorwatch.cli.printing import print_lines
+from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import GUESS, FileFormat
 
 
 def register_commands(app: typer.Typer) -> None:
@@ -30,7 +33,7 @@ def register_commands(app: typer.Typer) -> None:
     app.command("plant")(plant)
     app.command("monitor")(monitor)
     app.command("record")(record)
-    app.command("replay")(replay)
+    app.command("replay")(take_table_options(replay))
     app.command("alive")(alive)
 
 
@@ -213,6 +216,7 @@ def replay(
         ),
     ] = False,
     as_json: Json = False,
+    stated: FileFormat = GUESS,
 ) -> None:
     """Publish a recording or a record as the plant did, or verify a recording.
 
@@ -227,11 +231,12 @@ def replay(
                 raise InputError(f"--verify publishes nothing and takes the whole recording; leave out {option}")
         raise typer.Exit(run(check_recording(file), config, name, as_json=as_json))
     from reactorwatch.records.record import MINUTE_NS
+    from reactorwatch.records.source_text import is_table
     from reactorwatch.runtime.config import section
     from recorder.tools.replay import ReplayConfig, run_replay
 
-    if column and file.suffix.lower() != ".csv":
-        raise InputError(f"--column is for the columns of a .csv file, got {file}")
+    if column and not is_table(file):
+        raise InputError(f"--column is for the columns of a table, such as a .csv file, got {file}")
     tables, bus = _settings(config, endpoint)
     flags = {
         "file": str(check_recording(file)),
@@ -241,6 +246,7 @@ def replay(
         "to_min": parse_span_ns(end, "--to") / MINUTE_NS if end is not None else None,
         "loop": loop,
         "columns": parse_columns(column) or None,
+        "table": {name: value for name, value in asdict(stated).items() if value not in (None, ())} or None,
     }
     run_replay(section(ReplayConfig, "replay", tables, flags), bus)
 

@@ -39,9 +39,6 @@ Process = Annotated[
         show_default=False,
     ),
 ]
-TimeColumn = Annotated[
-    str | None, typer.Option("--time", help="The column of times, by name or number [guessed].", show_default=False)
-]
 Force = Annotated[
     bool, typer.Option("--force", help="Replace a file that is there and is of another kind than its name says.")
 ]
@@ -56,7 +53,7 @@ Diagnose = Annotated[
 Files = Annotated[
     list[Path],
     typer.Argument(
-        help="Records (.csv) or recordings (.mcap), folders of them, or patterns such as 'runs/*.csv'.",
+        help="Records (.csv or other tables) or recordings (.mcap), folders of them, or patterns such as 'runs/*.csv'.",
         show_default=False,
     ),
 ]
@@ -196,12 +193,12 @@ def check_input(path: Path) -> Path:
     return path
 
 
-def check_output(path: Path, suffix: str, sources: Iterable[Path | None], *, force: bool) -> Path:
+def check_output(path: Path, suffix: str | tuple[str, ...], sources: Iterable[Path | None], *, force: bool) -> Path:
     """Check that an output file may be written and has the right suffix; returns its path.
 
     Args:
         path: the file.
-        suffix: the required suffix.
+        suffix: the required suffix, or those of which it must have one.
         sources: see `check_output_file`.
         force: see `check_output_file`.
 
@@ -209,6 +206,7 @@ def check_output(path: Path, suffix: str, sources: Iterable[Path | None], *, for
         InputError: as `check_output_file`; or its name has another suffix.
     """
     check_output_file(path, sources, force=force)
-    if path.suffix.lower() != suffix:
-        raise InputError(f"{path}: the name must end in {suffix}, got {path.suffix or 'no ending'}")
+    suffixes = (suffix,) if isinstance(suffix, str) else suffix
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: the name must end in {' or '.join(suffixes)}, got {path.suffix or 'no ending'}")
     return path

@@ -1,4 +1,4 @@
-"""Read tables and `.mcap` files as a record or as messages.
+"""Read tables (`.csv` and others) and `.mcap` files as a record or as messages.
 
 A folder is one recording of all the files in it; in a list of files it stands for each of them (`expand_folder`).
 """
@@ -12,16 +12,15 @@ from typing import TYPE_CHECKING, NamedTuple
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.keys import check_plant
 from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.input_file import list_files
 from reactorwatch.records.record import Record, format_utc
 
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process
+from reactorwatch.records.source_text import TABLE_SUFFIXES, is_table
 
 DEFAULT_PLANT = "cstr"
-
-TABLES = ("csv", "tsv", "txt", "dat", "gz", "xlsx", "parquet")
-"""Suffixes of tables, beside recordings."""
 
 
 def record(
@@ -29,17 +28,19 @@ def record(
     plant: str | None = None,
     columns: dict[str, str] | None = None,
     process: "Process | None" = None,
+    stated: FileFormat = GUESS,
 ) -> Record:
     """Read a file as a record.
 
     Args:
-        path: a table of any form that is read, an .mcap or a folder of recordings.
+        path: a table, an .mcap or a folder of recordings.
         plant: plant in a recording.
         columns: names of a table's columns, by signal.
         process: process whose signals are read; None: the reactor.
+        stated: statements about the form of a table, beside those of the process.
 
     Raises:
-        InputError: the file is of no kind that can be read, or is malformed.
+        InputError: the file is neither a table nor an .mcap, or is malformed.
     """
     from reactorwatch.description.find import find_process
 
@@ -50,21 +51,23 @@ def record(
         return read_record(path, plant, (*described.inputs, *described.outputs))
     from reactorwatch.description.read import read_process_table
 
-    return read_process_table(path, described, columns)
+    return read_process_table(path, described, columns, stated)
 
 
 class MessageSource(NamedTuple):
     """Messages of a file.
 
     Attributes:
-        messages: messages in the order of receipt; those of a .csv are its samples.
+        messages: messages in the order of receipt; those of a table are its samples.
         zero_ns: time from which the file's minutes are counted; None: that of the first sample.
         has_clock: True if the times of the messages are clock times.
+        read_as: guesses about the form of a table; empty: none.
     """
 
     messages: Iterator[Encoded]
     zero_ns: int | None
     has_clock: bool
+    read_as: str = ""
 
     def zero(self, first_ns: int) -> str | None:
         """Time from which the minutes are counted, as ISO 8601; None: unknown.
@@ -80,6 +83,7 @@ def open_messages(
     plant: str | None = None,
     columns: dict[str, str] | None = None,
     units: Mapping[str, str] | None = None,
+    stated: FileFormat = GUESS,
 ) -> MessageSource:
     """Open a file as messages.
 
@@ -88,20 +92,22 @@ def open_messages(
         plant: plant in a recording.
         columns: names of a table's columns, by signal.
         units: units of the signals; None: those of the columns.
+        stated: statements about the form of a table.
 
     Raises:
         InputError: as `record`.
     """
-    if file_kind(path) == "csv":
+    if file_kind(path) == "table":
         from reactorwatch.description.find import find_process
         from recorder.tools.player import samples_of
 
         # any rig may be watched without equations under the reactor's names, in units of its own
-        measured = record(path, plant, columns, find_process().without_equations())
+        measured = record(path, plant, columns, find_process().without_equations(), stated)
         if units is not None:
             measured = replace(measured, units=units)
         publications = samples_of(measured, plant or DEFAULT_PLANT, measured.stored_zero_ns)
-        return MessageSource((encode(item) for item in publications), measured.stored_zero_ns, has_clock=False)
+        encoded = (encode(item) for item in publications)
+        return MessageSource(encoded, measured.stored_zero_ns, bool(measured.zero_ns), measured.read_as)
     from recorder.tools.mcap_file import ZERO_NS, has_clock, read_messages, read_metadata, zero_from
 
     read = (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
@@ -110,7 +116,7 @@ def open_messages(
 
 
 def messages(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Iterator[Encoded]:
-    """Read the messages of a file in the order of receipt; those of a .csv are its samples.
+    """Read the messages of a file in the order of receipt; those of a table are its samples.
 
     Raises:
         InputError: as `record`.
@@ -149,7 +155,7 @@ def resolve_plant(path: Path, plant: str | None) -> str:
     Raises:
         InputError: as `one_plant_in`; or the name is invalid.
     """
-    if file_kind(path) == "csv":
+    if file_kind(path) == "table":
         return plant or DEFAULT_PLANT
     from recorder.tools.mcap_file import one_plant_in
 
@@ -162,16 +168,18 @@ def resolve_plant(path: Path, plant: str | None) -> str:
 
 
 def file_kind(path: Path) -> str:
-    """Kind of a file by its suffix, `csv` or `mcap`; a folder is of recordings.
+    """Kind of a file by its suffix, `table` or `mcap`; a folder is of recordings.
 
     Raises:
         InputError: the suffix is another one.
     """
     if path.is_dir():
         return "mcap"
-    ending = path.suffix.lower().removeprefix(".")
-    if ending == "mcap":
-        return ending
-    if ending not in TABLES:
-        raise InputError(f"{path}: must be a .csv or .mcap file, got {path.suffix or 'no ending'}")
-    return "csv"
+    if is_table(path):
+        return "table"
+    if path.suffix.lower() != ".mcap":
+        others = ", ".join(suffix for suffix in TABLE_SUFFIXES if suffix != ".csv")
+        raise InputError(
+            f"{path}: must be a .csv or .mcap file, or another table ({others}), got {path.suffix or 'no ending'}"
+        )
+    return "mcap"

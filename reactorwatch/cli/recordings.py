@@ -7,13 +7,15 @@ import typer
 
 from reactorwatch.cli.options import Force, Json, check_input, check_output, check_recording, parse_span_ns
 from reactorwatch.cli.printing import print_lines, print_text
+from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import GUESS, FileFormat
 
 
 def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("recover")(recover)
-    app.command("info")(info)
+    app.command("info")(take_table_options(info))
     app.command("cut")(cut)
     app.command("merge")(merge)
 
@@ -44,19 +46,30 @@ def recover(
 
 
 def info(
-    file: Annotated[Path, typer.Argument(help="A recording (.mcap), or a folder of them.", show_default=False)],
+    file: Annotated[
+        Path, typer.Argument(help="A recording (.mcap), a folder of them, or a table.", show_default=False)
+    ],
     as_json: Json = False,
+    stated: FileFormat = GUESS,
 ) -> None:
-    """Show the contents of a recording, and missing messages."""
+    """Show the contents of a recording, and missing messages; or how a table is read, and what is in it."""
     import msgspec
 
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.recording_reports import info_object, info_text
+    from reactorwatch.cli.table_report import table_object, table_text
+    from reactorwatch.records.read_table import read_table
+    from reactorwatch.records.source_text import is_table
     from recorder.tools.inspect import inspect
 
     with task(f"reading {file.name}"):
-        seen = inspect(check_recording(file))
-    print_text(msgspec.json.encode(info_object(seen, file)).decode() if as_json else info_text(seen, file))
+        if is_table(check_recording(file)) and not file.is_dir():
+            record = read_table(file, None, stated)
+            text = msgspec.json.encode(table_object(record, file)).decode() if as_json else table_text(record, file)
+        else:
+            seen = inspect(file)
+            text = msgspec.json.encode(info_object(seen, file)).decode() if as_json else info_text(seen, file)
+    print_text(text)
 
 
 def cut(

@@ -16,7 +16,6 @@ from reactorwatch.cli.options import (
     Processes,
     Scheduler,
     Settings,
-    TimeColumn,
     check_input,
     check_output,
     check_recording,
@@ -25,28 +24,32 @@ from reactorwatch.cli.options import (
     parse_tolerances,
 )
 from reactorwatch.cli.printing import print_lines
+from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import GUESS, FileFormat
 
 
 def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
-    app.command("simulate")(simulate)
-    app.command("backtest")(backtest)
-    app.command("diagnose")(diagnose)
+    app.command("simulate")(take_table_options(simulate))
+    app.command("backtest")(take_table_options(backtest))
+    app.command("diagnose")(take_table_options(diagnose))
 
 
 def simulate(
     file: Annotated[Path, typer.Argument(help="A record (.csv) or recording (.mcap).", show_default=False)],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write (.csv).", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The file to write (.csv or another table).", show_default=False)
+    ],
     plant: Plant = None,
     fault: Annotated[
         list[str] | None, typer.Option(help="A fault, as cause:profile:size@onset, onset in the file's time.")
     ] = None,
     process: Process = None,
-    time: TimeColumn = None,
     column: Columns = None,
     force: Force = False,
     as_json: Json = False,
+    stated: FileFormat = GUESS,
 ) -> None:
     """Run the plant's equations along a record.
 
@@ -56,16 +59,16 @@ def simulate(
     from reactorwatch.cli.read_record import record
     from reactorwatch.cli.simulation import report, simulate_along
     from reactorwatch.description.choice import ProcessChoice
-    from reactorwatch.records.csv_file import write_csv
+    from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
 
-    choice = ProcessChoice(process, time)
-    out = check_output(out, ".csv", (file, choice.file), force=force)
-    measured = record(check_recording(file), plant, parse_columns(column), choice.load())
+    choice = ProcessChoice(process)
+    out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
+    measured = record(check_recording(file), plant, parse_columns(column), choice.load(), stated=stated)
     model = choice.load_model(measured.zero_ns)
     with task(f"simulating {file.name}"):
         simulated = simulate_along(measured, model, fault or [])
         try:
-            write_csv(out, simulated)
+            write_table(out, simulated)
         except InputError:
             print_lines(report(measured, simulated, model, None, as_json=as_json))
             raise
@@ -88,6 +91,7 @@ def backtest(
     scheduler: Scheduler = None,
     force: Force = False,
     as_json: Json = False,
+    stated: FileFormat = GUESS,
 ) -> None:
     """Run the monitor over recordings at full speed."""
     from monitor_node.config import MonitorConfig
@@ -106,7 +110,8 @@ def backtest(
         "model": str(check_input(model)) if model is not None else None,
     }
     settings = section(MonitorConfig, "monitor", read_settings(config), flags)
-    todo = make_jobs(named, settings, plant, parse_columns(column), as_json=as_json, elsewhere=scheduler is not None)
+    columns, elsewhere = parse_columns(column), scheduler is not None
+    todo = make_jobs(named, settings, plant, columns, as_json=as_json, elsewhere=elsewhere, stated=stated)
     run_jobs(BACKTEST, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)
 
 
@@ -139,13 +144,13 @@ def diagnose(
         ),
     ] = None,
     process: Process = None,
-    time: TimeColumn = None,
     plant: Plant = None,
     column: Columns = None,
     jobs: Processes = None,
     scheduler: Scheduler = None,
     force: Force = False,
     as_json: Json = False,
+    stated: FileFormat = GUESS,
 ) -> None:
     """Say what the simulation gets wrong, and why."""
     from reactorwatch.cli.batch import expand_files, run_jobs
@@ -154,10 +159,16 @@ def diagnose(
     from reactorwatch.description.choice import ProcessChoice
 
     named = expand_files(files)
-    choice = ProcessChoice(process, time)
+    choice = ProcessChoice(process)
     check_out(named, out, choice.file, force=force)
     asked = DiagnosisOptions(
-        plant, parse_columns(column), choice, uncertain, parse_tolerances(tolerance), parse_limits(limit)
+        plant,
+        parse_columns(column),
+        choice,
+        uncertain,
+        parse_tolerances(tolerance),
+        parse_limits(limit),
+        stated=stated,
     )
     todo = make_jobs(named, out, asked, as_json=as_json, elsewhere=scheduler is not None)
     run_jobs(DIAGNOSIS, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)

@@ -16,6 +16,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import format_utc, to_minutes
+from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import parse_tables, read_settings, section
 from reactorwatch.terminal import printable_lines
 from recorder.tools.inspect import gaps_in, zero_ns_of
@@ -42,7 +43,7 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
     Raises:
         InputError: the recording cannot be read, or holds nothing to verify.
     """
-    if file.suffix.lower() == ".csv":
+    if is_table(file):
         raise InputError(f"{file}: holds no alarms to verify; a recording (.mcap) was expected")
     metadata = read_metadata(file)
     monitor = _settings(file, metadata, config, one_plant_in(file, plant))

@@ -18,7 +18,6 @@ class ProcessChoice:
 
     Attributes:
         process: a name in the catalogue or a path, see `find_process`; None: the reactor, unless columns are named.
-        time: name or number of the column of times; None: as the process states, or guessed.
         inputs: columns that are inputs of a process without a description.
         outputs: columns that are its outputs.
 
@@ -27,7 +26,6 @@ class ProcessChoice:
     """
 
     process: str | None = None
-    time: str | None = None
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
 
@@ -62,12 +60,8 @@ class ProcessChoice:
         if self.outputs:
             roles = {"input": self.inputs, "output": self.outputs}
             signals = (Signal(name, role=role) for role, names in roles.items() for name in names)
-            process = Process(UNDESCRIBED, tuple(signals))
-        else:
-            process = find_process(self.process or DEFAULT_PROCESS, zero_ns)
-        if self.time is None:
-            return process
-        return replace(process, file_format=replace(process.file_format, time=self.time, period=None))
+            return Process(UNDESCRIBED, tuple(signals))
+        return find_process(self.process or DEFAULT_PROCESS, zero_ns)
 
     def load_model(self, zero_ns: int = 0) -> ProcessModel:
         """Load the equations of the process.

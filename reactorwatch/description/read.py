@@ -8,13 +8,16 @@ import numpy as np
 
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.read_table import SignalColumn, read_table
 from reactorwatch.records.record import Record
 from reactorwatch.records.time_column import STANDARD
 from reactorwatch.units import conversion
 
 
-def read_process_table(path: Path, process: Process, columns: Mapping[str, str] | None = None) -> Record:
+def read_process_table(
+    path: Path, process: Process, columns: Mapping[str, str] | None = None, stated: FileFormat = GUESS
+) -> Record:
     """Read the signals of a process from a table.
 
     Args:
@@ -23,6 +26,7 @@ def read_process_table(path: Path, process: Process, columns: Mapping[str, str] 
             there.
         columns: names of columns with other names, by signal, or by `time_min` or `time_s`. Such a column has the unit
             in brackets at its end, or an unknown one.
+        stated: statements about the file, which override those of the process.
 
     Returns:
         The record, in the units of the equations; without equations, in those of the signals. A value outside the
@@ -31,7 +35,7 @@ def read_process_table(path: Path, process: Process, columns: Mapping[str, str] 
     Raises:
         InputError: as `read_table`; or `columns` names no signal of the process.
     """
-    names, stated = dict(columns or {}), process.file_format
+    names, stated = dict(columns or {}), process.file_format.override(stated)
     for name, unit in STANDARD.items():
         if name in names:
             stated = replace(stated, time=names.pop(name), time_unit=unit)

@@ -5,20 +5,16 @@ others, which are ignored. Gaps and irregular times are allowed; an empty cell w
 starts a new run; in a column `run` that counts up from 1 by 1, each number is a run.
 """
 
-import csv
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import GUESS, RUN, SignalColumn, read_table
-from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN, UNITS, Record
+from reactorwatch.records.file_format import GUESS, FileFormat
+from reactorwatch.records.read_table import SignalColumn, read_table
+from reactorwatch.records.record import UNITS, Record
 from reactorwatch.records.time_column import STANDARD
+from reactorwatch.records.write_table import write_table
 
 
 def read_csv(
@@ -68,27 +64,5 @@ def read_csv(
 
 
 def write_csv(path: Path, record: Record) -> None:
-    """Write a record so that `read_csv` returns exactly the same numbers.
-
-    Raises:
-        InputError: the folder does not exist or cannot be written to.
-        ValueError: a time or a value that `read_csv` refuses, such as an infinite one.
-    """
-    if not (np.abs(record.time_min) <= LONGEST_MIN).all():
-        raise ValueError(f"times must be within {LONGEST_MIN:.3g} min of their zero to be read again from CSV")
-    cells = [record.time_min.tolist()]
-    header = ["time_min", *record.columns]
-    for signal, values in record.columns.items():
-        if (np.abs(values) >= LARGEST_VALUE).any():
-            raise ValueError(
-                f"column {signal!r} must be below {LARGEST_VALUE:g} or NaN to be read again from CSV, "
-                f"got {np.nanmax(np.abs(values)):g}"
-            )
-        cells.append(["" if math.isnan(value) else value for value in values.tolist()])
-    if record.runs is not None:
-        header.append(RUN)
-        cells.append(record.runs.tolist())
-    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")  # writes a float as its repr, which reads back exactly
-        writer.writerow(header)
-        writer.writerows(zip(*cells, strict=True))
+    """Write a record so that `read_csv` returns exactly the same numbers; see `write_table`."""
+    write_table(path, record)

@@ -2,7 +2,7 @@
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 from reactorwatch.errors import InputError, describe_unknown
 
@@ -63,6 +63,13 @@ class FileFormat:
         if self.zone is not None:
             _check_zone(self.zone)
 
+    def override(self, other: "FileFormat") -> "FileFormat":
+        """Copy with the statements of another one in place of its own, where it has any."""
+        given = {item.name: value for item in fields(other) if (value := getattr(other, item.name)) not in (None, ())}
+        if "time" in given or "period" in given:  # a file has one of the two
+            given = {"time": None, "period": None} | given
+        return replace(self, **given)
+
     @property
     def period_s(self) -> float | None:
         """Sampling period in seconds; None: the file has a time column.
@@ -77,6 +84,10 @@ class FileFormat:
         if not 0 < seconds < math.inf:
             raise InputError(f"--period must be a positive number with its unit, such as 4 s, got {self.period!r}")
         return seconds
+
+
+GUESS = FileFormat()
+"""Nothing is stated, all is guessed."""
 
 
 def fixed_offset_s(zone: str) -> int | None:

@@ -58,7 +58,9 @@ class HeaderSearch:
             comments: numbers and texts of the comment lines.
         """
         table, stated = self._table, self._stated
-        first = next((index for index, (_, cells) in enumerate(table) if self._is_data(cells)), None)
+        has_numbers = self._is_numbered_header(0)
+        data = (index for index, (_, cells) in enumerate(table) if self._is_data(cells))
+        first = next((index for index in data if index or not has_numbers), None)
         if first is None:  # nothing but a header
             return self._make([] if stated.header is False else table[:1], 1)
         while first and len(table[first - 1][1]) == self._width and not self._is_names(table[first - 1][1]):
@@ -120,7 +122,7 @@ class HeaderSearch:
     def _make(self, heads: list[tuple[int, list[str]]], first: int) -> Layout:
         filled = [sum(bool(cell.strip()) for cell in cells) for _, cells in heads]
         names_index = filled.index(max(filled)) if heads else 0
-        names = [cell.strip() for cell in heads[names_index][1]] if heads else [""] * self._width
+        names = [" ".join(cell.split()) for cell in heads[names_index][1]] if heads else [""] * self._width
         below = heads[names_index + 1 :]
         units_row = min(below, key=lambda head: sum(map(len, head[1]))) if below else None
         units = (
@@ -146,7 +148,7 @@ class HeaderSearch:
             names=tuple(name or str(number) for number, name in enumerate(names, start=1)),
             units=tuple(units),
             header_row=heads[names_index][0] if heads else None,
-            first_row=self._table[first][0] if first < len(self._table) else self._table[-1][0] + 1,
+            first_row=self._first_line(first),
             sample=sample,
             missing=self._missing,
             notes=notes,
@@ -156,6 +158,13 @@ class HeaderSearch:
         if layout.decimal == ",":
             notes.insert(0 if self._separator == "," else 1, "decimal comma")
         return layout
+
+    def _first_line(self, index: int) -> int:
+        """Number of the first line of a row of the head; cells may hold line ends."""
+        if index >= len(self._table):
+            return self._table[-1][0] + 1
+        row, cells = self._table[index]
+        return row - sum(cell.count("\n") for cell in cells)
 
     def _guess_decimal(self, layout: Layout) -> str:
         """Decimal sign, from all rows where the first ones leave it open.

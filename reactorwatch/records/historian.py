@@ -12,7 +12,8 @@ from reactorwatch.records.cells import NUMBER, TEXT
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.layout import Layout, bare_name
 from reactorwatch.records.text_table import TextTable
-from reactorwatch.records.time_column import TimeColumn, choose_time, read_times
+from reactorwatch.records.time_column import TimeColumn, choose_time
+from reactorwatch.records.times import read_times
 
 _TAG = re.compile(r"tag|point|signal|variable|sensor|channel|mess(?:stelle|punkt)|kanal|name", re.IGNORECASE)
 _VALUE = re.compile(r"val|wert|reading|mess", re.IGNORECASE)
@@ -52,14 +53,14 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
     columns = range(len(layout.names))
     if headers & {name for name in names if not name.isdigit()} or not 3 <= len(columns) <= 7 or not layout.sample:
         return None
-    texts = [column for column in columns if layout.kind(column) == TEXT and _repeats(layout.cells(column))]
+    texts = [column for column in columns if layout.kinds[column] == TEXT and _repeats(layout.cells(column))]
     tag = next((column for column in texts if _TAG.search(layout.names[column])), None)
     if tag is None and layout.header_row is None:
         tag = next(iter(texts), None)
     if tag is None:
         return None
     qualities = [column for column in columns if _QUALITY.search(layout.names[column]) and column != tag]
-    numbers = [column for column in columns if layout.kind(column) == NUMBER and column not in qualities]
+    numbers = [column for column in columns if layout.kinds[column] == NUMBER and column not in qualities]
     value = next((column for column in numbers if _VALUE.search(layout.names[column])), None)
     time = choose_time(layout, stated, [column for column in (tag, value, *qualities) if column is not None])
     rest = [column for column in numbers if column not in time.columns]

@@ -5,6 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from reactorwatch.errors import InputError
@@ -12,6 +13,9 @@ from reactorwatch.records.cells import EMPTY, kind_of
 
 _SEPARATORS = {",": "comma separated", "\t": "tab separated", " ": "blank separated"}
 _BRACKETED = re.compile(r"\s*[\[(]([^\[\]()]+)[\])]\s*$")
+
+
+COMMENT = re.compile(rb"^[ \t]*(?:#(?!N/A|NV\b|DIV/0!|[A-Z]+[!?])|%|//)[^\n]*", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -50,11 +54,15 @@ class Layout:
         """Cells of a column in the sample."""
         return [row[column] for row in self.sample]
 
-    def kind(self, column: int) -> str:
-        """Kind of most cells of a column in the sample."""
-        kinds = Counter(kind_of(cell, self.missing) for cell in self.cells(column))
-        kinds.pop(EMPTY, None)
-        return kinds.most_common(1)[0][0] if kinds else EMPTY
+    @cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """Kind of most cells of each column in the sample."""
+        found = []
+        for column in range(len(self.names)):
+            kinds = Counter(kind_of(cell, self.missing) for cell in self.cells(column))
+            kinds.pop(EMPTY, None)
+            found.append(kinds.most_common(1)[0][0] if kinds else EMPTY)
+        return tuple(found)
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield rows of data, each with the number of its last line; for messages.
@@ -75,6 +83,11 @@ class Layout:
                 return
             if len(cells) > 1 or (cells and cells[0].strip()):
                 yield self.first_row - 1 + reader.line_num, cells
+
+
+def blank_comments(text: bytes) -> bytes:
+    """Text with blank lines in place of comments, so that line numbers stay."""
+    return COMMENT.sub(b"", text)
 
 
 def bare_name(name: str) -> str:
@@ -103,4 +116,5 @@ def describe_separator(separator: str) -> str:
 
 def split_line(line: str, separator: str) -> list[str]:
     """Cells of a line; runs of blanks separate once."""
-    return next(csv.reader([" ".join(line.split()) if separator == " " else line], delimiter=separator), [""])
+    lines = [" ".join(line.split())] if separator == " " else line.splitlines(keepends=True)
+    return next(csv.reader(lines, delimiter=separator), [""])

@@ -188,11 +188,14 @@ def _starts_with(magic: bytes) -> Callable[[bytes], bool]:
 
 _KINDS: Mapping[str, Callable[[bytes], bool]] = {
     ".csv": _is_table,
+    ".gz": _starts_with(b"\x1f\x8b"),
     ".html": _is_page,
     ".json": _is_json,
     ".mcap": _starts_with(b"\x89MCAP"),
     ".md": _is_text,
+    ".parquet": _starts_with(b"PAR1"),
     ".png": _starts_with(b"\x89PNG"),
     ".rrd": _starts_with(b"RRF"),
+    ".xlsx": _starts_with(b"PK\x03\x04"),
 }
 """Check of the start of a file, by suffix. Files with other suffixes are never overwritten."""

@@ -9,26 +9,18 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.cells import EMPTY, NUMBER, TEXT
-from reactorwatch.records.file_format import FileFormat
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.historian import LongFormat, find_long_format, read_tags
 from reactorwatch.records.layout import Layout, bare_name, bracketed_unit
-from reactorwatch.records.record import MINUTE_NS, Record, join_runs
+from reactorwatch.records.record import Record
 from reactorwatch.records.row_checks import check_times, check_values, filled_rows, find_runs, numbered_runs
 from reactorwatch.records.sniff import sniff
 from reactorwatch.records.source_text import read_text
 from reactorwatch.records.text_table import TextTable
-from reactorwatch.records.time_column import (
-    TimeColumn,
-    Times,
-    choose_time,
-    read_times,
-)
+from reactorwatch.records.time_column import TimeColumn, choose_time, counts_rows
+from reactorwatch.records.times import Times, find_written_zero_ns, read_times
+from reactorwatch.records.write_table import RUN
 from reactorwatch.units import UnknownUnitError, conversion
-
-RUN = "run"
-"""Column with the run of each row, if a record has several."""
-
-GUESS = FileFormat()
 
 
 @dataclass(frozen=True)
@@ -101,56 +93,6 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
     return _make_record(table, time, read_times(table, time, stated), sources, run, notes)
 
 
-def read_tables(
-    paths: Sequence[Path], signals: Sequence[SignalColumn] | None = None, stated: FileFormat = GUESS
-) -> Record:
-    """Read several files in a row as one record; one that starts before the end of the one before is a new run.
-
-    Raises:
-        InputError: as `read_table`; or the files have different signals.
-    """
-    return join_files([read_table(path, signals, stated) for path in paths])
-
-
-def join_files(records: Sequence[Record]) -> Record:
-    """Join records of files that follow each other.
-
-    Raises:
-        InputError: they have different signals, or not all have clock time.
-    """
-    first = records[0]
-    parts: list[Record] = []
-    for record in records:
-        if record.columns.keys() != first.columns.keys():
-            got, expected = ", ".join(record.columns), ", ".join(first.columns)
-            raise InputError(f"{record.name}: expected the signals of {first.name}, {expected}, got {got}")
-        if bool(record.zero_ns) != bool(first.zero_ns):
-            raise InputError(f"{record.name}: expected {'' if first.zero_ns else 'no '}clock time, as {first.name} has")
-        shift = (record.zero_ns - first.zero_ns) / MINUTE_NS
-        for run in record.split_runs():
-            moved = Record(run.time_min + shift, run.columns, first.name, first.zero_ns, units=first.units)
-            if parts and run is not record.split_runs()[0]:
-                parts.append(moved)
-            elif parts and parts[-1].time_min[-1] < moved.time_min[0]:
-                last = parts.pop()
-                columns = {name: np.concatenate([values, moved.columns[name]]) for name, values in last.columns.items()}
-                times = np.concatenate([last.time_min, moved.time_min])
-                parts.append(Record(times, columns, first.name, first.zero_ns, units=first.units))
-            else:
-                parts.append(moved)
-    joined = join_runs(parts)
-    return Record(
-        joined.time_min,
-        joined.columns,
-        first.name,
-        first.zero_ns,
-        runs=joined.runs,
-        units=first.units,
-        strays=sum(record.strays for record in records),
-        read_as=first.read_as,
-    )
-
-
 def _check_names(layout: Layout) -> None:
     for name in layout.names:
         if layout.names.count(name) > 1:
@@ -197,8 +139,9 @@ def _sources(
     bare = [bare_name(name) for name in layout.names]
     sources = []
     for column, name in enumerate(layout.names):
-        is_unnamed = layout.header_row is not None and name == str(column + 1) and layout.kind(column) == EMPTY
-        if column in time.columns or name == RUN or is_unnamed or layout.kind(column) not in (NUMBER, EMPTY):
+        is_unnamed = layout.header_row is not None and name == str(column + 1)
+        is_unnamed = is_unnamed and (layout.kinds[column] == EMPTY or counts_rows(layout, column))
+        if column in time.columns or name == RUN or is_unnamed or layout.kinds[column] not in (NUMBER, EMPTY):
             continue
         own = bare[column] if bare.count(bare[column]) == 1 else name
         sources.append(_Source(SignalColumn(own), column, layout.units[column]))
@@ -211,7 +154,7 @@ def _sources(
 
 
 def _is_coded(layout: Layout, source: _Source) -> bool:
-    return source.signal.role in ("mode", "label") and layout.kind(source.column) == TEXT
+    return source.signal.role in ("mode", "label") and layout.kinds[source.column] == TEXT
 
 
 def _make_record(
@@ -234,15 +177,14 @@ def _make_record(
             check_values(table, source.column, columns[name])
         columns[name], units[name] = _convert(layout, source, columns[name], notes)
     minutes, zero_ns = times.since_first()
+    zero_ns = zero_ns or find_written_zero_ns(layout, time, [source.column for source in sources])
     runs = numbered_runs(table, run)
     kept = filled_rows(times, columns)
     check_times(table, time, times, minutes, runs, kept)
-    first_row = None
-    if kept is not None:
-        minutes, runs = minutes[kept], None if runs is None else runs[kept]
+    first_row = table.first_row
+    if kept is not None and not kept.all():
+        first_row, minutes, runs = None, minutes[kept], None if runs is None else runs[kept]
         columns = {name: values[kept] for name, values in columns.items()}
-    elif not layout.transposed and layout.text.rstrip(b"\n").count(b"\n") + 2 - layout.first_row == minutes.size:
-        first_row = layout.first_row  # no blank lines between the rows
     return Record(
         minutes,
         columns,
@@ -260,7 +202,7 @@ def _describe_texts(layout: Layout, time: TimeColumn, sources: Sequence[_Source]
     texts = [
         layout.names[column]
         for column in range(len(layout.names))
-        if column not in used and layout.kind(column) == TEXT
+        if column not in used and layout.kinds[column] == TEXT
     ]
     return [f"text left out: {', '.join(f'`{name}`' for name in texts)}"] if texts else []
 

@@ -168,11 +168,12 @@ class Record:
 
     @property
     def remarks(self) -> list[str]:
-        """Remarks on the rows for people: several runs, samples that are left out."""
+        """Remarks on the rows for people: several runs, samples that are left out, guesses about the file."""
         one = self.strays == 1
         strays = f"{self.strays} sample{'' if one else 's'} with a time or number that fits no other"
         left_out = [f"{strays} {'is' if one else 'are'} left out"] if self.strays else []
-        return [*filter(None, [self.describe_runs()]), *left_out]
+        read_as = [f"read as: {self.read_as}"] if self.read_as else []
+        return [*filter(None, [self.describe_runs()]), *left_out, *read_as]
 
     def describe_runs(self) -> str:
         """Describe the runs on one line; empty for one run."""

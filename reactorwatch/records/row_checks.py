@@ -7,7 +7,8 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.layout import Layout
 from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN
 from reactorwatch.records.text_table import TextTable
-from reactorwatch.records.time_column import MAX_SHARE_BACK, TimeColumn, Times, units_per_minute
+from reactorwatch.records.time_column import MAX_SHARE_BACK, TimeColumn
+from reactorwatch.records.times import Times, units_per_minute
 
 LONGEST_NUMBER = 18
 """Most digits of a run's number."""
@@ -50,6 +51,9 @@ def check_times(
     """
     if not minutes.size or (kept is not None and not kept.any()):
         raise InputError(f"{table.layout.path}: expected rows below the header, got none")
+    ends = np.abs(minutes[[0, -1]])
+    if kept is None and (minutes[1:] > minutes[:-1]).all() and (ends <= LONGEST_MIN).all():
+        return
     rows = np.arange(minutes.size) if kept is None else np.flatnonzero(kept)
     column = time.columns[0] if time.columns else 0
     still = np.diff(minutes[rows]) == 0
@@ -70,7 +74,10 @@ def check_times(
         table.refuse(row, column, "expected a finite number")
     after = f" after {_time_text(table, time, int(rows[at - 1]))}, that of the row before" if at else ""
     table.refuse(
-        row, column, f"expected a time{after}", "state --zone if summer time ends here" if times.is_clock and at else ""
+        row,
+        column,
+        f"expected a time{after}",
+        "state --zone if summer time ends here" if times.is_clock and times.valid[row] else "",
     )
 
 
@@ -86,10 +93,9 @@ def check_values(table: TextTable, column: int, values: NDArray[np.float64]) -> 
     Raises:
         InputError: one is not.
     """
-    large = np.abs(values) >= LARGEST_VALUE
-    if not large.any():
+    if max(np.fmax.reduce(values, initial=0.0), -np.fmin.reduce(values, initial=0.0)) < LARGEST_VALUE:
         return
-    row = int(np.flatnonzero(large)[0])
+    row = int(np.flatnonzero(np.abs(values) >= LARGEST_VALUE)[0])
     if np.isinf(values[row]):
         table.refuse(row, column, "expected a finite number or nothing")
     rule = f"expected a number below {LARGEST_VALUE:g}, or nothing where nothing was measured"
@@ -104,6 +110,8 @@ def find_runs(
     Raises:
         InputError: the time steps back too often for rows in time order.
     """
+    if numbered is None and (minutes[1:] >= minutes[:-1]).all():
+        return None
     back = starts = np.diff(minutes, prepend=minutes[0]) < 0
     if numbered is not None:
         begins = np.diff(numbered, prepend=1) > 0

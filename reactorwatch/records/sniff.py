@@ -13,7 +13,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.cells import EMPTY, MISSING, NUMBER, TEXT, TIME, kind_of
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.header import HeaderSearch
-from reactorwatch.records.layout import Layout, split_line
+from reactorwatch.records.layout import COMMENT, Layout, blank_comments, split_line
 
 HEAD_BYTES = 65_536
 HEAD_LINES = 200
@@ -25,8 +25,10 @@ MIN_LINES = 12
 MIN_TRANSPOSED = 10
 """Fewest columns of a file without names that may be taken as rows."""
 
+MAX_CELL_LINES = 4
+"""Most lines of a quoted cell in the head."""
+
 _SEPARATORS = ";\t,| "
-_COMMENT = re.compile(rb"^[ \t]*(?:#|%|//)[^\n]*", re.MULTILINE)
 _PAIR = re.compile(rb"([^,\n]*),([^,\n]*)(,?)")
 _BLANKS = re.compile(rb"[ \t]+")
 
@@ -44,11 +46,11 @@ def sniff(path: Path, text: bytes, stated: FileFormat) -> Layout:
     """
     missing = frozenset((*MISSING, *stated.missing))
     comments = [
-        (text.count(b"\n", 0, found.start()) + 1, found[0].decode()) for found in _COMMENT.finditer(text, 0, HEAD_BYTES)
+        (text.count(b"\n", 0, found.start()) + 1, found[0].decode()) for found in COMMENT.finditer(text, 0, HEAD_BYTES)
     ]
-    if comments or any(mark in text for mark in (b"\n#", b"\n%", b"\n//")):
-        text = _COMMENT.sub(b"", text)
-    numbered = [(row, line) for row, line in enumerate(_head(text), start=1) if line.strip(" \t")]
+    if comments:
+        text = blank_comments(text)
+    numbered = [(row, line) for row, line in _head(text) if line.strip(" \t\n")]
     if not numbered:
         raise InputError(f"{path}: expected a header and rows, got only comments")
     separator = stated.separator or _guess_separator([line for _, line in numbered], missing)
@@ -66,13 +68,21 @@ def sniff(path: Path, text: bytes, stated: FileFormat) -> Layout:
     return layout
 
 
-def _head(text: bytes) -> list[str]:
-    """Whole lines at the start of a text."""
+def _head(text: bytes) -> list[tuple[int, str]]:
+    """Whole lines at the start of a text, each with its number; lines of one quoted cell are one."""
     size = HEAD_BYTES
     while text.count(b"\n", 0, size) < MIN_LINES and size < len(text):
         size *= 4
     lines = text[:size].decode(errors="ignore").split("\n")
-    return lines[:HEAD_LINES] if size >= len(text) else lines[:-1][:HEAD_LINES]
+    lines = lines[:HEAD_LINES] if size >= len(text) else lines[:-1][:HEAD_LINES]
+    found: list[tuple[int, str]] = []
+    row = 0
+    while row < len(lines):
+        ends = range(row + 1, min(row + 1 + MAX_CELL_LINES, len(lines)) + 1)
+        end = next((end for end in ends if not "\n".join(lines[row:end]).count('"') % 2), row + 1)
+        found.append((end, "\n".join(lines[row:end])))
+        row = end
+    return found
 
 
 def _join_pairs(text: bytes) -> bytes | None:

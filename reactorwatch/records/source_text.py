@@ -5,6 +5,7 @@ import gzip
 import io
 import zipfile
 import zlib
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,11 @@ TABLE_SUFFIXES = (*TEXT_SUFFIXES, *WORKBOOK_SUFFIXES, *PARQUET_SUFFIXES)
 
 _MAGIC = {b"\x1f\x8b": "gz", b"PK\x03\x04": "xlsx", b"PAR1": "parquet", b"\x89MCAP": "mcap"}
 _BYTE_ORDER_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+
+
+def is_table(path: Path) -> bool:
+    """True for a file with the suffix of a table."""
+    return path.suffix.lower() in TABLE_SUFFIXES
 
 
 def read_text(path: Path) -> tuple[bytes, list[str]]:
@@ -92,15 +98,17 @@ def import_openpyxl(path: Path) -> Any:
 
 
 def _workbook(path: Path, data: bytes) -> tuple[bytes, str]:
-    """Write the first sheet that has rows as text, with `;` between cells."""
+    """Write the first sheet that has rows as text."""
     openpyxl = import_openpyxl(path)
     try:
         book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
         for sheet in book.worksheets:
+            rows = [[_cell(value) for value in row] for row in sheet.iter_rows(values_only=True)]
+            width = max(map(len, rows), default=0)  # empty cells at the end of a row may be absent
             lines = io.StringIO()
-            writer = csv.writer(lines, delimiter=";", lineterminator="\n")
-            writer.writerows([_cell(value) for value in row] for row in sheet.iter_rows(values_only=True))
-            if lines.getvalue().strip('"; \n'):
+            writer = csv.writer(lines, lineterminator="\n")
+            writer.writerows([*row, *[""] * (width - len(row))] for row in rows)
+            if lines.getvalue().strip('", \n'):
                 return lines.getvalue().encode(), str(sheet.title)
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: expected a workbook (.xlsx), got a damaged or another file: {error}") from error
@@ -110,13 +118,15 @@ def _workbook(path: Path, data: bytes) -> tuple[bytes, str]:
 def _cell(value: object) -> str:
     if value is None:
         return ""
+    if isinstance(value, timedelta):
+        return repr(value.total_seconds())
     if hasattr(value, "isoformat"):
         return str(value.isoformat())
     return repr(value) if isinstance(value, float) else str(value)
 
 
 def _parquet(path: Path, data: bytes) -> bytes:
-    """Write a Parquet file as text, with `;` between cells."""
+    """Write a Parquet file as text."""
     import pyarrow as pa
     import pyarrow.csv
     import pyarrow.parquet
@@ -124,7 +134,7 @@ def _parquet(path: Path, data: bytes) -> bytes:
     try:
         table = pyarrow.parquet.read_table(pa.BufferReader(data))
         text = pa.BufferOutputStream()
-        pyarrow.csv.write_csv(table, text, pyarrow.csv.WriteOptions(delimiter=";"))
+        pyarrow.csv.write_csv(table, text)
     except pa.ArrowException as error:
         reason = str(error).partition("\n")[0]
         raise InputError(f"{path}: expected a Parquet file with columns of plain values: {reason}") from error

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.cells import find_sentinels, to_numbers
-from reactorwatch.records.layout import Layout, describe_separator
+from reactorwatch.records.layout import Layout, blank_comments, describe_separator
 
 BLOCK_BYTES = 1 << 22
 
@@ -30,12 +31,14 @@ class TextTable:
         import pyarrow as pa
 
         self.layout = layout
-        self._body = _skip_lines(layout.text, layout.first_row - 1)
+        self._body = _body(layout)
         if not layout.sample and not bytes(self._body).strip():
             raise InputError(f"{layout.path}: expected rows below the header, got none")
         try:
             self._table = self._parse(dict.fromkeys(map(str, numbers), pa.float64()), texts)
-        except pa.ArrowInvalid:  # some cells are no plain numbers, or a row is too short
+        except pa.ArrowInvalid:  # some cells are no plain numbers, a row is too short, or there are comments
+            self.layout = replace(layout, text=blank_comments(layout.text))
+            self._body = _body(self.layout)
             self._table = self._parse({}, [*numbers, *texts])
         self._sentinels = find_sentinels(layout.missing)
         self._known: dict[int, NDArray[np.float64]] = {}
@@ -45,6 +48,12 @@ class TextTable:
     def rows(self) -> int:
         """Number of rows."""
         return int(self._table.num_rows)
+
+    @property
+    def first_row(self) -> int | None:
+        """Number of the first row in the file, as a text editor counts; None: lines between the rows are blank."""
+        lines = self.layout.text.count(b"\n") - self.layout.text.endswith(b"\n") + 2 - self.layout.first_row
+        return self.layout.first_row if lines == self.rows and not self.layout.transposed else None
 
     def select(self, rows: NDArray[np.intp]) -> "TextTable":
         """Some of the rows.
@@ -71,9 +80,10 @@ class TextTable:
             if str(cells.type) == "double":
                 values = np.asarray(cells.to_numpy())
             else:
+                cure = "--missing {} reads it as not measured" if rule.endswith("nothing") else ""
                 values, bad = to_numbers(cells.combine_chunks(), self.layout.decimal, self.layout.missing)
                 if bad is not None:
-                    self.refuse(bad, column, rule, "--missing {} reads it as not measured")
+                    self.refuse(bad, column, rule, cure)
             if self._sentinels:
                 values = np.where(np.isin(values, self._sentinels), np.nan, values)
             self._known[column] = values
@@ -145,11 +155,13 @@ class TextTable:
         raise InputError(f"{self.layout.path}: expected {kind} cells: {str(error).partition(chr(10))[0]}") from error
 
 
-def _skip_lines(text: bytes, count: int) -> Any:
-    """Buffer of a text without its first lines."""
+def _body(layout: Layout) -> Any:
+    """Buffer of the lines from the first row on, without line ends at the end."""
     import pyarrow as pa
 
-    start = 0
-    for _ in range(count):
+    text, start, end = layout.text, 0, len(layout.text)
+    for _ in range(layout.first_row - 1):
         start = text.find(b"\n", start) + 1 or len(text)
-    return pa.py_buffer(text).slice(start)
+    while end > start and text[end - 1] == ord("\n"):
+        end -= 1
+    return pa.py_buffer(text).slice(start, end - start)

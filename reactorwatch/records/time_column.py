@@ -1,8 +1,9 @@
-"""The time column of a table: chosen by name and content, and converted to minutes and a zero."""
+"""The time column of a table, chosen by name and content."""
 
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.cells import NUMBER
 from reactorwatch.records.file_format import SECONDS, FileFormat
 from reactorwatch.records.layout import Layout, bare_name
-from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.records.text_table import TextTable
-from reactorwatch.records.timestamps import CLOCK, DAY_NS, PATTERNS, Pattern, guess_pattern, parse, stated_pattern
-from reactorwatch.records.zones import HOUR_NS, to_utc
+from reactorwatch.records.timestamps import CLOCK, PATTERNS, Pattern, guess_pattern, stated_pattern
 
 STANDARD = {"time_min": "min", "time_s": "s"}
 """Names of time columns that need no guess, and their units."""
@@ -36,9 +34,17 @@ _UNIT_WORDS = {
     "h": ("h", "hr", "hrs", "hour", "hours", "std", "stunden"),
     "d": ("d", "day", "days", "tage"),
 }
+PLAIN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 _UNIT_OF = {word: unit for unit, words in _UNIT_WORDS.items() for word in words}
-_EPOCHS_S = ((6.3e8, 4.2e9, 1.0), (6.3e11, 4.2e12, 1e-3), (6.3e14, 4.2e15, 1e-6), (6.3e17, 4.2e18, 1e-9))
-"""Smallest and largest Unix times of 1990 to 2100, and their unit."""
+_EPOCHS = {
+    1.0: (6.3e8, 4.2e9),
+    1e-3: (6.3e11, 4.2e12),
+    1e-6: (6.3e14, 4.2e15),
+    1e-9: (6.3e17, 4.2e18),
+}
+"""Smallest and largest Unix times of 1990 to 2100, by their unit in seconds."""
+_SERIAL_DAYS, _SERIAL_ZERO, _SERIAL_STEP = (32_874, 73_050), 25_569, 0.05
+"""Days of a spreadsheet from 1990 to 2100, that of 1970, and steps that are shorter than those of other numbers."""
 
 
 @dataclass(frozen=True)
@@ -56,30 +62,6 @@ class TimeColumn:
     unit: str = ""
     pattern: Pattern | None = None
     is_standard: bool = False
-
-
-@dataclass(frozen=True)
-class Times:
-    """Times of the rows.
-
-    Attributes:
-        values: minutes, or nanoseconds since 1970-01-01 UTC; shape (rows,).
-        valid: False where a row has no time, shape (rows,).
-        is_clock: the times are clock times, in nanoseconds.
-        notes: guesses, for people.
-    """
-
-    values: NDArray[np.float64] | NDArray[np.int64]
-    valid: NDArray[np.bool_]
-    is_clock: bool
-    notes: list[str]
-
-    def since_first(self) -> tuple[NDArray[np.float64], int]:
-        """Minutes, NaN without a time, and their zero in nanoseconds since 1970; 0: unknown."""
-        if not self.is_clock or not self.valid.any():
-            return np.asarray(self.values, dtype=np.float64), 0
-        zero_ns = int(self.values[self.valid][0])
-        return np.where(self.valid, (self.values - zero_ns) / MINUTE_NS, np.nan), zero_ns
 
 
 def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> TimeColumn:
@@ -111,13 +93,13 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
     named = [
         item
         for item in candidates
-        if item.pattern is None and _has_time_name(layout, item) and _increases(layout, item)
+        if item.pattern is None and layout.kinds[item.columns[0]] == NUMBER and _has_time_name(layout, item)
     ]
-    found = [*stamps, *named]
+    found = [*stamps, *(item for item in named if _increases(layout, item))]
     if not found:
-        numbers = [item for item in candidates if layout.kind(item.columns[0]) == NUMBER and _increases(layout, item)]
-        found = [item for item in numbers if _epoch(_values(layout, item))]
-        found = found or [item for item in numbers if _is_index(layout, item)]
+        numbers = [item for item in candidates if layout.kinds[item.columns[0]] == NUMBER and _increases(layout, item)]
+        found = [item for item in numbers if find_epoch(layout, item, _values(layout, item.columns[0])) is not None]
+        found = found or [item for item in numbers if counts_rows(layout, item.columns[0])] or named
     if len(found) > 1:
         names = ", ".join(repr(layout.names[item.columns[0]]) for item in found)
         raise InputError(f"{layout.path}: {len(found)} columns could be the time: {names}; state --time NAME")
@@ -141,34 +123,6 @@ def find_column(layout: Layout, name: str, option: str) -> int:
     raise InputError(f"{layout.path}, row {layout.header_row or 1}: expected a column {name!r} ({option}), got {found}")
 
 
-def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Times:
-    """Read the times of the rows.
-
-    Raises:
-        InputError: a cell is no time, or local times are ambiguous.
-    """
-    if stated.period is not None:
-        minutes = np.arange(table.rows, dtype=np.float64) * ((stated.period_s or 0.0) / 60.0)
-        return Times(minutes, np.isfinite(minutes), is_clock=False, notes=[f"a row each {stated.period}"])
-    name = " ".join(f"`{table.layout.names[number]}`" for number in column.columns)
-    if column.pattern is not None:
-        return _read_stamps(table, column, column.pattern, stated, name)
-    values = table.numbers(column.columns[0], "expected a finite number")
-    valid = np.isfinite(values)
-    epoch_s = None if column.is_standard else _epoch(values)
-    if epoch_s is not None and (not column.unit or SECONDS[column.unit] == epoch_s):
-        whole = np.round(np.nan_to_num(values) * epoch_s * 1e6).astype(np.int64) * 1000
-        return Times(whole, valid, is_clock=True, notes=[f"time {name} seconds since 1970"])
-    unit = column.unit or "s"
-    notes = [] if column.is_standard else [f"time {name} in {unit}"]
-    return Times(values / units_per_minute(unit), valid, is_clock=False, notes=notes)
-
-
-def units_per_minute(unit: str) -> float:
-    """Units of time in a minute."""
-    return 60.0 / SECONDS[unit]
-
-
 def _describe(layout: Layout, column: int, stated: FileFormat) -> TimeColumn:
     """Form of a column if it is the time."""
     if stated.time_format is not None:
@@ -190,96 +144,50 @@ def _has_time_name(layout: Layout, item: TimeColumn) -> bool:
     return bool(words & _TIME_WORDS or (name.lower() in _TIME_WORDS and name != "T"))
 
 
-def _is_index(layout: Layout, item: TimeColumn) -> bool:
+def counts_rows(layout: Layout, column: int) -> bool:
     """True for a first column that counts the rows or their times, under a name that says nothing."""
-    name = layout.names[item.columns[0]].lower()
-    values = _values(layout, item)
+    name = layout.names[column].lower()
+    values = _values(layout, column)
     steps = np.diff(values)
-    if item.columns[0] != 0 or not steps.size or float(np.ptp(steps)) > 1e-6 * max(abs(values[-1]), steps[0]):
+    if column != 0 or not steps.size or float(np.ptp(steps)) > 1e-6 * max(abs(values[-1]), steps[0]):
         return False
-    return layout.header_row is None or name == "1" or name in _INDEX_WORDS
+    return steps[0] > 0 and (layout.header_row is None or name == "1" or name in _INDEX_WORDS)
 
 
-def _values(layout: Layout, item: TimeColumn) -> NDArray[np.float64]:
-    """Numbers in the sample of a column, without those that are none."""
-    cells = [cell.strip().replace(",", ".") for cell in layout.cells(item.columns[0])]
-    return np.array(
-        [float(cell) for cell in cells if re.fullmatch(r"[+-]?[\d.]+(?:[eE][+-]?\d+)?", cell) and cell.count(".") < 2]
-    )
+def _values(layout: Layout, column: int) -> NDArray[np.float64]:
+    """Numbers in the sample of a column, without cells that are none."""
+    cells = [cell.strip().replace(",", ".") for cell in layout.cells(column)]
+    return np.array([float(cell) for cell in cells if PLAIN.fullmatch(cell)])
 
 
 def _increases(layout: Layout, item: TimeColumn) -> bool:
-    steps = np.diff(_values(layout, item))
+    steps = np.diff(_values(layout, item.columns[0]))
     is_ordered = bool(np.count_nonzero(steps <= 0) <= MAX_SHARE_BACK * steps.size)
-    return is_ordered and layout.kind(item.columns[0]) == NUMBER
+    return is_ordered and layout.kinds[item.columns[0]] == NUMBER
 
 
-def _epoch(values: NDArray[np.float64]) -> float | None:
-    """Unit in seconds of Unix times; None if the numbers are no Unix times."""
-    if not values.size:
+class Epoch(NamedTuple):
+    """Clock time in numbers: the unit, and the number of 1970 in it."""
+
+    name: str
+    unit_s: float
+    zero: float = 0.0
+
+
+def find_epoch(layout: Layout, item: TimeColumn, values: NDArray[np.float64]) -> Epoch | None:
+    """Clock time that numbers stand for; None: they are no clock time."""
+    usable = values[np.isfinite(values)]
+    if item.is_standard or not usable.size:
         return None
-    low, high = np.nanmin(values), np.nanmax(values)
-    return next((unit for least, most, unit in _EPOCHS_S if least <= low and high <= most), None)
-
-
-def _read_stamps(table: TextTable, column: TimeColumn, pattern: Pattern, stated: FileFormat, name: str) -> Times:
-    import pyarrow.compute as pc
-
-    cells = pc.binary_join_element_wise(*(pc.fill_null(table.texts(number), "") for number in column.columns), " ")
-    try:
-        instants, form = parse(cells, pattern)
-    except ValueError as error:
-        cure = "state --time-format %d/%m/%Y or %m/%d/%Y, with the time of day"
-        raise InputError(f"{table.layout.path}, column {name}: day and month are ambiguous; {cure}") from error
-    at = column.columns[0]
-    wrong = np.flatnonzero(~instants.valid & ~np.asarray(pc.equal(pc.utf8_trim_whitespace(cells), "")))
-    if wrong.size:
-        table.refuse(int(wrong[0]), at, f"expected a time of the form {form}", "state --time-format if it is another")
-    notes, local_ns = [f"time {name} {form}"], instants.local_ns
-    if not pattern.has_date:
-        local_ns = local_ns + DAY_NS * np.cumsum(np.diff(local_ns, prepend=local_ns[:1]) < -12 * HOUR_NS)
-        return Times(
-            np.where(instants.valid, local_ns / MINUTE_NS, np.nan), instants.valid, is_clock=False, notes=notes
-        )
-    offset = np.isfinite(instants.offset_s)
-    if offset.any():
-        if not offset[instants.valid].all():
-            row = int(np.flatnonzero(instants.valid & ~offset)[0])
-            table.refuse(
-                row, at, "expected a time with a known offset from UTC, as in other rows", "write it as +01:00"
-            )
-        return Times(
-            local_ns - (np.nan_to_num(instants.offset_s) * 1e9).astype(np.int64),
-            instants.valid,
-            is_clock=True,
-            notes=notes,
-        )
-    zone = stated.zone or _zone_in_name(table.layout, column)
-    if zone is not None:
-        rows = np.flatnonzero(instants.valid)
-        utc_ns = local_ns.copy()
-        utc_ns[rows] = to_utc(
-            local_ns[rows], zone, lambda row, rule: table.refuse(int(rows[row]), at, rule, "state --zone")
-        )
-        return Times(utc_ns, instants.valid, is_clock=True, notes=[f"{notes[0]} in {zone}"])
-    steps = np.diff(local_ns)
-    usual = float(np.median(steps)) if steps.size else 0.0
-    back = (
-        np.flatnonzero(np.abs(steps + HOUR_NS - usual) < max(usual / 2, 1e9))
-        if usual < HOUR_NS
-        else np.flatnonzero(steps == 0)
-    )
-    back = back[steps[back] <= 0]
-    if back.size:
-        rule = "expected increasing times; the clock steps back by an hour, as at the end of summer time"
-        table.refuse(int(back[0]) + 1, at, rule, "state the zone, such as --zone Europe/Berlin (--zone UTC: none)")
-    return Times(local_ns, instants.valid, is_clock=True, notes=[*notes, "time zone unknown, taken as UTC"])
-
-
-def _zone_in_name(layout: Layout, column: TimeColumn) -> str | None:
-    """Zone that the header names; only UTC is certain."""
-    texts = [layout.names[number] + " " + layout.units[number] for number in column.columns]
-    return "UTC" if any(re.search(r"\b(?:UTC|GMT|utc)\b", text) for text in texts) else None
+    low, high = float(usable.min()), float(usable.max())
+    for unit_s, (least, most) in _EPOCHS.items():
+        if least <= low and high <= most and (not item.unit or SECONDS[item.unit] == unit_s):
+            return Epoch("seconds since 1970", unit_s)
+    is_dated = "dat" in layout.names[item.columns[0]].lower()
+    is_dense = usable.size > 1 and float(np.abs(np.diff(usable)).max()) < _SERIAL_STEP
+    if _SERIAL_DAYS[0] <= low and high <= _SERIAL_DAYS[1] and item.unit in ("", "d") and (is_dated or is_dense):
+        return Epoch("days of a spreadsheet", SECONDS["d"], _SERIAL_ZERO)
+    return None
 
 
 def _refuse_without_time(layout: Layout) -> None:

@@ -72,7 +72,10 @@ CLOCK = Pattern("hh:mm:ss", rf"^\s*{_CLOCK.replace('1,2', '1,5', 1)}\s*$")
 """A time of day, or hours since the start."""
 DATES = tuple(Pattern(name, rf"^\s*{date}\s*$") for name, date in _DATES.items())
 DATE_TIMES = (
-    *(Pattern(f"{name} hh:mm:ss", rf"^\s*{date}[T\s,]+{_CLOCK}\s*$") for name, date in _DATES.items()),
+    *(
+        Pattern(f"{name} hh:mm:ss", rf"^\s*(?:\pL{{2,10}}[.,]?\s+)?{date}[T\s,]+{_CLOCK}\s*$")
+        for name, date in _DATES.items()
+    ),
     Pattern(
         "yyyymmddThhmmss",
         rf"^(?P<y>\d{{4}})(?P<m>\d\d)(?P<d>\d\d)T(?P<H>\d\d)(?P<M>\d\d)(?P<S>\d\d){_ZONE}?$",
@@ -145,6 +148,15 @@ def parse(cells: Any, pattern: Pattern) -> tuple[Instants, str]:
     import pyarrow as pa
     import pyarrow.compute as pc
 
+    if pattern.name.startswith("yyyy-mm-dd"):
+        for zone in (None, "UTC"):
+            try:
+                times = pc.cast(cells, pa.timestamp("ns", zone))
+            except pa.ArrowInvalid:  # another form of ISO 8601, or some cells are no timestamps
+                continue
+            offset_s = np.full(len(cells), np.nan if zone is None else 0.0)
+            local_ns = np.asarray(pc.fill_null(times.cast(pa.int64()), 0))
+            return Instants(local_ns, offset_s, np.asarray(times.is_valid())), pattern.name
     groups = pc.extract_regex(cells, pattern.regex)
     names = {field.name for field in groups.type}
     valid = np.asarray(groups.is_valid())

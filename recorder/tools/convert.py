@@ -1,34 +1,45 @@
 """Convert between recordings (MCAP) and records (CSV)."""
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.csv_file import read_csv, write_csv
+from reactorwatch.records.csv_file import read_csv
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.output import refuse_source
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, to_time_ns
+from reactorwatch.records.several_files import join_files
+from reactorwatch.records.write_table import write_table
 from recorder.columns.run_splitter import ContinuousTime
 from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import CLOCK, NO_CLOCK, ZERO_NS, RecordingWriter, read_record
 from recorder.tools.player import samples_of
 
 
-def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | None = None, zero_ns: int = 0) -> Record:
+def import_csv(
+    csv: Path | Sequence[Path],
+    mcap: Path,
+    plant: str,
+    columns: Mapping[str, str] | None = None,
+    zero_ns: int = 0,
+    stated: FileFormat = GUESS,
+) -> Record:
     """Convert a record to a recording; the time of receipt is the sample time.
 
     A recording holds no times before 1970. Where a record without clock time has some, all its times are shifted, and
     the recording's `zero_ns` holds the shift. A run that starts before the end of the run before is received after it.
 
     Args:
-        csv: the record.
+        csv: the record, or the files of it in a row.
         mcap: the recording; an existing file is replaced.
         plant: name of the plant.
         columns: column names of the file by signal, as in `read_csv`.
-        zero_ns: time that the record's minutes count from; 0 if unknown.
+        zero_ns: time that the minutes of a record without clock time count from; 0 if unknown.
+        stated: statements about the form of the file.
 
     Returns:
         The record.
@@ -40,13 +51,15 @@ def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | N
         keys.check_plant(plant)
     except ValueError as error:
         raise InputError(str(error)) from error
-    refuse_source(mcap, (csv,))
-    record = read_csv(csv, columns)
+    files = [csv] if isinstance(csv, Path) else list(csv)
+    refuse_source(mcap, files)
+    record = join_files([read_csv(file, columns, stated=stated) for file in files])
     metadata = {"plant": plant, "source": record.name}
+    zero_ns = record.zero_ns or zero_ns
     if not zero_ns:
         metadata[CLOCK] = NO_CLOCK
         zero_ns = record.stored_zero_ns
-    _check_times(csv, record, zero_ns)
+    _check_times(files[0], record, zero_ns)
     received = ContinuousTime()
     with (
         atomic_write(mcap) as temporary,
@@ -60,13 +73,14 @@ def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | N
     return record
 
 
-def export_csv(mcap: Path, csv: Path, plant: str | None = None) -> Record:
+def export_csv(mcap: Path, csv: Path, plant: str | None = None, *, clock: bool = False) -> Record:
     """Convert the samples of a recording to a record.
 
     Args:
         mcap: the recording.
-        csv: the record; an existing file is replaced.
+        csv: the record, in the form of its suffix (see `write_table`); an existing file is replaced.
         plant: name of the plant; None if the recording has only one.
+        clock: add a column with the clock time.
 
     Returns:
         The record.
@@ -76,7 +90,7 @@ def export_csv(mcap: Path, csv: Path, plant: str | None = None) -> Record:
     """
     refuse_source(csv, (mcap,))
     record = read_record(mcap, plant)
-    write_csv(csv, record)
+    write_table(csv, record, clock=clock)
     return record
 
 

@@ -11,6 +11,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import NEVER_NS, to_time_ns
+from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
@@ -83,8 +84,10 @@ def replay(config: ReplayConfig, bus_config: BusConfig, stop: StopSignal) -> int
 def _open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iterator[Publication]]]:
     """Names of the plants on the bus, and the function that returns the publications."""
     path = Path(config.file)
-    if path.suffix.lower() == ".csv":
-        plant, record = config.plant or PLANT, read_csv(path, config.columns)
+    if is_table(path):
+        plant, record = config.plant or PLANT, read_csv(path, config.columns, stated=config.table)
+        if record.read_as:
+            log.info("read as", file=config.file, form=record.read_as)
         if record.runs is not None:
             log.warning("plays several runs one after the other", file=config.file, runs=record.describe_runs())
         zero_ns = record.stored_zero_ns

@@ -2,7 +2,9 @@
 
 import shutil
 from collections.abc import Callable
+from datetime import datetime, timedelta
 from pathlib import Path
+from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -31,6 +33,23 @@ def _renamed_record(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     header, rows = text.split("\n", 1)
     path.write_text(f"{header.replace('qc', 'FC-7').replace('T', 'TI-101')}\n{rows}", encoding="utf-8")
+
+
+def _logged_record(path: Path, start: str = "2026-10-24T23:00:06+00:00") -> None:
+    """The same as a logger in Germany writes it, over the end of summer time."""
+    record = simulate_record(PlantConfig(seed=3, faults=(LEAK,)), 1500)
+    zone, first = ZoneInfo("Europe/Berlin"), datetime.fromisoformat(start)
+    lines = ["Anlage 7;;;", ";;;", "Zeit;FC-7;AI-3;TI-101", ";l/min;mol/l;K"]
+    for minutes, *values in zip(record.time_min, *record.columns.values(), strict=True):
+        time = (first + timedelta(minutes=round(minutes - record.time_min[0], 6))).astimezone(zone)
+        cells = [f"{value:.6f}".replace(".", ",") for value in values]
+        lines.append(";".join([f"{time:%d.%m.%Y %H:%M:%S}", *cells]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _later_record(path: Path) -> None:
+    """The next file of that logger."""
+    _logged_record(path, "2026-10-25T02:00:06+00:00")
 
 
 def _narrow_record(path: Path) -> None:
@@ -65,6 +84,8 @@ def _records(folder: Path) -> None:
 GIVEN: dict[str, Callable[[Path], None]] = {
     "record.csv": _record,
     "plant.csv": _renamed_record,
+    "plant.txt": _logged_record,
+    "later.txt": _later_record,
     "narrow.csv": _narrow_record,
     "rig.csv": _tank_record,
     "run.mcap": _recording,

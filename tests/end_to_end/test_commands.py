@@ -76,7 +76,7 @@ def record_csv(tmp_path: Path) -> Path:
         (["cut", "BAD.mcap", "--from", "soon", "-o", "a.mcap"], "--from must be a number with s, min or h"),
         (["cut", "BAD.mcap", "--from", "2min", "--to", "60s", "-o", "a.mcap"], "--from must be before --to"),
         (["merge", "BAD.mcap", "-o", "a.mcap"], "expected an MCAP recording, got another kind of file"),
-        (["backtest", "BAD.txt"], "must be a .csv or .mcap file"),
+        (["backtest", "BAD.doc"], "must be a .csv or .mcap file"),
         (["backtest", "BAD.csv"], "row 3"),
         (["backtest", "BAD.mcap"], "BAD.mcap"),
         (["simulate", "RECORD", "-o", "no/such/folder.csv"], "folder"),
@@ -143,6 +143,7 @@ def check_told_in_one_line(
     (tmp_path / "BAD.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,x,440\n")
     (tmp_path / "BAD.mcap").write_bytes(b"this is no recording")
     (tmp_path / "BAD.txt").write_text("?")
+    (tmp_path / "BAD.doc").write_text("?")
     (tmp_path / "EMPTY").mkdir()
     before = sorted(tmp_path.rglob("*"))
     named = [{"RECORD": str(record_csv), "OUT": str(tmp_path / "out.csv")}.get(item, item) for item in arguments]

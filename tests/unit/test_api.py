@@ -93,7 +93,7 @@ def test_identification_gives_its_fit_under_both_names(leaking: rw.Record) -> No
         (lambda record: rw.backtest(record, colour="red"), r"colour"),
         (lambda record: rw.identify(record, output="p"), r"holds no signal 'p', only qc, C, T"),
         (lambda _: rw.Monitor().from_bytes(b"\xc1"), r"the state of a monitor cannot be read"),
-        (lambda _: rw.read_record("data.docx"), r"must be a \.csv or \.mcap file"),
+        (lambda _: rw.read_record("data.doc"), r"must be a \.csv or \.mcap file"),
     ],
 )
 def test_a_mistake_is_one_line_that_names_the_cure(call: object, message: str, leaking: rw.Record) -> None:

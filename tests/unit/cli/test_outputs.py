@@ -47,7 +47,7 @@ class Case(NamedTuple):
 
 CASES = {
     "export": [Case("export run.mcap", {"file": "run.mcap"}, "new.csv")],
-    "import": [Case("import run.csv", {"file": "run.csv"}, "new.mcap")],
+    "import": [Case("import run.csv", {"files": "run.csv"}, "new.mcap")],
     "simulate": [
         Case("simulate run.csv --model model.json", {"file": "run.csv", "process": "model.json"}, "new.csv"),
         Case("simulate run.mcap", {"file": "run.mcap", "process": ""}, "new.csv"),

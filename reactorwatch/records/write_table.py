@@ -1,0 +1,109 @@
+"""Write a record as a table: CSV, compressed CSV, workbook or Parquet, by the file's suffix."""
+
+import csv
+import gzip
+import io
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN, MINUTE_NS, Record
+from reactorwatch.records.source_text import PARQUET_SUFFIXES, import_openpyxl
+
+RUN, CLOCK = "run", "time"
+"""Columns with the run of each row, if a record has several, and with its clock time, if it is asked for."""
+
+WRITTEN_SUFFIXES = (".csv", ".gz", ".xlsx", ".parquet")
+MAX_SHEET_ROWS = 1_048_576
+
+
+def write_table(path: Path, record: Record, *, clock: bool = False) -> None:
+    """Write a record so that `read_table` returns exactly the same numbers; a workbook holds 16 digits.
+
+    Args:
+        path: the file; its suffix decides the form: .csv, .gz (compressed CSV), .xlsx or .parquet.
+        record: the record.
+        clock: add a column with the clock time of each row, ISO 8601 in UTC.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written to, the record has no clock time to be added, a
+            library is not installed, or a workbook cannot hold so many rows.
+        ValueError: a time or a value that `read_table` refuses, such as an infinite one.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".xlsx":
+        _write_workbook(path, record, clock)
+    elif suffix in PARQUET_SUFFIXES:
+        _write_parquet(path, record, clock)
+    else:
+        _write_text(path, record, clock, compress=suffix == ".gz")
+
+
+def _columns(record: Record, clock: bool) -> dict[str, list[Any]]:
+    """Cells by header; None where nothing was measured."""
+    if not (np.abs(record.time_min) <= LONGEST_MIN).all():
+        raise ValueError(f"times must be within {LONGEST_MIN:.3g} min of their zero to be read again")
+    columns: dict[str, list[Any]] = {"time_min": record.time_min.tolist()}
+    for signal, values in record.columns.items():
+        if (np.abs(values) >= LARGEST_VALUE).any():
+            raise ValueError(
+                f"column {signal!r} must be below {LARGEST_VALUE:g} or NaN to be read again, "
+                f"got {np.nanmax(np.abs(values)):g}"
+            )
+        columns[signal] = [None if math.isnan(value) else value for value in values.tolist()]
+    if record.runs is not None:
+        columns[RUN] = record.runs.tolist()
+    if clock:
+        columns[CLOCK] = _clock_texts(record)
+    return columns
+
+
+def _clock_texts(record: Record) -> list[str]:
+    if not record.zero_ns:
+        raise InputError(f"{record.name}: has no clock time that --clock could add, only minutes")
+    times = record.zero_ns + np.round(record.time_min * MINUTE_NS / 1000).astype(np.int64) * 1000
+    unit = next(unit for unit, size in (("s", 10**9), ("ms", 10**6), ("us", 10**3)) if not (times % size).any())
+    return [f"{text}Z" for text in times.astype("datetime64[ns]").astype(f"datetime64[{unit}]").astype(str).tolist()]
+
+
+def _rows(columns: dict[str, list[Any]]) -> Iterable[tuple[Any, ...]]:
+    return zip(*columns.values(), strict=True)
+
+
+def _write_text(path: Path, record: Record, clock: bool, *, compress: bool = False) -> None:
+    columns = _columns(record, clock)
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        packed = gzip.GzipFile("", "wb", fileobj=file, mtime=0) if compress else file
+        with io.TextIOWrapper(packed, encoding="utf-8", newline="") as text:
+            writer = csv.writer(text, lineterminator="\n")  # writes a float as its repr, which reads back exactly
+            writer.writerow(columns)
+            writer.writerows(_rows(columns))
+
+
+def _write_workbook(path: Path, record: Record, clock: bool) -> None:
+    if record.rows >= MAX_SHEET_ROWS:
+        raise InputError(
+            f"{path}: a sheet has at most {MAX_SHEET_ROWS} rows, got {record.rows}; write .parquet or .csv"
+        )
+    columns, openpyxl = _columns(record, clock), import_openpyxl(path)
+    book = openpyxl.Workbook(write_only=True)
+    sheet = book.create_sheet("record")
+    sheet.append(list(columns))
+    for row in _rows(columns):
+        sheet.append(row)
+    with atomic_write(path) as temporary:
+        book.save(temporary)
+
+
+def _write_parquet(path: Path, record: Record, clock: bool) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet
+
+    table = pa.table(_columns(record, clock))
+    with atomic_write(path) as temporary:
+        pyarrow.parquet.write_table(table, temporary)
