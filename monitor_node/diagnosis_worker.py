@@ -77,10 +77,6 @@ class DiagnosisWorker:
         """True while findings are to be expected."""
         return bool(self._submitted)
 
-    def is_queued(self, plant: str) -> bool:
-        """True while a finding about a plant is to be expected."""
-        return plant in self._submitted
-
     def pop_findings(self) -> list[PlantFinding]:
         """Findings since the last call."""
         found = list(_drain(self._findings))

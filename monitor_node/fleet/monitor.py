@@ -26,7 +26,6 @@ from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.admission import PROVEN_MESSAGES, PROVEN_ROWS, UnverifiedPlants
-from monitor_node.fleet.deadline_queue import NEVER_NS
 from monitor_node.fleet.handed_over_alarms import HandedOverAlarms, alarm_of
 from monitor_node.fleet.recently_adopted import RecentlyAdopted
 from monitor_node.fleet.sharding import ShardGroup
@@ -38,6 +37,7 @@ from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decod
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import NEVER_NS
 
 PRESUME_GONE_NS = 10_000_000_000
 """Time after the start, when a shard without a monitor is presumed gone."""

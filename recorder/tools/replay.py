@@ -10,7 +10,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
 from reactorwatch.records.csv_file import read_csv
-from reactorwatch.records.record import to_time_ns
+from reactorwatch.records.record import NEVER_NS, to_time_ns
 from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
@@ -22,7 +22,6 @@ from recorder.tools.mcap_file import plants_in, read_messages
 from recorder.tools.player import (
     COMMANDS,
     EVERYTHING,
-    NEVER_NS,
     SAMPLES,
     Player,
     filter_playable,
