@@ -163,6 +163,15 @@ REFUSED = {
         FileFormat(),
         "row 2, column 'C': expected a finite number or nothing, got 'high'; --missing high reads it as not measured",
     ),
+    "two decimal signs": (
+        table(
+            MINUTES,
+            [["100,5", "0,11", "438.2" if row[0] == "7" else "438,2"] for row in zip(MINUTES, strict=True)],
+            separator=";",
+        ),
+        FileFormat(),
+        "row 9, column 'T': expected a finite number or nothing, got '438.2'; state --decimal if its sign is another",
+    ),
     "a day or a month": (
         table([f"03/04/2026 10:{row // 60:02d}:{row % 60:02d}" for row in range(ROWS)], cells(), STAMPS),
         FileFormat(),
