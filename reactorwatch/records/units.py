@@ -43,10 +43,11 @@ class _Scale(NamedTuple):
     offset: Fraction
 
 
-_KNOWN: dict[str, _Scale] = {}
+KNOWN: dict[str, _Scale] = {}
+"""Scale of each unit."""
 for _quantity, _units in _SCALES.items():
     for _unit, _factor, *_offset in map(str.split, _units.split(", ")):
-        _KNOWN[_unit] = _Scale((_quantity,), Fraction(_factor), Fraction(*_offset) if _offset else Fraction(0))
+        KNOWN[_unit] = _Scale((_quantity,), Fraction(_factor), Fraction(*_offset) if _offset else Fraction(0))
 
 
 class UnitError(ValueError):
@@ -85,7 +86,7 @@ def _spell(unit: str) -> str:
 
 def _resolve(unit: str) -> _Scale | None:
     """Scale of a unit or of a quotient of two; None if it is not known."""
-    parts = [_KNOWN.get(part) for part in _spell(unit).split("/")]
+    parts = [KNOWN.get(part) for part in _spell(unit).split("/")]
     if None in parts or len(parts) > 2:
         return None
     first, *rest = (part for part in parts if part is not None)
