@@ -1,4 +1,4 @@
-"""Files of real rigs and public benchmarks read at the first try; nothing is stated but a period where none is there."""
+"""Files of real rigs and public benchmarks read at the first try; only a period is stated, where none is there."""
 
 from pathlib import Path
 
