@@ -20,6 +20,7 @@ def test_each_pair_of_units_converts_there_and_back_or_is_of_two_quantities() ->
         there = convert(VALUES, unit, other)
         assert there is not None
         back = convert(there, other, unit)
+        assert back is not None
         np.testing.assert_allclose(back, VALUES, rtol=1e-12, atol=1e-12, err_msg=f"{unit} {other}")
 
 
