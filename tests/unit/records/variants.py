@@ -169,6 +169,7 @@ def _variants() -> dict[str, Variant]:
         "a period and no header": _text("\n".join(" ".join(row) for row in cells()) + "\n", stated=FileFormat(period="1min"), names=only_numbers, suffix=".dat"),
         "no header": _text(_headerless(plain), stated=FileFormat(time_unit="min"), names=by_number),
         "no header, stated time": _text(_headerless(table(SECONDS, cells(), separator="\t")), stated=FileFormat(time="1", header=False), names=by_number, suffix=".txt"),
+        "a stated header of numbers": _text(table(SECONDS, cells(), ("0.5", "101", "102", "103")), stated=FileFormat(header=True, time="0.5"), names={"qc": "101", "C": "102", "T": "103"}),
         "UTC": _text(table(_iso(START), cells(), STAMPS), start=START),
         "Z and milliseconds": _text(table([time.strftime("%Y-%m-%dT%H:%M:%S.250Z") for time in clock()], cells(), ("timestamp", "qc", "C", "T")), start=START + timedelta(seconds=0.25)),
         "an offset": _text(table(_iso(START, BERLIN), cells(), ("datetime", "qc", "C", "T")), start=START),
