@@ -49,7 +49,6 @@ def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_
     for message in warm.messages[:TRAINED]:
         published += node.on_message(message, 0)
     assert not node._worker.is_busy
-    assert node.preparation is None
     for message in warm.messages[TRAINED:LATE]:
         published += node.on_message(message, 0)
     assert node.rows == LATE // 3
