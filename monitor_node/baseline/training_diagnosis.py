@@ -14,9 +14,10 @@ import numpy as np
 
 from monitor_node.baseline.training import TrainingState
 from reactorwatch.contract.messages_pb2 import Baseline
-from reactorwatch.diagnosis.result import AMBIGUOUS, NAMED, NOMINAL, Cause, Diagnosis
+from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import FREE_NAME
 from reactorwatch.records.record import MINUTE_NS, Record
 from reactorwatch.stored_state import unpack_numbers, unpack_times
 
@@ -70,7 +71,8 @@ class Finding(NamedTuple):
 def diagnose_training(job: DiagnosisJob) -> Finding:
     """Diagnose a training.
 
-    Where the rows cannot rank the explanations, the best of them is taken.
+    Where the rows cannot rank the explanations, the best of them is taken. Of its causes those are taken that last: a
+    curve (profile `free`), such as a disturbance, predicts no other rows.
 
     Raises:
         InputError: the rows cannot be diagnosed: too few, or without movement of the input.
@@ -87,8 +89,12 @@ def diagnose_training(job: DiagnosisJob) -> Finding:
     given = parse_extended_model(job.equations)
     given = replace(given, effects=tuple(item.shift(-job.first_ns / MINUTE_NS) for item in given.effects))
     found = diagnose(record, given.build())
-    extends = found.verdict in (NAMED, AMBIGUOUS)
-    return Finding(job.first_ns, found.verdict, _reason(found), _json(found.extended_model) if extends else "")
+    if all(cause.profile == FREE_NAME for cause in found.causes):
+        return Finding(job.first_ns, found.verdict, _reason(found))
+    extended = parse_extended_model(_json(found.extended_model))
+    added = (item for item in extended.effects[len(given.effects) :] if item.profile.name != FREE_NAME)
+    lasting = replace(extended, effects=(*extended.effects[: len(given.effects)], *added))
+    return Finding(job.first_ns, found.verdict, _reason(found), _json(lasting.to_object()))
 
 
 def read_equations(text: str) -> ProcessModel:
@@ -112,6 +118,8 @@ def _reason(found: Diagnosis) -> str:
 
 def _text(cause: Cause) -> str:
     size = cause.parameters["size"]
+    if cause.profile == FREE_NAME:
+        return f"{cause.label} ({cause.cause}) in the course of a curve, which predicts no other rows"
     unit = "" if size.unit == "1" else f" {size.unit}"
     return f"{cause.label} ({cause.cause}, {cause.profile}) of {size.value:+.3g}{unit}"
 
