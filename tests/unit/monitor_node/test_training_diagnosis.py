@@ -18,7 +18,7 @@ from reactorwatch.process.extended_model import ExtendedModel
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.stored_state import packed_times, unpacked_times
+from reactorwatch.stored_state import pack_times, unpack_times
 
 from .warm_plant import CONFIG, GIVEN, LATE, TRAINED, Run, changes, plant, publish, without_baseline
 
@@ -70,7 +70,7 @@ def test_a_given_model_with_effects_is_what_the_training_is_compared_with_on_the
     publish(monitor, warm.messages[: TRAINED + 3])
     job = monitor.diagnosis_job
     assert job is not None
-    times_ns = packed_times(START_NS + time_ns for time_ns in unpacked_times(job.rows.times_ns))
+    times_ns = pack_times(START_NS + time_ns for time_ns in unpack_times(job.rows.times_ns))
     known = parse_fault(f"feed_temperature:step:2@{START_NS / MINUTE_NS - 5}min")
     found = find_deviations(
         DiagnosisJob(
