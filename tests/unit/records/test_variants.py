@@ -258,6 +258,8 @@ def test_the_option_that_is_named_settles_it(tmp_path: Path, name: str, stated: 
         ({"separator": ",", "decimal": ","}, "--separator and --decimal must differ"),
         ({"period": "4"}, "--period must be a positive number with its unit, such as 4 s, got '4'"),
         ({"period": "-4 s"}, "--period must be a positive number"),
+        ({"time_format": "%Y-%Q"}, "--time-format '%Y-%Q': unknown directive '%Q'"),
+        ({"time_format": "%Y-%Y"}, "--time-format '%Y-%Y': each part once"),
         ({"zone": "Mars/Olympus"}, "--zone must be a time zone such as Europe/Berlin"),
     ],
 )
