@@ -15,6 +15,7 @@ import numpy as np
 from monitor_node.baseline.training import TrainingState
 from reactorwatch.contract.messages_pb2 import Baseline
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
+from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME
@@ -103,7 +104,10 @@ def read_equations(text: str) -> ProcessModel:
     Raises:
         InputError: it is no model of this software.
     """
-    return parse_extended_model(text).rebase(0).build()
+    try:
+        return parse_extended_model(text).rebase(0).build()
+    except InputError as error:
+        raise InputError(f"the model of the baseline {error}") from error
 
 
 def _reason(found: Diagnosis) -> str:
