@@ -86,9 +86,13 @@ class DiagnosisWorker:
         return found
 
     def close(self) -> None:
-        """Start no further diagnosis."""
+        """End a running diagnosis, and start no further one."""
         self._is_closed = True
         self._jobs.put(None)
+        if isinstance(self._executor, ProcessExecutor):
+            self._executor.close()
+            if self._thread is not None:
+                self._thread.join()
 
     def _work(self) -> None:
         while not self._is_closed:

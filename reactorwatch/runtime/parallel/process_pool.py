@@ -56,6 +56,19 @@ class ProcessExecutor:
     def __init__(self, processes: int, retries: int = RETRIES) -> None:
         self._processes = processes
         self._retries = retries
+        self._running: dict[Connection[Any, Any], _Worker] = {}
+        self._is_closed = False
+
+    def close(self) -> None:
+        """End the running processes and start no others, from any thread; the iterator of `map_unordered` then ends.
+
+        A program that ends while a thread of it iterates would otherwise wait for the job: the thread takes the end of
+        the process for a death, and starts another one.
+        """
+        self._is_closed = True
+        for worker in list(self._running.values()):
+            with suppress(ValueError):  # it has just ended by itself
+                worker.process.terminate()
 
     def map_unordered(
         self, work: Callable[[Job], Result], jobs: Sequence[Job]
@@ -63,7 +76,7 @@ class ProcessExecutor:
         """See `Executor`."""
         queue = deque(range(len(jobs)))
         deaths = [0] * len(jobs)
-        running: dict[Connection[Any, Any], _Worker] = {}
+        running = self._running
 
         def assign(worker: _Worker) -> None:
             worker.number = queue.popleft()
@@ -71,16 +84,20 @@ class ProcessExecutor:
                 worker.pipe.send(jobs[worker.number])
 
         try:
-            while queue or running:
+            while (queue or running) and not self._is_closed:
                 while queue and len(running) < self._processes:
                     worker = _start(work)
                     running[worker.pipe] = worker
                     assign(worker)
+                if self._is_closed:  # while one was started
+                    return
                 for pipe in wait(list(running)):
                     worker = running[cast("Connection[Any, Any]", pipe)]
                     try:
                         outcome = worker.pipe.recv()
                     except (EOFError, OSError):
+                        if self._is_closed:
+                            return
                         del running[worker.pipe]
                         _end(worker)
                         deaths[worker.number] += 1
@@ -101,6 +118,7 @@ class ProcessExecutor:
                 worker.process.terminate()
             for worker in running.values():
                 _end(worker)
+            running.clear()
 
 
 def _start(work: Callable[[Any], Any]) -> _Worker:

@@ -1,7 +1,9 @@
 """Jobs come to the same whoever does them; a failure stays with its job, and a dead worker costs a retry."""
 
 import multiprocessing
+import os
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +13,8 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.parallel.jobs import RETRIES, Executor, Failed, SerialExecutor, choose_executor, in_job_order
 from reactorwatch.runtime.parallel.process_pool import THREADS, ProcessExecutor, available_cores
 from tests.cluster import dask_cluster
-from tests.unit.runtime.work import deadly, linear_algebra_threads, picky, square, unspeakable
+from tests.running import WITHIN_S
+from tests.unit.runtime.work import deadly, endless, linear_algebra_threads, picky, square, unspeakable
 
 
 @pytest.fixture(scope="module")
@@ -171,3 +174,16 @@ def test_a_scheduler_that_is_not_there_is_told_by_its_address(monkeypatch: pytes
     monkeypatch.setattr("reactorwatch.runtime.parallel.dask_workers.CONNECT_WITHIN_S", 0.2)
     with pytest.raises(InputError, match=r"^--scheduler tcp://127\.0\.0\.1:1: cannot be reached: "):
         list(choose_executor(None, "tcp://127.0.0.1:1").map_unordered(square, range(2)))
+
+
+def test_a_closed_executor_ends_its_running_job_and_starts_no_other(tmp_path: Path) -> None:
+    executor, found = ProcessExecutor(1), list[object]()
+    os.mkfifo(tmp_path / "runs")
+    jobs = [str(tmp_path / "runs")] * 2
+    thread = threading.Thread(target=lambda: found.extend(executor.map_unordered(endless, jobs)))
+    thread.start()
+    assert (tmp_path / "runs").read_text() == "x"  # waits for the job
+    executor.close()
+    thread.join(WITHIN_S)
+    assert not thread.is_alive()
+    assert found == []

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 from pathlib import Path
 
 from reactorwatch.errors import InputError
@@ -36,3 +37,9 @@ def linear_algebra_threads(_job: int) -> str | None:
 
 def unspeakable(x: int) -> object:
     return (lambda: x) if x == 1 else x
+
+
+def endless(fifo: str) -> None:
+    """Write to a pipe with a name, and wait until the process is ended."""
+    Path(fifo).write_text("x")
+    threading.Event().wait()
