@@ -74,7 +74,8 @@ def check_record(
 
     Args:
         structure: structure of the model; one output.
-        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
+        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured. Without inputs there is no excitation
+            and no step response to check.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,); None: gaps are not detected.
 
@@ -84,6 +85,12 @@ def check_record(
     varied = variation(outputs)
     if not varied.passed:
         return (varied,)
+    if structure.inputs == 0:
+        return (
+            varied,
+            conditioning(structure, inputs, outputs, time),
+            amplitude(structure, inputs, outputs, time),
+        )
     excited = persistence(inputs, structure.output_lags + structure.input_lags, time)
     conditioned = conditioning(structure, inputs, outputs, time)
     if not excited.passed or conditioned.value == math.inf:
