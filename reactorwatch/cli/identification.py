@@ -23,6 +23,7 @@ NAMES = {
     "oe": "OE",
     "armax": "ARMAX",
     "bj": "Box-Jenkins model",
+    "narx": "polynomial NARX",
 }
 
 
@@ -162,6 +163,7 @@ def _parameter_lines(found: Identification) -> list[str]:
         groups.append(("b", found.b, sd.b))
     pairs = [(f"{name}{lag}", *pair) for name, *both in groups for lag, pair in enumerate(zip(*both, strict=True), 1)]
     pairs.append(("offset", found.offset, sd.offset))
+    pairs += [(item.term, item.value, item.sd) for item in ([] if found.terms is msgspec.UNSET else found.terms)]
     for name in ("c", "d", "f"):
         values, deviations = getattr(found, name), getattr(sd, name)
         if values is not msgspec.UNSET:

@@ -17,6 +17,7 @@ from reactorwatch.identification.excitation import check_record
 from reactorwatch.identification.free_run import free_run
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.output_error import fit_oe
+from reactorwatch.identification.polynomial_narx import PolynomialModel, fit_narx, name_product
 from reactorwatch.identification.prediction_error import PredictionErrorModel, fit_armax, fit_box_jenkins
 from reactorwatch.identification.recursive_output_error import RecursiveOutputError
 from reactorwatch.identification.regressor import consecutive_rows, rows_of
@@ -26,11 +27,14 @@ from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, 
 
 Array = NDArray[np.float64]
 
-MODELS: dict[str, Callable[..., LinearModel | PredictionErrorModel]] = {
+FittedModel = LinearModel | PredictionErrorModel | PolynomialModel
+
+MODELS: dict[str, Callable[..., FittedModel]] = {
     "arx": fit_arx,
     "oe": fit_oe,
     "armax": fit_armax,
     "bj": fit_box_jenkins,
+    "narx": fit_narx,
 }
 """Fits by the kind of model."""
 
@@ -46,7 +50,7 @@ class ModelForm:
     """Choice of a model.
 
     Attributes:
-        model: `arx`, `oe`, `armax`, `bj` (Box-Jenkins).
+        model: `arx`, `oe`, `armax`, `bj` (Box-Jenkins) or `narx` (polynomial of degree 2).
         order: number of lags of the output, of each input and of the disturbance.
         delay: samples from a move of an input to its first effect, at least 1.
         recursive: whether it is learned row by row instead of from all rows at once.
@@ -84,6 +88,20 @@ class Deviations(msgspec.Struct, frozen=True):
     f: Coefficients | UnsetType = UNSET
 
 
+class Term(msgspec.Struct, frozen=True):
+    """A term of a polynomial.
+
+    Attributes:
+        term: factors by signal and lag in rows; `T1*u2` is T[k-1] u[k-2].
+        value: coefficient of the term.
+        sd: standard deviation of the coefficient.
+    """
+
+    term: str
+    value: float
+    sd: float
+
+
 class FitPercent(msgspec.Struct, frozen=True):
     """Fits on the held-out rows, 100 (1 - |y - yhat| / |y - mean y|).
 
@@ -114,10 +132,11 @@ class Identification(msgspec.Struct, frozen=True):
     y[k] = a1 y[k-1] + ... + an y[k-n] + b1 u[k-d] + ... + bn u[k-d-n+1] + offset, d the delay, in the signals' own
     units; in an output-error model y stands for the model's own output. An ARMAX model adds e[k] + c1 e[k-1] + ... +
     cn e[k-n], with e its one-step error. A Box-Jenkins model is w + v, w[k] = f1 w[k-1] + ... + b1 u[k-d] + ... +
-    offset and v[k] = d1 v[k-1] + ... + e[k] + c1 e[k-1] + ...; it has no a.
+    offset and v[k] = d1 v[k-1] + ... + e[k] + c1 e[k-1] + ...; it has no a. A polynomial NARX model is the sum of its
+    terms and the offset; it has neither a nor b.
 
     Attributes:
-        model: `arx`, `oe`, `armax` or `bj`.
+        model: `arx`, `oe`, `armax`, `bj` or `narx`.
         order: n.
         delay: delay in samples.
         output: name of the output.
@@ -134,6 +153,7 @@ class Identification(msgspec.Struct, frozen=True):
         c: n coefficients of past errors, of an ARMAX or Box-Jenkins model.
         d: n coefficients of the past disturbance of a Box-Jenkins model.
         f: n coefficients of the plant's own past of a Box-Jenkins model.
+        terms: terms of a polynomial NARX model.
         rmse: errors on the held-out rows, where a record was given for validation or rows set the state.
     """
 
@@ -153,6 +173,7 @@ class Identification(msgspec.Struct, frozen=True):
     c: Coefficients | UnsetType = UNSET
     d: Coefficients | UnsetType = UNSET
     f: Coefficients | UnsetType = UNSET
+    terms: tuple[Term, ...] | UnsetType = UNSET
     rmse: Rmse | UnsetType = UNSET
 
     @property
@@ -189,7 +210,7 @@ def identify(
         excitation = checks.get("excitation", "ok")
         raise refusal if excitation == "ok" else InputError(excitation) from refusal
     residuals = model.residuals(*fitted.arrays)[:, 0]
-    of_own_past = {"arx": form.order, "oe": 0}.get(form.model, 2 * form.order)
+    of_own_past = {"arx": form.order, "narx": form.order, "oe": 0}.get(form.model, 2 * form.order)
     lags, white = max(DEFAULT_LAGS, of_own_past + 10), math.nan
     if np.isfinite(residuals).sum() >= 5 * lags:
         white = whiteness(residuals, lags, of_own_past).minus_log10_p
@@ -200,7 +221,7 @@ def identify(
     predicted, run = model.predict(*held_out.arrays)[:, 0], free_run(model, held_out, settle)
     predicted[:settle] = np.nan
     y = held_out.output[:, 0]
-    values, deviations = (_name(model, form, data.input_names, part) for part in _parameters(model))
+    values, deviations = _coefficients(model, form, data)
     return Identification(
         model=form.model,
         order=form.order,
@@ -232,7 +253,7 @@ def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out
         raise InputError(f"the held-out part needs more rows than the {first} that set the state, got {held_out.rows}")
 
 
-def _fit(structure: Structure, form: ModelForm, data: Dataset) -> LinearModel | PredictionErrorModel:
+def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
     u, y, t = data.arrays
     if not form.recursive:
         return MODELS[form.model](structure, u, y, t, form.choice)
@@ -254,11 +275,23 @@ def _fit(structure: Structure, form: ModelForm, data: Dataset) -> LinearModel | 
     return model_of(structure, scaling, estimator, simulates=False)
 
 
-def _parameters(model: LinearModel | PredictionErrorModel) -> tuple[Array, Array]:
-    """Parameters and their standard deviations, each of shape (parameters,)."""
+def _coefficients(model: FittedModel, form: ModelForm, data: Dataset) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Parameters and their standard deviations by the names of the result."""
+    if isinstance(model, PolynomialModel):
+        products, values, deviations = model.expand()
+        names = (name_product(product, model.structure, data.input_names, data.output_name) for product in products)
+        terms = tuple(Term(*term) for term in zip(names, _floats(values), _floats(deviations), strict=True))
+        none: dict[str, Any] = {
+            "a": (),
+            "b": dict.fromkeys(data.input_names, ()) if len(data.input_names) > 1 else (),
+        }
+        return none | {"offset": terms[0].value, "terms": terms[1:]}, none | {"offset": terms[0].sd}
     if isinstance(model, LinearModel):
-        return model.parameters[0], model.standard_deviations[0]
-    return model.parameters, model.standard_deviations
+        parts = model.parameters[0], model.standard_deviations[0]
+    else:
+        parts = model.parameters, model.standard_deviations
+    named, deviations_named = (_name(model, form, data.input_names, part) for part in parts)
+    return named, deviations_named
 
 
 def _name(

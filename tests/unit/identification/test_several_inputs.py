@@ -9,7 +9,7 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.dataset import Dataset
-from reactorwatch.identification.identify import Identification, ModelForm, identify
+from reactorwatch.identification.identify import MODELS, Identification, ModelForm, identify
 from tests.unit.identification.systems import ARMAX, ARX, AUTOREGRESSION, BOX_JENKINS, OUTPUT_ERROR, System
 
 ROWS = 1200
@@ -134,7 +134,7 @@ def test_settling_rows_follow_gaps_and_missing_values() -> None:
 U, Y = ARX.simulate(200, 1)
 
 
-@pytest.mark.parametrize("model", ["arx", "oe", "armax", "bj"])
+@pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize(
     ("u", "y", "text"),
     [
@@ -147,7 +147,7 @@ U, Y = ARX.simulate(200, 1)
 def test_a_record_that_determines_nothing_is_refused_before_any_fit(
     model: str, u: np.ndarray, y: np.ndarray, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("reactorwatch.identification.identify.MODELS", dict.fromkeys(("arx", "oe", "armax", "bj")))
+    monkeypatch.setattr("reactorwatch.identification.identify.MODELS", dict.fromkeys(MODELS))
     data = Dataset.of(np.arange(float(len(y))), u, y, output_name="th", missing="leave out")
     with pytest.raises(InputError, match=text) as caught:
         identify(data, ModelForm(model))
@@ -162,7 +162,7 @@ def test_rows_that_settle_must_leave_rows_to_judge() -> None:
         identify(data, settle=-1)
 
 
-@pytest.mark.parametrize("model", ["armax", "bj"])
+@pytest.mark.parametrize("model", ["armax", "bj", "narx"])
 def test_only_models_with_a_recursive_form_are_learned_row_by_row(model: str) -> None:
     with pytest.raises(InputError, match=f"only arx and oe can be recursive, got {model}"):
         ModelForm(model, recursive=True)
