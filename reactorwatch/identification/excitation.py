@@ -133,9 +133,16 @@ def persistence(inputs: ArrayLike, order: int, time: ArrayLike | None = None) ->
         spacing *= 2
     if found >= order:
         return Check("excitation", "ok", float(found), float(order))
-    kind = {0: " (a constant input excites none)", 2: " (as a single sinusoid does)"}.get(found, "")
+    several = u.shape[1] > 1
+    none = (
+        "constant inputs, and inputs that move in proportion, excite none"
+        if several
+        else "a constant input excites none"
+    )
+    kind = {0: f" ({none})", 2: " (as a single sinusoid does)"}.get(found, "")
+    subject, them = ("the inputs together excite", "each") if several else ("the input excites", "it")
     reason = (
-        f"the input excites order {found}{kind}, order {order} is needed: move it in steps at irregular times, "
+        f"{subject} order {found}{kind}, order {order} is needed: move {them} in steps at irregular times, "
         f"or by a sum of at least {-(-order // 2)} sinusoids"
     )
     return Check("excitation", reason, float(found), float(order))

@@ -60,6 +60,8 @@ def test_without_inputs_it_is_an_autoregression() -> None:
     truth = np.linalg.lstsq(np.column_stack([y[k - 1], y[k - 2], np.ones(k.size)]), y[k])[0]
     np.testing.assert_allclose([*found.a, found.offset], truth, rtol=1e-8)
     assert found.b == found.sd.b == ()
+    recursive = identify(data, ModelForm("arx", order=2, recursive=True))
+    np.testing.assert_allclose(recursive.a, found.a, rtol=1e-6)
     assert set(found.checks) == {"variation", "conditioning", "amplitude", "whiteness"}
 
 
@@ -152,6 +154,13 @@ def test_a_record_that_determines_nothing_is_refused_before_any_fit(
     with pytest.raises(InputError, match=text) as caught:
         identify(data, ModelForm(model))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_inputs_that_move_in_proportion_are_refused_as_such(model: str) -> None:
+    u = np.column_stack([U[:, 0], 3.0 * U[:, 0] + 1.0])
+    with pytest.raises(InputError, match="inputs that move in proportion, excite none"):
+        identify(Dataset.of(np.arange(200.0), u, Y), ModelForm(model, order=1))
 
 
 def test_rows_that_settle_must_leave_rows_to_judge() -> None:
