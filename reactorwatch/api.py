@@ -34,7 +34,8 @@ from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import report_object
 from reactorwatch.diagnosis.result import Diagnosis
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.identification.identify import Identification
+from reactorwatch.identification.dataset import Dataset
+from reactorwatch.identification.identify import Identification, ModelForm
 from reactorwatch.identification.identify import identify as identify_model
 from reactorwatch.process import MODELS, effects_of
 from reactorwatch.process.effect import Effect
@@ -123,40 +124,34 @@ def identify(
     record: Record,
     output: str,
     *,
-    input: str = "qc",
-    model: str = "arx",
-    order: int = 3,
-    delay: int = 1,
-    recursive: bool = False,
+    process: ProcessLike = "cstr",
+    input: str | Sequence[str] | None = None,
+    validate: Record | None = None,
+    settle: int = 0,
+    **form: Any,
 ) -> Identification:
-    """Fit a linear model of one output to the first half of a record and validate it on the second.
+    """Fit a model of one output to the first half of a record and validate it on the second.
 
     Args:
-        record: with columns of the input and the output.
+        record: with columns of the inputs and the output.
         output: name of the output.
-        input: name of the input.
-        model: `arx` or `oe`.
-        order: number of lags of output and input.
-        delay: rows from a change of the input to its first effect, at least 1.
-        recursive: whether the parameters are learned row by row (recursive least squares).
+        process: decides which signals are the inputs.
+        input: names of the inputs, none, one or several; None: those of the process.
+        validate: record to validate on; all of `record` is then fitted.
+        settle: number of first held-out rows that may set the state, and are left out of the fits.
+        form: `model` (`arx`, `oe`, `armax`, `bj`, `narx`), `order`, `delay` and `recursive`, like the options of the
+            command.
 
     Raises:
-        InputError: a signal is missing, or the record cannot determine the model.
+        InputError: a signal is missing, the record cannot determine the model, or `form` has another name.
     """
-    for signal in (input, output):
-        if signal not in record.columns:
-            raise InputError(f"{record.name}: holds no signal {signal!r}, only {', '.join(record.columns)}")
-    return identify_model(
-        record.continuous_min,
-        record.columns[input],
-        record.columns[output],
-        model=model,
-        order=order,
-        delay=delay,
-        output=output,
-        recursive=recursive,
-        missing="leave out",
-    )
+    known = ("model", "order", "delay", "recursive")
+    for name in form:
+        if name not in known:
+            raise InputError(describe_unknown("argument", name, known))
+    inputs = find_process(process).inputs if input is None else (input,) if isinstance(input, str) else tuple(input)
+    held_out = None if validate is None else Dataset.of_record(validate, inputs, output)
+    return identify_model(Dataset.of_record(record, inputs, output), ModelForm(**form), held_out, settle)
 
 
 @dataclass(frozen=True)

@@ -1,54 +1,103 @@
-"""`identify`: fit linear models to a record and format the results."""
+"""`identify`: fit models of the outputs of a record and format the results."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import msgspec
-import numpy as np
 
-from reactorwatch.arrays import Array
-from reactorwatch.errors import InputError
+from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.find import DEFAULT_PROCESS, find_process
+from reactorwatch.description.process import Process
+from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.families import Arx, Family, OutputError
-from reactorwatch.identification.identify import Identification
-from reactorwatch.identification.identify import identify as identify_model
+from reactorwatch.identification.identify import Coefficients, Identification, ModelForm, identify
 from reactorwatch.identification.selection import Selection, select
-from reactorwatch.identification.structure import ALL_ROWS, REPORT_ROWS
 from reactorwatch.records.record import Record
 
-INPUT = "qc"
+DEFAULT_OUTPUTS = {DEFAULT_PROCESS: ("T",)}
+"""Outputs that are identified where none is named, by process; else all."""
+
+NAMES = {
+    "arx": "ARX",
+    "oe": "OE",
+    "armax": "ARMAX",
+    "bj": "Box-Jenkins model",
+    "narx": "polynomial NARX",
+}
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Rows that a model is validated on.
+
+    Attributes:
+        record: the record; None: the second half of the one that is fitted.
+        settle: number of first rows that may set the state.
+    """
+
+    record: Record | None = None
+    settle: int = 0
+
+
+def choose_outputs(
+    process: str | None, inputs: tuple[str, ...], outputs: tuple[str, ...]
+) -> tuple[Process, tuple[str, ...]]:
+    """Process and the outputs that are identified.
+
+    Args:
+        process: name or path of a process; None: the named columns describe one, or it is the default process.
+        inputs: columns that are inputs.
+        outputs: outputs of the process, or columns that are outputs.
+
+    Raises:
+        InputError: as `ProcessChoice`; or a process has no such output.
+    """
+    default = find_process()
+    if process is None and (inputs or not set(outputs) <= set(default.outputs)):
+        described = ProcessChoice(None, inputs, outputs).load()
+    else:
+        described = ProcessChoice(process or DEFAULT_PROCESS, inputs).load()
+    for output in outputs:
+        if output not in described.outputs:
+            raise InputError(describe_unknown("--output", output, described.outputs))
+    return described, outputs or DEFAULT_OUTPUTS.get(described.name, described.outputs)
 
 
 def fit(
     measured: Record,
-    output: str,
-    model: str,
-    order: int,
-    delay: int,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    form: ModelForm,
+    validation: Validation,
     *,
-    recursive: bool,
-    report_rows: bool,
     as_json: bool,
 ) -> str:
-    """Fit one model of one output and format it.
+    """Fit one model of each output and format them, as JSON one object a line.
 
     Raises:
         InputError: the record or the options are unsuitable.
     """
-    identification = identify_model(
-        measured.continuous_min,
-        *_columns(measured, output),
-        model=model,
-        order=order,
-        delay=delay,
-        output=output,
-        recursive=recursive,
-        choice=REPORT_ROWS if report_rows else ALL_ROWS,
-        missing="leave out",
-    )
+    found = []
+    for output in outputs:
+        held_out = None if validation.record is None else Dataset.of_record(validation.record, inputs, output)
+        found.append(identify(Dataset.of_record(measured, inputs, output), form, held_out, validation.settle))
     if as_json:
-        return msgspec.json.encode(identification).decode()
-    return f"{_text(identification, measured)}{_remarks_text(measured)}"
+        return "\n".join(msgspec.json.encode(item).decode() for item in found)
+    other = None if validation.record is None else validation.record.name
+    return "\n\n".join(_text(item, inputs, measured, other) for item in found) + _remarks_text(measured)
 
 
-def compare(measured: Record, output: str, order: int, delay: int, *, neural: bool, as_json: bool) -> str:
-    """Compare every family at every order up to `order`, and format the choice with its reason.
+def compare(
+    measured: Record,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    form: ModelForm,
+    *,
+    neural: bool,
+    as_json: bool,
+) -> str:
+    """Compare every family at every order up to that of the form, and format the choice for each output.
 
     Raises:
         InputError: as `fit`, or the extra for neural networks is not installed.
@@ -58,36 +107,20 @@ def compare(measured: Record, output: str, order: int, delay: int, *, neural: bo
         from reactorwatch.identification.neural import Neural
 
         families.append(Neural())
-    if order < 1:
-        raise InputError(f"order must be at least 1, got {order}")
-    selection = select(
-        *_columns(measured, output),
-        measured.continuous_min,
-        families=families,
-        orders=range(1, order + 1),
-        delay=delay,
-    )
-    if as_json:
-        return _selection_json(selection, output)
-    return f"{selection.table()}\n\n{selection.reason}{_remarks_text(measured)}"
+    if form.order < 1:
+        raise InputError(f"order must be at least 1, got {form.order}")
+    orders, texts = range(1, form.order + 1), []
+    for output in outputs:
+        u, y, time = Dataset.of_record(measured, inputs, output).arrays
+        selection = select(u, y, time, families=families, orders=orders, delay=form.delay)
+        text = f"{selection.table()}\n\n{selection.reason}"
+        heading = f"{output}\n" if len(outputs) > 1 else ""
+        texts.append(_selection_json(selection, output) if as_json else f"{heading}{text}")
+    return "\n".join(texts) if as_json else "\n\n".join(texts) + _remarks_text(measured)
 
 
 def _remarks_text(measured: Record) -> str:
     return "".join(f"\nnote: {remark}" for remark in measured.remarks)
-
-
-def _columns(measured: Record, output: str) -> tuple[Array, Array]:
-    """Values of the input and of the output.
-
-    Raises:
-        InputError: there is no such output, or one of the two has no value.
-    """
-    if output not in ("C", "T"):
-        raise InputError(f"--output must be C or T, got {output!r}")
-    for signal in (INPUT, output):
-        if not np.isfinite(measured.columns[signal]).any():
-            raise InputError(f"{measured.name}: {signal} has no measured value, so no model of {output} can be fitted")
-    return measured.columns[INPUT], measured.columns[output]
 
 
 def _selection_json(selection: Selection, output: str) -> str:
@@ -100,23 +133,40 @@ def _selection_json(selection: Selection, output: str) -> str:
     return msgspec.json.encode(report).decode()
 
 
-def _text(found: Identification, measured: Record) -> str:
+def _text(found: Identification, inputs: Sequence[str], measured: Record, other: str | None) -> str:
     unit = measured.units.get(found.output, "unit not known")
-    names = [f"a{lag}" for lag in range(1, found.order + 1)] + [f"b{lag}" for lag in range(1, found.order + 1)]
-    values = [*found.a, *found.b, found.offset]
-    deviations = [*found.sd.a, *found.sd.b, found.sd.offset]
-    past = "measured past" if found.model == "arx" else "model's own past"
+    past = "model's own past" if found.model == "oe" else "measured past"
+    rows = f"{found.rows} rows fitted{', row by row' if found.recursive else ''}"
+    error = "" if found.rmse is msgspec.UNSET else f" (root mean square error {found.rmse.free_run:.4g})"
     lines = [
-        f"{found.model.upper()} of order {found.order}, delay {found.delay}: {found.output} ({unit}) from the {past} "
-        f"and {INPUT}; {found.rows} rows fitted{', row by row' if found.recursive else ''}",
+        f"{NAMES[found.model]} of order {found.order}, delay {found.delay}: {found.output} ({unit}) from the "
+        f"{' and '.join((past, *inputs))}; {rows}",
         "",
-        *(
-            f"  {name:<4}{value: .6g}  +- {deviation:.2g}"
-            for name, value, deviation in zip([*names, "c"], values, deviations, strict=True)
-        ),
+        *_parameter_lines(found),
         "",
-        f"fit on the other half: one step {found.fit_percent.one_step:.2f} %, "
-        f"free run {found.fit_percent.free_run:.2f} %",
+        f"fit on {other or 'the other half'}: one step {found.fit_percent.one_step:.2f} %, "
+        f"free run {found.fit_percent.free_run:.2f} %{error}",
         *(f"{name}: {result}" for name, result in found.checks.items()),
     ]
     return "\n".join(lines)
+
+
+def _parameter_lines(found: Identification) -> list[str]:
+    """One line a parameter, with its standard deviation."""
+    sd = found.sd
+    groups: list[tuple[str, Coefficients, Coefficients]] = [("a", found.a, sd.a)]
+    if isinstance(found.b, dict):
+        assert isinstance(sd.b, dict)
+        groups += [(f"b.{name}.", values, sd.b[name]) for name, values in found.b.items()]
+    else:
+        assert not isinstance(sd.b, dict)
+        groups.append(("b", found.b, sd.b))
+    pairs = [(f"{name}{lag}", *pair) for name, *both in groups for lag, pair in enumerate(zip(*both, strict=True), 1)]
+    pairs.append(("offset", found.offset, sd.offset))
+    pairs += [(item.term, item.value, item.sd) for item in ([] if found.terms is msgspec.UNSET else found.terms)]
+    for name in ("c", "d", "f"):
+        values, deviations = getattr(found, name), getattr(sd, name)
+        if values is not msgspec.UNSET:
+            pairs += [(f"{name}{lag}", *pair) for lag, pair in enumerate(zip(values, deviations, strict=True), 1)]
+    width = max(len(name) for name, *_ in pairs) + 2
+    return [f"  {name:<{width}}{value: .6g}  +- {deviation:.2g}" for name, value, deviation in pairs]

@@ -5,7 +5,18 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Force, Json, Plant, Processes, Scheduler, check_recording, parse_columns
+from reactorwatch.cli.options import (
+    Columns,
+    Force,
+    Json,
+    Plant,
+    Processes,
+    ProcessInputs,
+    Scheduler,
+    check_recording,
+    parse_columns,
+    split_names,
+)
 from reactorwatch.cli.printing import print_text
 from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
@@ -21,10 +32,31 @@ def register_commands(app: typer.Typer) -> None:
 
 def identify(
     file: Annotated[Path, typer.Argument(help="A record (.csv) or recording (.mcap).", show_default=False)],
-    model: Annotated[str, typer.Option(help="arx or oe.")] = "arx",
-    order: Annotated[int, typer.Option(help="Lags of output and input.")] = 3,
-    delay: Annotated[int, typer.Option(help="Samples from a move of qc to its first effect.")] = 1,
-    output: Annotated[str, typer.Option(help="C or T.")] = "T",
+    process: Annotated[
+        str | None,
+        typer.Option(
+            help="A process: a name in the catalogue, or a .toml, .py or extended.json file [cstr].", show_default=False
+        ),
+    ] = None,
+    inputs: ProcessInputs = None,
+    output: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--output",
+            help="An output to identify, each by a model of its own (repeatable) [T of cstr, else all].",
+            show_default=False,
+        ),
+    ] = None,
+    model: Annotated[str, typer.Option(help="arx, oe, armax, bj (Box-Jenkins) or narx (polynomial).")] = "arx",
+    order: Annotated[int, typer.Option(help="Lags of the output, each input and the disturbance.")] = 3,
+    delay: Annotated[int, typer.Option(help="Samples from a move of an input to its first effect.")] = 1,
+    validate: Annotated[
+        Path | None,
+        typer.Option(help="A record to validate on; all of FILE is then fitted [the second half].", show_default=False),
+    ] = None,
+    settle: Annotated[
+        int, typer.Option(help="Held-out rows that may set the state of the free run, and are left out of fits.")
+    ] = 0,
     recursive: Annotated[bool, typer.Option("--recursive", help="Learn row by row, as the monitor does.")] = False,
     report_rows: Annotated[
         bool, typer.Option("--report-rows", help="Fit every 6th row from the 100th on, as the original report did.")
@@ -40,23 +72,32 @@ def identify(
     as_json: Json = False,
     stated: FileFormat = GUESS,
 ) -> None:
-    """Fit a linear model to one half, validate it on the other."""
+    """Fit models of the outputs to one half, validate them on the other."""
     from reactorwatch.cli import identification
     from reactorwatch.cli.batch import write_remark
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.read_record import record
     from reactorwatch.cli.unit_remarks import unit_remark
-    from reactorwatch.process.library.cstr.model import cstr
+    from reactorwatch.identification.identify import ModelForm
+    from reactorwatch.identification.structure import ALL_ROWS, REPORT_ROWS
 
-    measured = record(check_recording(file), plant, parse_columns(column), stated=stated)
-    remark = unit_remark(cstr(), measured.columns, measured.time_min)
+    described, outputs = identification.choose_outputs(process, split_names(inputs), split_names(output))
+    form = ModelForm(model, order, delay, recursive=recursive, choice=REPORT_ROWS if report_rows else ALL_ROWS)
+    if compare and (validate is not None or settle):
+        raise InputError("--compare chooses by the second half of FILE: leave --validate and --settle out")
+    measured, held_out = (
+        None if path is None else record(check_recording(path), plant, parse_columns(column), described, stated)
+        for path in (file, validate)
+    )
+    assert measured is not None
+    equations = described.model
+    remark = "" if equations is None else unit_remark(equations, measured.columns, measured.time_min)
     with task(f"identifying {file.name}"):
         if compare:
-            text = identification.compare(measured, output, order, delay, neural=neural, as_json=as_json)
+            text = identification.compare(measured, described.inputs, outputs, form, neural=neural, as_json=as_json)
         else:
-            text = identification.fit(
-                measured, output, model, order, delay, recursive=recursive, report_rows=report_rows, as_json=as_json
-            )
+            validation = identification.Validation(held_out, settle)
+            text = identification.fit(measured, described.inputs, outputs, form, validation, as_json=as_json)
     print_text(text)
     write_remark(file, remark)
 

@@ -39,6 +39,12 @@ Process = Annotated[
         show_default=False,
     ),
 ]
+ProcessInputs = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--input", help="A column that is an input of a process without a file (repeatable).", show_default=False
+    ),
+]
 Force = Annotated[
     bool, typer.Option("--force", help="Replace a file that is there and is of another kind than its name says.")
 ]
@@ -95,6 +101,16 @@ def parse_columns(pairs: list[str] | None) -> dict[str, str]:
             raise InputError(f"--column must be signal=column, such as T=reactor_temp, got {pair!r}")
         names[signal] = column
     return names
+
+
+def split_names(texts: list[str] | None) -> tuple[str, ...]:
+    """Split values of an option that is repeatable or comma separated to names, each once.
+
+    >>> split_names(["h1,h2", "h3", "h1"])
+    ('h1', 'h2', 'h3')
+    """
+    names = (name.strip() for text in texts or () for name in text.split(","))
+    return tuple(dict.fromkeys(filter(None, names)))
 
 
 def parse_tolerances(text: str | None) -> dict[str, float]:

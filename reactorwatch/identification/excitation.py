@@ -74,7 +74,8 @@ def check_record(
 
     Args:
         structure: structure of the model; one output.
-        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
+        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured. Without inputs there is no excitation
+            and no step response to check.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,); None: gaps are not detected.
 
@@ -84,6 +85,12 @@ def check_record(
     varied = variation(outputs)
     if not varied.passed:
         return (varied,)
+    if structure.inputs == 0:
+        return (
+            varied,
+            conditioning(structure, inputs, outputs, time),
+            amplitude(structure, inputs, outputs, time),
+        )
     excited = persistence(inputs, structure.output_lags + structure.input_lags, time)
     conditioned = conditioning(structure, inputs, outputs, time)
     if not excited.passed or conditioned.value == math.inf:
@@ -126,9 +133,16 @@ def persistence(inputs: ArrayLike, order: int, time: ArrayLike | None = None) ->
         spacing *= 2
     if found >= order:
         return Check("excitation", "ok", float(found), float(order))
-    kind = {0: " (a constant input excites none)", 2: " (as a single sinusoid does)"}.get(found, "")
+    several = u.shape[1] > 1
+    none = (
+        "constant inputs, and inputs that move in proportion, excite none"
+        if several
+        else "a constant input excites none"
+    )
+    kind = {0: f" ({none})", 2: " (as a single sinusoid does)"}.get(found, "")
+    subject, them = ("the inputs together excite", "each") if several else ("the input excites", "it")
     reason = (
-        f"the input excites order {found}{kind}, order {order} is needed: move it in steps at irregular times, "
+        f"{subject} order {found}{kind}, order {order} is needed: move {them} in steps at irregular times, "
         f"or by a sum of at least {-(-order // 2)} sinusoids"
     )
     return Check("excitation", reason, float(found), float(order))

@@ -1,42 +1,125 @@
-"""Identify a model of one output from the first half of a record, and validate it on the second."""
+"""Identify models of one output from a record, and validate them on rows that they have not seen."""
 
 import math
-from collections.abc import Iterable
-from typing import Literal
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from msgspec import UNSET, UnsetType
+from numpy.typing import NDArray
 
-from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import SINGULAR_CONDITION, check_not_constant, fit_arx, model_of
+from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, model_of
+from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.excitation import check_record
+from reactorwatch.identification.free_run import free_run
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.output_error import fit_oe
+from reactorwatch.identification.polynomial_narx import PolynomialModel, fit_narx, name_product
+from reactorwatch.identification.prediction_error import PredictionErrorModel, fit_armax, fit_box_jenkins
 from reactorwatch.identification.recursive_output_error import RecursiveOutputError
 from reactorwatch.identification.regressor import consecutive_rows, rows_of
-from reactorwatch.identification.residual_tests import independence, whiteness
+from reactorwatch.identification.residual_tests import DEFAULT_LAGS, independence, whiteness
 from reactorwatch.identification.rls import RecursiveLeastSquares
-from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
+from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure
 
-MODELS = ("arx", "oe")
+Array = NDArray[np.float64]
+
+FittedModel = LinearModel | PredictionErrorModel | PolynomialModel
+
+MODELS: dict[str, Callable[..., FittedModel]] = {
+    "arx": fit_arx,
+    "oe": fit_oe,
+    "armax": fit_armax,
+    "bj": fit_box_jenkins,
+    "narx": fit_narx,
+}
+"""Fits by the kind of model."""
+
+RECURSIVE_MODELS = ("arx", "oe")
 WORST_MINUS_LOG10_P = 6.0
+
+Coefficients = tuple[float, ...]
+InputCoefficients = Coefficients | dict[str, Coefficients]
+
+
+@dataclass(frozen=True)
+class ModelForm:
+    """Choice of a model.
+
+    Attributes:
+        model: `arx`, `oe`, `armax`, `bj` (Box-Jenkins) or `narx` (polynomial of degree 2).
+        order: number of lags of the output, of each input and of the disturbance.
+        delay: samples from a move of an input to its first effect, at least 1.
+        recursive: whether it is learned row by row instead of from all rows at once.
+        forgetting: forgetting factor of the recursive methods, in (0, 1].
+        choice: rows that are fitted; `REPORT_ROWS` is the report's choice.
+
+    Raises:
+        InputError: an unknown kind of model, or a choice that it does not have.
+    """
+
+    model: str = "arx"
+    order: int = 3
+    delay: int = 1
+    recursive: bool = False
+    forgetting: float = 1.0
+    choice: RowChoice = ALL_ROWS
+
+    def __post_init__(self) -> None:
+        if self.model not in MODELS:
+            raise InputError(describe_unknown("model", self.model, MODELS))
+        if self.recursive and self.model not in RECURSIVE_MODELS:
+            raise InputError(f"only {' and '.join(RECURSIVE_MODELS)} can be recursive, got {self.model}")
+        if self.recursive and self.model == "oe" and self.choice != ALL_ROWS:
+            raise InputError("a recursive output-error model runs through every row: it cannot choose rows")
 
 
 class Deviations(msgspec.Struct, frozen=True):
     """Standard deviations of the parameters; inf where the rows do not determine them."""
 
-    a: tuple[float, ...]
-    b: tuple[float, ...]
+    a: Coefficients
+    b: InputCoefficients
     offset: float
+    c: Coefficients | UnsetType = UNSET
+    d: Coefficients | UnsetType = UNSET
+    f: Coefficients | UnsetType = UNSET
+
+
+class Term(msgspec.Struct, frozen=True):
+    """A term of a polynomial.
+
+    Attributes:
+        term: factors by signal and lag in rows; `T1*u2` is T[k-1] u[k-2].
+        value: coefficient of the term.
+        sd: standard deviation of the coefficient.
+    """
+
+    term: str
+    value: float
+    sd: float
 
 
 class FitPercent(msgspec.Struct, frozen=True):
-    """Fits on the held-out half, 100 (1 - |y - yhat| / |y - mean y|).
+    """Fits on the held-out rows, 100 (1 - |y - yhat| / |y - mean y|).
 
     Attributes:
-        one_step: fit of the one-step-ahead prediction, for either kind of model.
-        free_run: fit of the simulation from the half's first rows on; -inf if it diverges.
+        one_step: fit of the one-step-ahead prediction, for any kind of model.
+        free_run: fit of the simulation from the first held-out rows on; -inf if it diverges.
+    """
+
+    one_step: float
+    free_run: float
+
+
+class Rmse(msgspec.Struct, frozen=True):
+    """Root mean square errors on the held-out rows, in the unit of the output.
+
+    Attributes:
+        one_step: error of the one-step-ahead prediction.
+        free_run: error of the simulation; inf if it diverges.
     """
 
     one_step: float
@@ -47,23 +130,31 @@ class Identification(msgspec.Struct, frozen=True):
     """A model and how good it is.
 
     y[k] = a1 y[k-1] + ... + an y[k-n] + b1 u[k-d] + ... + bn u[k-d-n+1] + offset, d the delay, in the signals' own
-    units; in an output-error model y stands for the model's own output.
+    units; in an output-error model y stands for the model's own output. An ARMAX model adds e[k] + c1 e[k-1] + ... +
+    cn e[k-n], with e its one-step error. A Box-Jenkins model is w + v, w[k] = f1 w[k-1] + ... + b1 u[k-d] + ... +
+    offset and v[k] = d1 v[k-1] + ... + e[k] + c1 e[k-1] + ...; it has no a. A polynomial NARX model is the sum of its
+    terms and the offset; it has neither a nor b.
 
     Attributes:
-        model: "arx" or "oe".
+        model: `arx`, `oe`, `armax`, `bj` or `narx`.
         order: n.
         delay: delay in samples.
         output: name of the output.
-        rows: number of rows of the fitted half.
+        rows: number of rows of the fitted part.
         recursive: whether it was learned row by row.
         a: n coefficients of past outputs.
-        b: n coefficients of past inputs.
+        b: n coefficients of past inputs; of several inputs, by their names.
         offset: the constant.
         sd: standard deviations of the parameters.
-        fit_percent: fits on the held-out half.
-        whiteness_minus_log10_p: whiteness test of the residuals of the fitted half: one-step errors of an ARX model,
-            simulation errors of an output-error model.
+        fit_percent: fits on the held-out rows.
+        whiteness_minus_log10_p: whiteness test of the residuals of the fitted part: simulation errors of an
+            output-error model, one-step errors of the others.
         checks: result of each check by name, "ok" or the reason of its failure.
+        c: n coefficients of past errors, of an ARMAX or Box-Jenkins model.
+        d: n coefficients of the past disturbance of a Box-Jenkins model.
+        f: n coefficients of the plant's own past of a Box-Jenkins model.
+        terms: terms of a polynomial NARX model.
+        rmse: errors on the held-out rows, where a record was given for validation or rows set the state.
     """
 
     model: str
@@ -72,13 +163,18 @@ class Identification(msgspec.Struct, frozen=True):
     output: str
     rows: int
     recursive: bool
-    a: tuple[float, ...]
-    b: tuple[float, ...]
+    a: Coefficients
+    b: InputCoefficients
     offset: float
     sd: Deviations
     fit_percent: FitPercent
     whiteness_minus_log10_p: float
     checks: dict[str, str]
+    c: Coefficients | UnsetType = UNSET
+    d: Coefficients | UnsetType = UNSET
+    f: Coefficients | UnsetType = UNSET
+    terms: tuple[Term, ...] | UnsetType = UNSET
+    rmse: Rmse | UnsetType = UNSET
 
     @property
     def fit(self) -> FitPercent:
@@ -87,127 +183,91 @@ class Identification(msgspec.Struct, frozen=True):
 
 
 def identify(
-    time: ArrayLike,
-    inputs: ArrayLike,
-    outputs: ArrayLike,
-    *,
-    model: str = "arx",
-    order: int = 3,
-    delay: int = 1,
-    output: str = "y",
-    recursive: bool = False,
-    forgetting: float = 1.0,
-    choice: RowChoice = ALL_ROWS,
-    missing: Literal["refuse", "leave out"] = "refuse",
+    data: Dataset, form: ModelForm | None = None, validation: Dataset | None = None, settle: int = 0
 ) -> Identification:
-    """Fit a model to the first half of a record and validate it on the second.
+    """Fit a model to the first half of a data set and validate it on the second.
 
     Args:
-        time: shape (rows,), increasing, in any unit. Rows after a gap are not predicted from rows before it.
-        inputs: shape (rows,); the input of a row is held until the next one.
-        outputs: shape (rows,).
-        model: "arx" or "oe".
-        order: n, lags of output and input.
-        delay: samples from a move of the input to its first effect, at least 1.
-        output: name of the output, for the result.
-        recursive: learn row by row instead of from all rows at once.
-        forgetting: forgetting factor of the recursive methods, in (0, 1].
-        choice: rows of the first half that are fitted; `REPORT_ROWS` is the report's choice.
-        missing: treatment of NaN values.
+        data: the rows.
+        form: the kind of model; None: ARX of order 3.
+        validation: rows to validate on; then all rows of `data` are fitted. None: the second half.
+        settle: number of first held-out rows that may set the state of the simulation, and are left out of the fits.
 
     Raises:
-        InputError: anything that keeps the model from being found, with the cause: an unknown model, an order or delay
-            below 1, too few rows, missing values, a constant output, an input that does not excite the order.
+        InputError: anything that keeps the model from being found, with the cause: an order or delay below 1, too few
+            rows, a signal that does not move, inputs that do not excite the order.
     """
-    t, u, y = _check(time, inputs, outputs, missing)
-    if model not in MODELS:
-        raise InputError(f"model must be one of {', '.join(MODELS)}, got {model!r}")
-    structure = Structure.of_order(order, delay)
-    if recursive and model == "oe" and choice != ALL_ROWS:
-        raise InputError("a recursive output-error model runs through every row: it cannot choose rows")
-    half = len(y) // 2
-    if half <= structure.history + structure.parameters:
-        raise InputError(
-            f"order {order} with delay {delay} needs more than {structure.history + structure.parameters} rows in each "
-            f"half, got {len(y)} rows in all"
-        )
-    fitted, held_out = (u[:half], y[:half], t[:half]), (u[half:], y[half:], t[half:])
-    check_not_constant(y[:half])
-    checks = {check.name: check.result for check in check_record(structure, *fitted)}
+    form = form or ModelForm()
+    structure = Structure.of_order(form.order, form.delay, data.inputs.shape[1])
+    fitted, held_out = data.split(data.rows // 2) if validation is None else (data, validation)
+    _check_rows(structure, form, fitted, held_out, settle)
+    fitted.check_movement()
+    checks = {check.name: check.result for check in check_record(structure, *fitted.arrays)}
     try:
-        found = _fit(structure, model, fitted, recursive, forgetting, choice)
+        model = _fit(structure, form, fitted)
     except InputError as refusal:
         # Where the input is to blame, that is the cause to name.
         excitation = checks.get("excitation", "ok")
         raise refusal if excitation == "ok" else InputError(excitation) from refusal
-    residuals = found.residuals(*fitted)[:, 0]
-    white = whiteness(residuals, fitted=order if model == "arx" else 0) if _testable(residuals) else None
-    if white is not None:
-        free = independence(residuals, u[:half], delay, time=t[:half])
-        checks["whiteness"] = _verdict(white.minus_log10_p, "the residuals are correlated with each other")
-        checks["independence"] = _verdict(free.minus_log10_p, "the residuals are correlated with past inputs")
-    values, deviations = found.parameters[0], found.standard_deviations[0]
+    residuals = model.residuals(*fitted.arrays)[:, 0]
+    of_own_past = {"arx": form.order, "narx": form.order, "oe": 0}.get(form.model, 2 * form.order)
+    lags, white = max(DEFAULT_LAGS, of_own_past + 10), math.nan
+    if np.isfinite(residuals).sum() >= 5 * lags:
+        white = whiteness(residuals, lags, of_own_past).minus_log10_p
+        checks["whiteness"] = _verdict(white, "the residuals are correlated with each other")
+        if structure.inputs:
+            free = independence(residuals, fitted.inputs, form.delay, time=fitted.time)
+            checks["independence"] = _verdict(free.minus_log10_p, "the residuals are correlated with past inputs")
+    predicted, run = model.predict(*held_out.arrays)[:, 0], free_run(model, held_out, settle)
+    predicted[:settle] = np.nan
+    y = held_out.output[:, 0]
+    values, deviations = _coefficients(model, form, data)
     return Identification(
-        model,
-        order,
-        delay,
-        output,
-        half,
-        recursive,
-        _floats(values[:order]),
-        _floats(values[order:-1]),
-        float(values[-1]),
-        Deviations(_floats(deviations[:order]), _floats(deviations[order:-1]), float(deviations[-1])),
-        FitPercent(
-            fit_percent(y[half:, 0], found.predict(*held_out)[:, 0]),
-            fit_percent(y[half:, 0], found.simulate(*held_out)[:, 0]),
-        ),
-        math.nan if white is None else white.minus_log10_p,
-        checks,
+        model=form.model,
+        order=form.order,
+        delay=form.delay,
+        output=data.output_name,
+        rows=fitted.rows,
+        recursive=form.recursive,
+        sd=Deviations(**deviations),
+        fit_percent=FitPercent(fit_percent(y, predicted), fit_percent(y, run)),
+        whiteness_minus_log10_p=white,
+        checks=checks,
+        rmse=Rmse(_rmse(y, predicted), _rmse(y, run)) if validation is not None or settle else UNSET,
+        **values,
     )
 
 
-def _check(
-    time: ArrayLike, inputs: ArrayLike, outputs: ArrayLike, missing: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    t = as_columns(time, "time", 1)
-    u, y = as_columns(inputs, "inputs", 1), as_columns(outputs, "outputs", 1)
-    if not len(t) == len(u) == len(y):
-        raise InputError(f"time, inputs and outputs must have equally many rows, got {len(t)}, {len(u)} and {len(y)}")
-    for name, values in (("time", t), ("inputs", u), ("outputs", y)):
-        infinite = np.flatnonzero(np.isinf(values[:, 0]))
-        absent = np.flatnonzero(np.isnan(values[:, 0]))
-        if infinite.size:
-            raise InputError(f"{name} must be finite, got {values[infinite[0], 0]} in row {infinite[0] + 1}")
-        if absent.size and (missing == "refuse" or name == "time"):
-            cure = "" if name == "time" else ": fill it in, or leave such rows out"
-            raise InputError(f"{name} must have a value in every row, got NaN in row {absent[0] + 1}{cure}")
-    return t[:, 0], u, y
+def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out: Dataset, settle: int) -> None:
+    of_noise = {"armax": form.order, "bj": 2 * form.order}.get(form.model, 0)
+    least = structure.history + structure.parameters + of_noise
+    if fitted.rows <= least:
+        raise InputError(
+            f"order {form.order} with delay {form.delay} needs more than {least} rows to fit, the first half of the "
+            f"record unless another validates, got {fitted.rows}"
+        )
+    if settle < 0:
+        raise InputError(f"settle must be at least 0 rows, got {settle}")
+    first = max(settle, structure.history)
+    if held_out.rows <= first:
+        raise InputError(f"the held-out part needs more rows than the {first} that set the state, got {held_out.rows}")
 
 
-def _fit(
-    structure: Structure,
-    model: str,
-    record: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
-    recursive: bool,
-    forgetting: float,
-    choice: RowChoice,
-) -> LinearModel:
-    u, y, t = record
-    if not recursive:
-        fit = fit_arx if model == "arx" else fit_oe
-        return fit(structure, u, y, t, choice)
+def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
+    u, y, t = data.arrays
+    if not form.recursive:
+        return MODELS[form.model](structure, u, y, t, form.choice)
     scaling = Scaling.of(u, y)
-    if model == "oe":
-        running = RecursiveOutputError(structure, scaling, forgetting)
+    if form.model == "oe":
+        running = RecursiveOutputError(structure, scaling, form.forgetting)
         for k, unbroken_rows in enumerate(consecutive_rows(np.concatenate([u, y], axis=1), t)):
             if unbroken_rows <= 1:
                 running.restart()
             if unbroken_rows:
                 running.update(u[k], float(y[k, 0]))
         return running.model
-    rows = rows_of(structure, scaling.inputs(u), scaling.outputs(y), t, choice)
-    estimator = RecursiveLeastSquares(structure.parameters, forgetting)
+    rows = rows_of(structure, scaling.inputs(u), scaling.outputs(y), t, form.choice)
+    estimator = RecursiveLeastSquares(structure.parameters, form.forgetting)
     for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
         estimator.update(regressor, value)
     if not estimator.condition < SINGULAR_CONDITION:
@@ -215,9 +275,52 @@ def _fit(
     return model_of(structure, scaling, estimator, simulates=False)
 
 
-def _testable(residuals: NDArray[np.float64]) -> bool:
-    """True if there are enough residuals for tests with 20 lags."""
-    return int(np.isfinite(residuals).sum()) >= 100
+def _coefficients(model: FittedModel, form: ModelForm, data: Dataset) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Parameters and their standard deviations by the names of the result."""
+    if isinstance(model, PolynomialModel):
+        products, values, deviations = model.expand()
+        names = (name_product(product, model.structure, data.input_names, data.output_name) for product in products)
+        terms = tuple(Term(*term) for term in zip(names, _floats(values), _floats(deviations), strict=True))
+        none: dict[str, Any] = {
+            "a": (),
+            "b": dict.fromkeys(data.input_names, ()) if len(data.input_names) > 1 else (),
+        }
+        return none | {"offset": terms[0].value, "terms": terms[1:]}, none | {"offset": terms[0].sd}
+    if isinstance(model, LinearModel):
+        parts = model.parameters[0], model.standard_deviations[0]
+    else:
+        parts = model.parameters, model.standard_deviations
+    named, deviations_named = (_name(model, form, data.input_names, part) for part in parts)
+    return named, deviations_named
+
+
+def _name(
+    model: LinearModel | PredictionErrorModel, form: ModelForm, inputs: tuple[str, ...], values: Array
+) -> dict[str, Any]:
+    """Parameters by the names of the result."""
+    order, count, plant = form.order, len(inputs), model.structure.parameters
+    by_input = {name: _floats(values[order + i : plant - 1 : count]) for i, name in enumerate(inputs)}
+    past = _floats(values[:order])
+    parts: dict[str, Any] = {
+        "a": past,
+        "b": by_input if count > 1 else next(iter(by_input.values()), ()),
+        "offset": float(values[plant - 1]),
+    }
+    if form.model == "armax":
+        parts["c"] = _floats(values[plant:])
+    if form.model == "bj":
+        parts |= {
+            "a": (),
+            "f": past,
+            "d": _floats(values[plant : plant + order]),
+            "c": _floats(values[plant + order :]),
+        }
+    return parts
+
+
+def _rmse(measured: Array, predicted: Array) -> float:
+    errors = (measured - predicted)[np.isfinite(measured) & ~np.isnan(predicted)]
+    return float(np.sqrt(np.mean(errors**2))) if errors.size else math.nan
 
 
 def _verdict(minus_log10_p: float, wrong: str) -> str:
@@ -226,5 +329,5 @@ def _verdict(minus_log10_p: float, wrong: str) -> str:
     return f"{wrong}, -log10 p = {minus_log10_p:.1f}: the model leaves something out, and its sd are too small"
 
 
-def _floats(values: Iterable[float]) -> tuple[float, ...]:
+def _floats(values: Iterable[float]) -> Coefficients:
     return tuple(float(value) for value in values)

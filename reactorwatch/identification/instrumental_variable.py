@@ -64,11 +64,20 @@ def stabilize(structure: Structure, parameters: NDArray[np.float64]) -> NDArray[
         parameters: shape (parameters,).
     """
     lags = structure.output_lags
-    poles = np.roots([1.0, *-parameters[:lags]])
+    inside = parameters.copy()
+    inside[:lags] = mirror_poles(parameters[:lags])
+    return inside
+
+
+def mirror_poles(a: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients of y[k] = a1 y[k-1] + ... with the poles on or outside the unit circle mirrored into it.
+
+    Args:
+        a: shape (lags,).
+    """
+    poles = np.roots([1.0, *-a])
     outside = np.abs(poles) >= 1.0
     if not np.any(outside):
-        return parameters
+        return a
     poles[outside] = 0.98 / np.conj(poles[outside])
-    inside = parameters.copy()
-    inside[:lags] = -np.real(np.poly(poles))[1:]
-    return inside
+    return np.asarray(-np.real(np.poly(poles))[1:])

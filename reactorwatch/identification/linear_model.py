@@ -70,6 +70,11 @@ class LinearModel:
         return int(self.parameters.size)
 
     @property
+    def dynamics(self) -> NDArray[np.float64]:
+        """Parameters of the recursion, shape (outputs, parameters)."""
+        return self.parameters
+
+    @property
     def standard_deviations(self) -> NDArray[np.float64]:
         """Standard deviations of the parameters, shape (outputs, parameters)."""
         return np.array([standard_deviations(covariance) for covariance in self.covariance])

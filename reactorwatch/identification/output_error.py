@@ -19,6 +19,7 @@ is s2 (G'G)^-1, which supposes white residuals: where the whiteness test fails i
 """
 
 import math
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,6 +41,16 @@ from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, 
 _ITERATIONS = 200
 _PRECISION = 1e-12  # a smaller relative gain of a step ends the descent
 _FILTERINGS = 10
+
+
+class Objective(Protocol):
+    """Errors of one record as a function of the parameters."""
+
+    def __call__(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Errors, shape (compared rows,), and the gradient of the prediction, shape (compared rows, parameters)."""
+
+    def admits(self, theta: NDArray[np.float64]) -> bool:
+        """True if the model of these parameters is stable."""
 
 
 class _Objective:
@@ -75,6 +86,10 @@ class _Objective:
         )
         return self.outputs[self.compared] - run[self.compared], gradient[self.compared]
 
+    def admits(self, theta: NDArray[np.float64]) -> bool:
+        """True if all poles are inside the unit circle."""
+        return bool(is_stable(np.ascontiguousarray(theta[: self.structure.output_lags])))
+
 
 def fit_oe(
     structure: Structure,
@@ -103,26 +118,27 @@ def fit_oe(
     check_not_constant(y)
     scaling = Scaling.of(u, y, centred=structure.offset)
     scaled_u, scaled_y = scaling.inputs(u), scaling.outputs(y)
-    theta, objective = _fit(structure, scaled_u, scaled_y, time, choice)
+    theta, objective = minimise_simulation_error(structure, scaled_u, scaled_y, time, choice)
     errors, gradient = objective(theta)
     # As for least squares: at the minimum the gradient takes the place of the regressors.
     linear = least_squares(gradient, errors)
-    return linear_model(
-        structure,
-        scaling,
-        LeastSquares(theta[None, :], linear.inverse, _variance(errors, theta.size), linear.condition),
-        errors.size,
-        simulates=True,
-    )
+    solution = LeastSquares(theta[None, :], linear.inverse, error_variance(errors, theta.size), linear.condition)
+    return linear_model(structure, scaling, solution, errors.size, simulates=True)
 
 
-def _fit(
+def minimise_simulation_error(
     structure: Structure,
     u: NDArray[np.float64],
     y: NDArray[np.float64],
-    time: ArrayLike | None,
-    choice: RowChoice,
+    time: ArrayLike | None = None,
+    choice: RowChoice = ALL_ROWS,
+    iterations: int = _ITERATIONS,
 ) -> tuple[NDArray[np.float64], _Objective]:
+    """Find the parameters with the smallest simulation error of scaled signals, shape (parameters,).
+
+    Returns:
+        The parameters, and the errors as a function of them.
+    """
     check_row_count(rows_of(structure, u, y, time, choice), len(y))
     plan = plan_run(structure, u, y, time)
     number = np.arange(len(y))
@@ -134,9 +150,13 @@ def _fit(
             f"got {int(compared.sum())} of {len(y)}"
         )
     objective = _Objective(structure, u, y, plan, compared)
-    best = min(
-        (descend(objective, start) for start in _starts(structure, u, y, plan, time, choice)), key=lambda r: r[1]
-    )
+    starts = _starts(structure, u, y, plan, time)
+    if structure.output_lags > 1 and structure.input_lags > 1:
+        lags = structure.output_lags - 1, structure.input_lags - 1
+        lower = Structure(*lags, structure.delay, structure.inputs, 1, structure.offset)
+        smaller, _ = minimise_simulation_error(lower, u, y, time, choice, iterations)
+        starts.append(pad_order(lower, smaller))
+    best = min((descend(objective, start, iterations) for start in starts), key=lambda r: r[1])
     return best[0], objective
 
 
@@ -146,31 +166,27 @@ def _starts(
     y: NDArray[np.float64],
     plan: RunPlan,
     time: ArrayLike | None,
-    choice: RowChoice,
 ) -> list[NDArray[np.float64]]:
     rows = rows_of(structure, u, y, time)
     arx = stabilize(structure, least_squares(rows.regressors, rows.outputs).parameters[0])
-    starts = [
+    return [
         arx,
         instrumental_variable(structure, u, y, plan, time),
         _steiglitz_mcbride(structure, u, y, time, arx),
     ]
-    if structure.output_lags > 1 and structure.input_lags > 1:
-        lower = Structure(
-            structure.output_lags - 1,
-            structure.input_lags - 1,
-            structure.delay,
-            structure.inputs,
-            1,
-            structure.offset,
-        )
-        smaller, _ = _fit(lower, u, y, time, choice)
-        lags = lower.output_lags
-        middle = lags + lower.input_lags * lower.inputs
-        starts.append(
-            np.concatenate([smaller[:lags], [0.0], smaller[lags:middle], np.zeros(lower.inputs), smaller[middle:]])
-        )
-    return starts
+
+
+def pad_order(structure: Structure, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Parameters of the same model with one lag more of output and inputs, which adds a pole at zero.
+
+    Args:
+        structure: structure of the model; one output.
+        parameters: shape (parameters,).
+    """
+    lags = structure.output_lags
+    middle = lags + structure.input_lags * structure.inputs
+    zeros = np.zeros(structure.inputs)
+    return np.concatenate([parameters[:lags], [0.0], parameters[lags:middle], zeros, parameters[middle:]])
 
 
 def _steiglitz_mcbride(
@@ -197,18 +213,19 @@ def _steiglitz_mcbride(
     return theta
 
 
-def descend(objective: _Objective, start: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Minimise by Marquardt's method from a start whose poles are inside the unit circle.
+def descend(
+    objective: Objective, start: NDArray[np.float64], iterations: int = _ITERATIONS
+) -> tuple[NDArray[np.float64], float]:
+    """Minimise by Marquardt's method from a start that the objective admits.
 
     Returns:
         The parameters and their sum of squares.
     """
-    lags = objective.structure.output_lags
     size = start.size
     theta, damping = start, 1e-3
     errors, gradient = objective(theta)
     squares = float(errors @ errors)
-    for _ in range(_ITERATIONS):
+    for _ in range(iterations):
         factor = _triangle(np.ascontiguousarray(np.concatenate([gradient, errors[:, None]], axis=1).T))[:size]
         scales = np.linalg.norm(factor[:, :size], axis=0)
         scales = np.where(scales > 0.0, scales, 1.0)
@@ -217,7 +234,7 @@ def descend(objective: _Objective, start: NDArray[np.float64]) -> tuple[NDArray[
             stacked = np.concatenate([factor[:, :size] / scales, math.sqrt(damping) * np.eye(size)])
             step = np.linalg.lstsq(stacked, np.concatenate([factor[:, size], np.zeros(size)]))[0] / scales
             candidate = theta + step
-            if is_stable(np.ascontiguousarray(candidate[:lags])):
+            if objective.admits(candidate):
                 new_errors, new_gradient = objective(candidate)
                 new_squares = float(new_errors @ new_errors)
                 if new_squares <= squares:
@@ -231,7 +248,8 @@ def descend(objective: _Objective, start: NDArray[np.float64]) -> tuple[NDArray[
     return theta, squares
 
 
-def _variance(errors: NDArray[np.float64], parameters: int) -> NDArray[np.float64]:
+def error_variance(errors: NDArray[np.float64], parameters: int) -> NDArray[np.float64]:
+    """Variance of the errors, shape (1,); inf for as many rows as parameters."""
     free = errors.size - parameters
     return np.array([float(errors @ errors) / free if free > 0 else math.inf])
 

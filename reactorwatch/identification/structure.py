@@ -16,7 +16,8 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
         y[k] = a1 y[k-1] + ... + a_na y[k-na] + b1 u[k-d] + ... + b_nb u[k-d-nb+1] + c.
 
-    With several outputs y[k-i] is their vector, and a_i has one value for each; the same holds for inputs.
+    With several outputs y[k-i] is their vector, and a_i has one value for each; the same holds for inputs. A model
+    without inputs has no b.
 
     Attributes:
         output_lags: na, number of past outputs.
@@ -28,7 +29,7 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         offset: whether there is a term c.
 
     Raises:
-        InputError: an order or the delay below 1, or no input or output.
+        InputError: an order or the delay below 1, or no output.
     """
 
     output_lags: int
@@ -39,10 +40,10 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offset: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("output_lags", "input_lags", "delay", "inputs", "outputs"):
-            value = getattr(self, name)
-            if value < 1:
-                raise InputError(f"{_TITLES[name]} must be at least 1, got {value}")
+        for name, title in _TITLES.items():
+            value, least = getattr(self, name), 0 if name == "inputs" else 1
+            if value < least:
+                raise InputError(f"{title} must be at least {least}, got {value}")
 
     @classmethod
     def of_order(cls, order: int, delay: int = 1, inputs: int = 1, outputs: int = 1, offset: bool = True) -> Self:
@@ -63,7 +64,7 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def history(self) -> int:
         """Number of rows before row k that its equation needs."""
-        return max(self.output_lags, self.delay + self.input_lags - 1)
+        return max(self.output_lags, self.delay + self.input_lags - 1 if self.inputs else 0)
 
     def parameter_names(self) -> tuple[str, ...]:
         """Names of one equation's parameters, in order; signals are numbered only where there are several.

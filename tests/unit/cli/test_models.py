@@ -11,8 +11,11 @@ from plant_node.record import simulate_record
 from reactorwatch.cli import identification
 from reactorwatch.cli.linear_models import describe
 from reactorwatch.errors import InputError
+from reactorwatch.identification.identify import ModelForm
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import Record
+
+TWO = ModelForm(order=2)
 
 
 @pytest.fixture(scope="module")
@@ -21,9 +24,10 @@ def measured() -> Record:
 
 
 def identified(measured: Record, **options: object) -> dict[str, object]:
-    settings: dict[str, object] = {"output": "T", "model": "arx", "order": 3, "delay": 1}
-    settings |= {"recursive": False, "report_rows": False, "as_json": True} | options
-    said: dict[str, object] = json.loads(identification.fit(measured, **settings))  # type: ignore[arg-type]
+    form = ModelForm(**options)  # type: ignore[arg-type]
+    said: dict[str, object] = json.loads(
+        identification.fit(measured, ("qc",), ("T",), form, identification.Validation(), as_json=True)
+    )
     return said
 
 
@@ -65,9 +69,9 @@ def test_row_by_row_gives_what_all_rows_at_once_give(measured: Record) -> None:
 
 
 def test_compare_says_which_and_why(measured: Record) -> None:
-    text = identification.compare(measured, "C", 2, 1, neural=False, as_json=False)
+    text = identification.compare(measured, ("qc",), ("C",), TWO, neural=False, as_json=False)
     assert text.splitlines()[-1].endswith(".")
-    said = json.loads(identification.compare(measured, "C", 2, 1, neural=False, as_json=True))
+    said = json.loads(identification.compare(measured, ("qc",), ("C",), TWO, neural=False, as_json=True))
     assert {(item["family"], item["order"]) for item in said["candidates"]} == {
         ("arx", 1), ("arx", 2), ("oe", 1), ("oe", 2),
     }  # fmt: skip
@@ -78,10 +82,9 @@ def test_compare_says_which_and_why(measured: Record) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"output": "pH"}, "--output must be C or T, got 'pH'"),
         ({"order": 0}, "order must be at least 1, got 0"),
         ({"delay": -1}, r"delay \(samples\) must be at least 1, got -1"),
-        ({"model": "armax"}, "model must be one of arx, oe, got 'armax'"),
+        ({"model": "fir"}, "unknown model 'fir'"),
         ({"order": 500}, "rows"),
     ],
 )

@@ -17,6 +17,7 @@ from reactorwatch.cli.reports import backtest_object, backtest_text
 from reactorwatch.cli.simulation import report, simulate_along
 from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
+from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record, join_runs
 from recorder.tools.player import samples_of
@@ -54,7 +55,7 @@ def test_a_run_of_one_row_is_simulated_as_that_row(whole: Record) -> None:
     assert np.array_equal(simulated.columns["T"][:500], whole_run.columns["T"][:500])
 
 
-@pytest.mark.parametrize("model", ["arx", "oe"])
+@pytest.mark.parametrize("model", ["arx", "oe", "armax"])
 @pytest.mark.parametrize("row", [400])
 def test_no_row_is_identified_from_rows_of_another_run(whole: Record, model: str, row: int) -> None:
     """However far the clock is set back, the model is the one of the same rows after a gap."""
@@ -62,8 +63,8 @@ def test_no_row_is_identified_from_rows_of_another_run(whole: Record, model: str
     def identified(back_min: float) -> object:
         runs = 1 + (np.arange(ROWS) >= row)
         record = replace(whole, time_min=whole.time_min - back_min * (runs - 1), runs=runs)
-        settings = {"order": 2, "delay": 1, "recursive": False, "report_rows": False, "as_json": True}
-        return json.loads(identification.fit(record, "T", model, **settings))  # type: ignore[arg-type]
+        form = ModelForm(model, order=2)
+        return json.loads(identification.fit(record, ("qc",), ("T",), form, identification.Validation(), as_json=True))
 
     after_a_gap = identified(-50.0)
     assert identified(60.0) == after_a_gap

@@ -15,6 +15,7 @@ from plant_node.record import simulate_record
 from reactorwatch.cli import identification
 from reactorwatch.cli.backtest_jobs import _units
 from reactorwatch.cli.read_record import open_messages
+from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process import MODELS
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv
@@ -97,11 +98,12 @@ def test_units_go_into_recordings_and_drawings_and_back(rig: Path, tmp_path: Pat
 
 def test_identification_speaks_of_the_unit_that_is_known(rig: Path) -> None:
     measured = read_csv(rig, COLUMNS)
-    settings = {"order": 2, "delay": 1, "recursive": False, "report_rows": False, "as_json": False}
-    assert "C (degC) from" in identification.fit(measured, "C", "arx", **settings)  # type: ignore[arg-type]
-    assert "T (unit not known) from" in identification.fit(measured, "T", "arx", **settings)  # type: ignore[arg-type]
+    settings = (ModelForm(order=2), identification.Validation())
+    text = identification.fit(measured, ("qc",), ("C", "T"), *settings, as_json=False)
+    assert "C (degC) from" in text
+    assert "T (unit not known) from" in text
     own = replace(measured, units=UNITS)
-    assert "T (K) from" in identification.fit(own, "T", "arx", **settings)  # type: ignore[arg-type]
+    assert "T (K) from" in identification.fit(own, ("qc",), ("T",), *settings, as_json=False)
 
 
 @given(

@@ -8,15 +8,15 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import fit_arx
-from reactorwatch.identification.identify import Identification, identify
+from reactorwatch.identification.identify import Identification
 from reactorwatch.identification.linear_model import fit_percent
 from reactorwatch.identification.structure import RowChoice, Structure
-from tests.unit.identification.truth import Daisy, NoisyPlant
+from tests.unit.identification.truth import Daisy, NoisyPlant, identify
 
 
 def test_it_tells_the_parameters_and_fits_of_the_daisy_record(daisy: Daisy) -> None:
     """Every number against LAPACK and the recursion written out, from the unscaled columns."""
-    told = identify(daisy.time, daisy.qc, daisy.T, order=3, output="T")
+    told = identify(daisy.time, daisy.qc, daisy.T, order=3, name="T")
     half, u, y = 3750, daisy.qc, daisy.T
     k = np.arange(3, half)
     columns = [y[k - 1], y[k - 2], y[k - 3], u[k - 1], u[k - 2], u[k - 3], np.ones(k.size)]
@@ -35,7 +35,7 @@ def test_it_tells_the_parameters_and_fits_of_the_daisy_record(daisy: Daisy) -> N
 
 
 def test_its_json_has_the_promised_names(daisy: Daisy) -> None:
-    told = msgspec.json.decode(msgspec.json.encode(identify(daisy.time, daisy.qc, daisy.C, order=2, output="C")))
+    told = msgspec.json.decode(msgspec.json.encode(identify(daisy.time, daisy.qc, daisy.C, order=2, name="C")))
     promised = ["model", "order", "delay", "output", "rows", "recursive", "a", "b", "offset", "sd", "fit_percent"]
     assert list(told)[: len(promised)] == promised
     assert {"whiteness_minus_log10_p", "checks"} <= set(told)
@@ -101,14 +101,20 @@ def test_a_record_that_determines_nothing_is_refused_with_the_cause(noisy_plant:
 
     holed, infinite = u.copy(), y.copy()
     holed[3], infinite[7] = math.nan, math.inf
-    assert_refused("model must be one of arx, oe, got 'fir'", model="fir")
+    assert_refused(r"unknown model 'fir' \(valid: arx, oe, armax, bj, narx\)", model="fir")
     assert_refused("order must be at least 1, got 0", order=0)
     assert_refused(r"delay \(samples\) must be at least 1, got -1", delay=-1)
-    assert_refused("order 3 with delay 1 needs more than 10 rows in each half, got 12", time[:12], u[:12], y[:12])
+    assert_refused(
+        "order 3 with delay 1 needs more than 10 rows to fit, the first half of .*, got 6", time[:12], u[:12], y[:12]
+    )
     assert_refused("inputs must have a value in every row, got NaN in row 4", inputs=holed)
     assert_refused("outputs must be finite, got inf in row 8", outputs=infinite)
-    assert_refused("output 1 is constant, 441 in all rows", outputs=np.full(200, 441.0))
-    assert_refused("a constant input excites none", inputs=np.full(200, 98.0), outputs=np.cumsum(y))
+    assert_refused("output y is constant, 441 in all rows", outputs=np.full(200, 441.0))
+    assert_refused(
+        "input u never moves, 98 in all rows to fit: a constant input excites none",
+        inputs=np.full(200, 98.0),
+        outputs=np.cumsum(y),
+    )
     assert_refused("equally many rows, got 199, 200 and 200", time[:199])
     assert_refused("time must increase", np.zeros(200))
     assert_refused(r"forgetting must be in \(0, 1\], got 2", recursive=True, forgetting=2.0)

@@ -13,7 +13,7 @@ from reactorwatch.identification.structure import REPORT_ROWS, RowChoice, Scalin
         ((0, 1, 1, 1), r"order \(lags of the output\) must be at least 1, got 0"),
         ((1, 0, 1, 1), r"order \(lags of the input\) must be at least 1, got 0"),
         ((1, 1, -2, 1), r"delay \(samples\) must be at least 1, got -2"),
-        ((1, 1, 1, 0), "number of inputs must be at least 1, got 0"),
+        ((1, 1, 1, -1), "number of inputs must be at least 0, got -1"),
     ],
 )
 def test_a_structure_that_cannot_be_is_named(arguments: tuple[int, int, int, int], message: str) -> None:

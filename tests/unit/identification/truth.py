@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from reactorwatch.identification import identify as identification
+from reactorwatch.identification.dataset import Dataset
 
 Array = NDArray[np.float64]
 
@@ -66,3 +70,16 @@ def oscillating_plant(rows: int = 4000, noise_sd: float = 1.0, seed: int = 0) ->
     for k in range(2, rows):
         clean[k] = a1 * clean[k - 1] + a2 * clean[k - 2] + b1 * inputs[k - 1] + b2 * inputs[k - 2] + c
     return NoisyPlant(parameters, inputs, clean, clean + noise_sd * rng.standard_normal(rows), noise_sd)
+
+
+def identify(
+    time: ArrayLike,
+    inputs: ArrayLike,
+    output: ArrayLike,
+    name: str = "y",
+    missing: Literal["refuse", "leave out"] = "refuse",
+    **form: Any,
+) -> identification.Identification:
+    """Identify a model of arrays."""
+    data = Dataset.of(time, inputs, output, output_name=name, missing=missing)
+    return identification.identify(data, identification.ModelForm(**form))
