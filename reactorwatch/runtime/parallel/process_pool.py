@@ -57,7 +57,7 @@ class ProcessExecutor:
         self._processes = processes
         self._retries = retries
         self._running: dict[Connection[Any, Any], _Worker] = {}
-        self._is_closed = False
+        self._closed = threading.Event()
 
     def close(self) -> None:
         """End the running processes and start no others, from any thread; the iterator of `map_unordered` then ends.
@@ -65,7 +65,7 @@ class ProcessExecutor:
         A program that ends while a thread of it iterates would otherwise wait for the job: the thread takes the end of
         the process for a death, and starts another one.
         """
-        self._is_closed = True
+        self._closed.set()
         for worker in list(self._running.values()):
             with suppress(ValueError):  # it has just ended by itself
                 worker.process.terminate()
@@ -84,19 +84,19 @@ class ProcessExecutor:
                 worker.pipe.send(jobs[worker.number])
 
         try:
-            while (queue or running) and not self._is_closed:
+            while (queue or running) and not self._closed.is_set():
                 while queue and len(running) < self._processes:
                     worker = _start(work)
                     running[worker.pipe] = worker
                     assign(worker)
-                if self._is_closed:  # while one was started
+                if self._closed.is_set():  # while one was started
                     return
                 for pipe in wait(list(running)):
                     worker = running[cast("Connection[Any, Any]", pipe)]
                     try:
                         outcome = worker.pipe.recv()
                     except (EOFError, OSError):
-                        if self._is_closed:
+                        if self._closed.is_set():
                             return
                         del running[worker.pipe]
                         _end(worker)
