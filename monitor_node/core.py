@@ -47,6 +47,7 @@ class Monitor:
         rejects: rejected messages.
         failures: contained errors of this software.
         alarms: alarms of the plant.
+        pipeline: pipeline of the plant's rows.
         first_ns: time of the first row; None before it.
         last_ns: time of the last row; None before the first.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
@@ -69,7 +70,7 @@ class Monitor:
         self._runs = [SequenceCheck() for _ in self._signals]
         self._replay_filter: ReplayFilter | None = None
         self.alarms = Annunciator(config)
-        self._pipeline = self._new_pipeline(self.alarms)
+        self.pipeline = self._new_pipeline(self.alarms)
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -142,7 +143,7 @@ class Monitor:
                 self._accept(signal, *item, publications)
         if is_accepted and now_ns >= self._heard_ns + HEARD_AGAIN_NS:
             self._heard_ns = now_ns
-            self._pipeline.signals.on_receipt(now_ns)
+            self.pipeline.signals.on_receipt(now_ns)
         self._published += len(publications)
         return publications
 
@@ -193,7 +194,7 @@ class Monitor:
         return self._due_ns()
 
     def _due_ns(self) -> int:
-        overdue_ns = self._pipeline.signals.due_ns()
+        overdue_ns = self.pipeline.signals.due_ns()
         return self._health_due_ns if overdue_ns is None else min(self._health_due_ns, overdue_ns)
 
     @property
@@ -234,7 +235,7 @@ class Monitor:
             self._runs,
             self._aligner.state,
             self.alarms.to_bytes(),
-            self._pipeline.state,
+            self.pipeline.state,
             self._units,
             self._heard_from_ns,
             self.first_ns,
@@ -260,7 +261,7 @@ class Monitor:
             pipeline.restore(state.watch, self._start_ns)
         except ValueError as error:
             raise InputError(f"is no state of this software's monitor: {error}") from error
-        self.alarms, self._pipeline = board, pipeline
+        self.alarms, self.pipeline = board, pipeline
         self._runs = state.runs
         self._aligner.state, self._replay_filter = state.alignment, ReplayFilter(state.alignment)
         self._units, self._heard_from_ns = state.units, state.heard_from_ns
@@ -273,7 +274,7 @@ class Monitor:
 
     def _learning_settings(self) -> dict[str, Any]:
         if self._settings is None:
-            self._settings = learning_settings(self.config, self._pipeline.model, points=self._points)
+            self._settings = learning_settings(self.config, self.pipeline.model, points=self._points)
         return self._settings
 
     def count_duplicate(self) -> None:
@@ -297,7 +298,7 @@ class Monitor:
             InputError: see `Annunciator.from_bytes`; nothing has changed.
         """
         self.alarms.from_bytes(data)
-        self._pipeline.signals.resume_from_alarms()
+        self.pipeline.resume_from_alarms()
 
     def resume_from_alarms(self, alarms: Iterable[Alarm]) -> None:
         """Resume from the alarms that another monitor of the plant published last, without its state.
@@ -308,12 +309,12 @@ class Monitor:
             alarms: the newest message of each alarm.
         """
         self.alarms.resume_from(alarms)
-        self._pipeline.signals.resume_from_alarms()
+        self.pipeline.resume_from_alarms()
 
     @property
     def receive_stats(self) -> ReceiveStats:
         """Statistics by receive time, which a restart resets."""
-        received_ns, counted_ns = self._pipeline.signals.receipts_ns
+        received_ns, counted_ns = self.pipeline.signals.receipts_ns
         return ReceiveStats(
             self._start_ns,
             self._heard_ns,
@@ -333,7 +334,7 @@ class Monitor:
             receive_stats.heard_ns,
             receive_stats.lag_ns,
         )
-        self._pipeline.signals.receipts_ns = receive_stats.received_ns, receive_stats.counted_ns
+        self.pipeline.signals.receipts_ns = receive_stats.received_ns, receive_stats.counted_ns
         self._health_due_ns, self._ticked = receive_stats.health_due_ns, receive_stats.ticked
         self._stalls, self.not_stored = receive_stats.stalls, receive_stats.not_stored
 
@@ -349,17 +350,17 @@ class Monitor:
     @property
     def model(self) -> ProcessModel | None:
         """Process model of the plant; None if there is none."""
-        return self._pipeline.model
+        return self.pipeline.model
 
     @property
     def reference(self) -> str:
         """Kind of the reference: `equations` or `arx`; empty before there is one."""
-        return self._pipeline.reference
+        return self.pipeline.reference
 
     @property
     def noise_levels(self) -> dict[str, dict[str, float]] | None:
         """Noise levels of the equations by sensor and by state; None with another reference."""
-        return self._pipeline.noise_levels
+        return self.pipeline.noise_levels
 
     @property
     def rows(self) -> int:
@@ -379,23 +380,23 @@ class Monitor:
     @property
     def expected_false_alarms(self) -> float:
         """Mean number of false alarms expected so far."""
-        return self._pipeline.expected_false_alarms
+        return self.pipeline.expected_false_alarms
 
     @property
     def left_out(self) -> dict[str, str]:
         """Signals that are not monitored, with the reason: no value came, or the training could not use them."""
         never_came = (signal for signal in self._signals if signal not in self._heard_from_ns)
-        return dict.fromkeys(never_came, NO_VALUE) | self._pipeline.left_out
+        return dict.fromkeys(never_came, NO_VALUE) | self.pipeline.left_out
 
     @property
     def refused_trainings(self) -> int:
         """Number of refused trainings."""
-        return self._pipeline.refused_trainings
+        return self.pipeline.refused_trainings
 
     @property
     def notes(self) -> list[str]:
         """Notes to log; the caller empties the list."""
-        notes, failures = self._pipeline.notes, self.failures.notes
+        notes, failures = self.pipeline.notes, self.failures.notes
         notes += failures
         failures.clear()
         return notes
@@ -405,11 +406,11 @@ class Monitor:
     @property
     def timeout_deadline_ns(self) -> int | None:
         """Sample time at which the plant's data timeout expires; None if unknown."""
-        return self._pipeline.signals.deadline_ns
+        return self.pipeline.signals.deadline_ns
 
     def declare_timeout(self) -> list[Publication]:
         """Declare a data timeout that was recorded, where the receive time expired it."""
-        return self._pipeline.signals.declare_timeout()
+        return self.pipeline.signals.declare_timeout()
 
     # --- rows ------------------------------------------------------------------------------------------------
 
@@ -439,11 +440,11 @@ class Monitor:
             self.span_ns += time_ns - self.last_ns
         self.last_ns = time_ns
         try:
-            self._pipeline.update(row, self._output_units, publications)
+            self.pipeline.update(row, self._output_units, publications)
             publications.extend(self.alarms.end_row(time_ns))
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
             self._contain("row", error)
-        if self._watching_since_ns is None and self._pipeline.watching:
+        if self._watching_since_ns is None and self.pipeline.watching:
             self._watching_since_ns = time_ns
         if due_ns is None or not 0 <= due_ns - time_ns <= self._snapshot_ns:
             self._snapshot_due_ns = time_ns + self._snapshot_ns
@@ -452,14 +453,14 @@ class Monitor:
 
     def _snapshots(self, time_ns: int) -> list[Publication]:
         try:
-            return self._pipeline.snapshots(time_ns)
+            return self.pipeline.snapshots(time_ns)
         except Exception as error:  # noqa: BLE001 # the plant's border, see `_on_row`
             self._contain("models", error)
             return []
 
     def _check_timeout(self, now_ns: int) -> list[Publication]:
         try:
-            return self._pipeline.signals.check(now_ns)
+            return self.pipeline.signals.check(now_ns)
         except Exception as error:  # noqa: BLE001 # the plant's border, see `_on_row`
             self._contain("silence", error)
             return []
@@ -476,9 +477,9 @@ class Monitor:
         """
         self.failures.add(stage, error, "the plant is learned again, its alarms stay")
         alarms = self.alarms.all_alarms()
-        notes, receipts_ns = self._pipeline.notes, self._pipeline.signals.receipts_ns
-        self._pipeline = self._new_pipeline(self.alarms)
-        self._pipeline.notes, self._pipeline.signals.receipts_ns = notes, receipts_ns
+        notes, receipts_ns = self.pipeline.notes, self.pipeline.signals.receipts_ns
+        self.pipeline = self._new_pipeline(self.alarms)
+        self.pipeline.notes, self.pipeline.signals.receipts_ns = notes, receipts_ns
         self._watching_since_ns = None
         self.resume_from_alarms(alarms)
 
@@ -496,8 +497,8 @@ class Monitor:
             not_stored=self.not_stored,
             stalls=self._stalls,
             failures=self.failures.by_stage,
-            reference=self._pipeline.reference,
-            training=self._pipeline.trained_share(self.last_ns),
+            reference=self.pipeline.reference,
+            training=self.pipeline.trained_share(self.last_ns),
         )
         self._lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

@@ -94,8 +94,10 @@ class DriftWatch:
             time_ns: of the row.
             predictors: as at the start.
         """
+        if not self.wanted:
+            return []
         self.until_next -= 1
-        if self.until_next or not self.wanted:
+        if self.until_next:
             return []
         self.until_next = ROWS
         publications: list[Publication] = []

@@ -9,6 +9,8 @@ the reference is charted as drift.
 from collections.abc import Iterator, Sequence
 from math import isfinite, nan
 
+import numpy as np
+
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.predictor import ArxPredictor
 from monitor_node.baseline.references import (
@@ -27,6 +29,7 @@ from monitor_node.failures import Failures
 from monitor_node.ingest.alignment import Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.isolation.stage import Suspicion, has_causes
+from monitor_node.row_step import CHARTS, EVENT, VIOLATING, RowNumbers, RowStep
 from monitor_node.signal_checks.stage import SignalChecks
 from monitor_node.state.pipeline_state import PipelineState, TrainedState
 from reactorwatch.contract import keys
@@ -38,7 +41,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
+from reactorwatch.spc.prewhitening import WHITENER, Prewhitener, Prewhitening
 
 
 def check_promise(config: MonitorConfig, period_min: float) -> None:
@@ -74,6 +77,7 @@ class PlantPipeline:
         model: process model of the plant; None if there is none.
         notes: notes to log, oldest first; the caller empties the list.
         rows_watched: number of evaluated rows.
+        is_normal: True if the compiled step may take the next row, see `row_step`.
         left_out: signals that are not monitored, with the reason, after the training.
         signals: signal checks.
     """
@@ -103,6 +107,10 @@ class PlantPipeline:
         self._checks: list[Check] = []
         self._reference: Reference | None = None
         self._whiteners: list[Prewhitener] = []
+        self._whitener_numbers = np.zeros(len(config.outputs), WHITENER)
+        self._step: RowStep | None = None
+        self._numbers: RowNumbers | None = None
+        self._row = np.empty(1 + len(config.outputs))
         self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
@@ -112,6 +120,7 @@ class PlantPipeline:
         self._promise_checked = False
         self.notes: list[str] = []
         self.rows_watched = 0
+        self.is_normal = False
         self.left_out: dict[str, str] = {}
 
     # --- state -----------------------------------------------------------------------------------------------
@@ -170,7 +179,9 @@ class PlantPipeline:
             raise ValueError(f"the state must be of {outputs} outputs, got {len(learned)}")
         self._leave_out(watched.left_out)
         self._set_reference(self._restore_reference(watched.reference), learned, watched.arl0)
-        self._whiteners = [Prewhitener.from_state(item) for item in watched.whiteners]
+        self._whiteners = [
+            Prewhitener.from_state(item, self._whitener_numbers[i : i + 1]) for i, item in enumerate(watched.whiteners)
+        ]
         self._charts.restore(watched.charts, self._evaluated)
         if (watched.suspicion is None) != (self._suspicion is None):
             raise ValueError("the state must tell of the search for causes as it is set")
@@ -184,6 +195,11 @@ class PlantPipeline:
         if self.model is None:
             raise ValueError("the state must be of a plant without a process model")
         return ProcessReference.from_state(state, self.model, self._config.outputs)
+
+    def resume_from_alarms(self) -> None:
+        """Follow alarms that were set from outside."""
+        self.is_normal = False
+        self.signals.resume_from_alarms()
 
     @property
     def watching(self) -> bool:
@@ -228,6 +244,8 @@ class PlantPipeline:
         """
         time_ns = row.time_ns
         follows = self._sampling.follows(time_ns) and not row.restarted
+        if self.is_normal and not row.restarted and self._step_row(row, units, publications, follows=follows):
+            return
         publications.extend(self.signals.check_row(time_ns, row.values))
         measured = self.signals.mask_values(time_ns, row.values, publications) if self._is_process else row.values
         input_value, *values = measured
@@ -237,6 +255,7 @@ class PlantPipeline:
             if row.restarted:
                 self.signals.reset()
             self._evaluate(time_ns, input_value, values, units, publications, follows=follows)
+            self.is_normal = self._find_normal(time_ns)
 
     def snapshots(self, time_ns: int) -> list[Publication]:
         """Snapshots of each output's models: the adaptive one, the one fitted to the training, and the reference.
@@ -343,7 +362,9 @@ class PlantPipeline:
         arl0 = false_alarm_budget.share_arl0(promised, self._chance_alarms, period_min)
         self._checks = trained.checks
         self._set_reference(trained.reference, trained.learned, arl0)
-        self._whiteners = [Prewhitener(item) for item in trained.learned]
+        self._whiteners = [
+            Prewhitener(item, self._whitener_numbers[i : i + 1]) for i, item in enumerate(trained.learned)
+        ]
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
@@ -356,6 +377,11 @@ class PlantPipeline:
         self._is_process = self._is_process_given or isinstance(reference, ProcessReference)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
+        self._step, self._numbers = RowStep.of(self._config, self._reference_model), None
+
+    @property
+    def _reference_model(self) -> ProcessModel | None:
+        return self._reference.model if isinstance(self._reference, ProcessReference) else None
 
     def _new_suspicion(self, reference: Reference) -> Suspicion | None:
         if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.model)):
@@ -375,7 +401,92 @@ class PlantPipeline:
             self._suspicion = self._new_suspicion(self._reference)
             return []
 
-    # --- monitoring ------------------------------------------------------------------------------------------
+    # --- ordinary rows ----------------------------------------------------------------------------------------
+
+    @property
+    def numbers(self) -> RowNumbers:
+        """Numbers of all stages, as views of their own arrays; of a plant in its normal state."""
+        if self._numbers is None:
+            assert self._step is not None
+            assert isinstance(self._reference, ProcessReference)
+            empty = self._step.shape(1, np.zeros)
+            timeouts, stuck, limits = self.signals.numbers
+            belief, variances = self._reference.numbers
+            charts = [self._charts.numbers(name) for name in CHARTS]
+            shewhart, ewma, cusum, mewma = (
+                numbers[None] if numbers is not None else none
+                for numbers, none in zip(charts, (empty.shewhart, empty.ewma, empty.cusum, empty.mewma), strict=True)
+            )
+            self._numbers = RowNumbers(
+                timing=empty.timing,
+                timeouts=timeouts[None],
+                belief=belief[None],
+                variances=variances[None],
+                whiteners=self._whitener_numbers[None],
+                stuck=stuck[None],
+                spike_limits=limits[None],
+                shewhart=shewhart,
+                ewma=ewma,
+                cusum=cusum,
+                mewma=mewma,
+                delays=self._charts.delays[None],
+            )
+        return self._numbers
+
+    def _find_normal(self, time_ns: int) -> bool:
+        """True if the compiled step may take the row after this one; it then finds its numbers."""
+        reference, sampling, time_min = self._reference, self._sampling.state, time_ns / MINUTE_NS
+        if self._step is None or not isinstance(reference, ProcessReference) or not self._charts.is_normal:
+            return False
+        if self.left_out or True in self._quarantined or sampling.period_ns is None or sampling.spacing_ns is None:
+            return False
+        if not (self.signals.is_normal and reference.is_normal(time_min)):
+            return False
+        numbers = self.numbers
+        if numbers.timeouts["last_ns"][0, 0] != time_ns or not all(item.is_ready for item in self._whiteners):
+            return False
+        numbers.timing[0] = (time_ns, sampling.period_ns, time_min, reference.last_input)
+        self._charts.load_delays()
+        return True
+
+    def _step_row(self, row: Row, units: list[str], publications: list[Publication], *, follows: bool) -> bool:
+        """Process a row by the compiled step; returns False if it is an event, for which nothing has changed."""
+        assert self._step is not None
+        assert isinstance(self._reference, ProcessReference)
+        time_ns, values = row.time_ns, row.values
+        time_min = time_ns / MINUTE_NS
+        self._row[:] = values
+        verdict = self._step.update(self.numbers, time_ns, time_min, self._row)
+        if verdict == EVENT:
+            self.is_normal = False
+            return False
+        if verdict == VIOLATING:
+            self._charts.store_delays()
+        self._reference.accept_row(time_min, values[0])
+        self.rows_watched += 1
+        if self._points:
+            self._publish_step(time_ns, list(values[1:]), units, publications)
+        if self._drift.wanted:
+            for predictor, value in zip(self._predictors, values[1:], strict=True):
+                predictor.buffer(time_ns, values[0], value, follows=follows)
+            publications.extend(self._drift.update(time_ns, self._predictors))
+        if self._suspicion is not None:
+            self._suspicion.add(time_min, values[0], list(values[1:]))
+        return True
+
+    def _publish_step(
+        self, time_ns: int, values: list[float], units: list[str], publications: list[Publication]
+    ) -> None:
+        assert self._step is not None
+        outcome, count = self._step.outcome, len(values)
+        outputs = outcome.outputs.tolist()
+        predictions, sds = outputs[:count], outputs[2 * count : 3 * count]
+        scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
+        expected = outcome.expected.tolist()
+        publications.extend(self._estimates(time_ns, values, predictions, sds, scales, expected, units))
+        publications.extend(self._charts.points(time_ns, outcome.points))
+
+    # --- events -----------------------------------------------------------------------------------------------
 
     def _evaluate(
         self,
@@ -414,7 +525,8 @@ class PlantPipeline:
         predictions, sds = reference.update(time_ns, input_value, values, self._quarantined, missing)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
-            publications.extend(self._estimates(time_ns, values, predictions, sds, scales, units))
+            expected = [whitener.expected() for whitener in self._whiteners]
+            publications.extend(self._estimates(time_ns, values, predictions, sds, scales, expected, units))
         e = [
             whitener.update((value - prediction) / sd)
             for whitener, value, prediction, sd in zip(self._whiteners, values, predictions, sds, strict=True)
@@ -446,13 +558,14 @@ class PlantPipeline:
         predictions: Sequence[float],
         sds: Sequence[float],
         scales: list[float],
+        expected: list[float],
         units: list[str],
     ) -> Iterator[Publication]:
-        """Estimates of a row, made before the prewhitening filter is updated with it."""
-        for index, whitener in enumerate(self._whiteners):
+        """Estimates of a row, with the values that the prewhitening filters expected before it."""
+        for index, mean in enumerate(expected):
             prediction, residual = predictions[index], values[index] - predictions[index]
             if isfinite(residual):
-                usual, reach = prediction + sds[index] * whitener.expected(), scales[index] * self._charts.widths[index]
+                usual, reach = prediction + sds[index] * mean, scales[index] * self._charts.widths[index]
                 estimate = _estimate(time_ns, prediction, residual, units[index])
                 estimate.residual_sd = scales[index]
                 estimate.lower_limit, estimate.upper_limit = usual - reach, usual + reach

@@ -6,7 +6,7 @@ from typing import Annotated, NamedTuple, TypeAlias
 import msgspec
 
 from monitor_node.alarms.incidents import Count
-from monitor_node.alarms.on_off_delay import OnOffDelay, OnOffDelayState
+from monitor_node.alarms.on_off_delay import IS_NORMAL, OnOffDelay, OnOffDelayState
 from monitor_node.alarms.states import Event, State, next_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, ChartPoint, Contribution, Priority, Suspect
@@ -193,7 +193,9 @@ class ChartAlarm:
         Returns:
             `RAISED` or `CLEARED`, to be applied, if the condition changes.
         """
-        change = self._rule.update(judgement.out, self._is_normal(judgement))
+        out = bool(judgement.out)
+        normal = not out and IS_NORMAL.call(*judgement[:4], self.memory.above, self._reach)
+        change = self._rule.update(out, normal)
         if change is None:
             return None
         memory = self.memory
@@ -261,14 +263,6 @@ class ChartAlarm:
             f"expects (allowed: {format_quantity(allowed, unit)})"
         )
         return Explanation(text, {self._signal: 1.0})
-
-    def _is_normal(self, judgement: Judgement) -> bool:
-        if judgement.out:
-            return False
-        deviation = judgement.statistic - judgement.centre
-        if self.memory.above:
-            return deviation <= self._reach * (judgement.upper_limit - judgement.centre)
-        return deviation >= self._reach * (judgement.lower_limit - judgement.centre)
 
 
 def chart_point(time_ns: int, judgement: Judgement) -> ChartPoint:

@@ -152,13 +152,8 @@ class Suspicion:
             units: of the outputs.
             stuck: outputs whose sensors are stuck; their values are missing.
         """
-        time_min, measured = time_ns / MINUTE_NS, self._measured(values)
-        if self._rows and time_min <= self._rows[-1][0]:  # the plant's clock was set back
-            self._rows.clear()
-            self._isolation = None
-        self._rows.append((time_min, input_value, measured))
-        if self._isolation is not None:
-            self._isolation.add(time_min, input_value, measured)
+        measured = self.add(time_ns / MINUTE_NS, input_value, values)
+        time_min = time_ns / MINUTE_NS
         board = self._board
         if not board.has_unexplained and True not in stuck:  # as mostly
             self._reconstruction = self._since = None
@@ -181,6 +176,17 @@ class Suspicion:
             publications += board.set_suspects(time_ns, told, stopped=isolation.stopped)
             self._follow(suspects[0])
         return publications
+
+    def add(self, time_min: float, input_value: float, values: list[float]) -> list[float]:
+        """Keep a row in which no alarm changes; returns its outputs of the model."""
+        measured = self._measured(values)
+        if self._rows and time_min <= self._rows[-1][0]:  # the plant's clock was set back
+            self._rows.clear()
+            self._isolation = None
+        self._rows.append((time_min, input_value, measured))
+        if self._isolation is not None:
+            self._isolation.add(time_min, input_value, measured)
+        return measured
 
     def _compared(self) -> Isolation:
         """With the newest rows in it. It is made at the first alarm: of thousands of plants few ever have one."""

@@ -1,11 +1,12 @@
 """Between all that a monitor remembers of a plant and its record.
 
-What changes with a row is in the record and in the ring of the newest rows. What seldom changes, and is no number, is
-kept beside it (`Rest`), and shared between plants where it is the same.
+The numbers of the stages are copied. What changes with a row is in them, in the record and in the ring of the newest
+rows. What seldom changes, and is no number, is kept beside it (`Rest`), and shared between plants where it is the same.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from math import isfinite
+from typing import NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
@@ -14,25 +15,14 @@ from monitor_node.alarms.alarms import AlarmMemory
 from monitor_node.alarms.annunciator import Annunciator, AnnunciatorState
 from monitor_node.alarms.incidents import Incident
 from monitor_node.alarms.kpis import KpiState
-from monitor_node.alarms.states import State
 from monitor_node.baseline.references import ProcessReferenceState
 from monitor_node.chart_stage import ChartsState, alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.ingest.alignment import REMEMBERED, AlignmentState
 from monitor_node.ingest.sampling import SamplingState
-from monitor_node.isolation.stage import SuspicionState
+from monitor_node.isolation.stage import SuspicionState, has_causes
 from monitor_node.quiet.layout import Records, record_type
-from monitor_node.quiet.learned import (
-    EqualRuns,
-    is_usual,
-    reference_of,
-    signals_of,
-    whitener_of,
-    write_reference,
-    write_signals,
-    write_whitener,
-)
 from monitor_node.quiet.lining_up import (
     alignment_of,
     is_in_order,
@@ -42,42 +32,44 @@ from monitor_node.quiet.lining_up import (
     write_runs,
 )
 from monitor_node.quiet.ring import NewestRows, times_ns_of
-from monitor_node.signal_checks.catalogue import CHECKS
+from monitor_node.row_step import RowNumbers, RowStep
+from monitor_node.signal_checks.spike import SpikeState
+from monitor_node.signal_checks.stage import SignalChecksState
+from monitor_node.signal_checks.stuck import Stuck
+from monitor_node.signal_checks.timeout import DataTimeout
 from monitor_node.state.monitor_state import MonitorState
 from monitor_node.state.pipeline_state import PipelineState, TrainedState
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import AlarmKpis
 from reactorwatch.contract.sample_bytes import unit_digest
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.kalman.ekf import FilterState, NoiseLevels
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.spc.charts.cusum import Cusum
-from reactorwatch.spc.charts.ewma import Ewma
-from reactorwatch.spc.charts.mewma import Mewma, MewmaState
-from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.compiled_chart import SignalState
+from reactorwatch.spc.prewhitening import Prewhitener
 from reactorwatch.stored_state import packed, unpacked
 
-CHARTS = (Shewhart.name, Ewma.name, Cusum.name, Mewma.name)
-"""That quiet plants may have, in the order of `rows.judge`."""
+EqualRuns: TypeAlias = tuple[dict[int, int], float]
+"""Training of a check for stuck sensors, see `Stuck.training`."""
 
-CHECKED = {"silence", "stuck", "spike", "range"}
-"""The signal checks that `rows.judge` has compiled; with another one every plant keeps its monitor."""
+STATS = ("start_ns", "heard_ns", "lag_ns", "health_due_ns", "ticked", "stalls", "not_stored")
+"""Fields of `ReceiveStats` that the record has under the same name; the other two are in `receipts`."""
 
 
 class Rest(NamedTuple):
-    """What is remembered of a plant beside its record.
+    """State of a plant beside its numbers.
 
     Attributes:
-        board: its alarms; None if none ever came up.
-        refused: counts by reason.
-        failures: contained errors of this software, by stage.
-        runs: of equal readings in the training, one an output, as MessagePack.
-        units: of the signals.
-        checks: what was said of the training.
-        refusals: trainings that were refused.
-        until_drift: rows until the next look at the drift.
-        cause: what was looked for last: number of the incident, output and cause.
+        board: the plant's alarms; None if there was never one.
+        refused: number of rejected messages by reason.
+        failures: number of contained errors of this software by stage.
+        runs: training of the checks for stuck sensors, one an output, as MessagePack.
+        units: units of the signals.
+        checks: checks of the training.
+        refusals: number of refused trainings.
+        until_drift: number of rows until the next drift point.
+        cause: newest search: number of the incident, output and cause.
     """
 
     board: Annunciator | None
@@ -92,78 +84,64 @@ class Rest(NamedTuple):
 
 
 class QuietForm:
-    """What records of plants with certain settings are like.
+    """Conversion between monitors with certain settings and packed plants.
 
     Args:
-        config: of their monitors.
-        model: that their rows are expected by.
+        config: settings of the monitors.
+        model: process model of the plants.
+        step: compiled step of the plants.
 
     Attributes:
-        record: the type of a record.
-        keeps: the newest rows that are kept.
-        remembered: of these, by which samples are told that come twice.
-        columns: of the rows, what is kept beside their times.
-        places: of the first alarm of each kind of chart, see `rows.judge`.
-        rules: of each chart's alarm, likewise.
-        figures: of alarms that never came up, but for the time.
+        record: type of a record.
+        step: compiled step of the plants.
+        keeps: number of the newest rows that are kept.
+        remembered: number of these by which repeated samples are recognised.
+        columns: number of values that are kept of each row.
+        figures: KPIs of alarms that were never raised, but for the time.
         least_s: see `DataTimeout`.
     """
 
-    def __init__(self, config: MonitorConfig, model: ProcessModel) -> None:
-        self.config, self._model = config, model
-        names = alarm_names(config)
-        self._alarms = [keys.chart_name(*pair) for pair in names]
+    def __init__(self, config: MonitorConfig, model: ProcessModel, step: RowStep) -> None:
+        self.config, self._model, self.step = config, model, step
+        self._alarms = [keys.chart_name(*pair) for pair in alarm_names(config)]
         self._signals = (config.input, *config.outputs)
-        self.record = record_type(len(config.outputs), len(model.states), len(names))
-        self._looks = config.isolation and model.name == cstr().name  # as in `watch`
-        remembered = REMEMBERED * config.reorder_rows
-        self.keeps = config.isolation_rows if self._looks else remembered
+        self.record = record_type(len(config.outputs), len(model.states))
+        self._looks = has_causes(config, model)
+        self.remembered = REMEMBERED * config.reorder_rows
+        self.keeps = config.isolation_rows if self._looks else self.remembered
         self.columns = len(self._signals) if self._looks else 0
-        kinds = [chart for chart, _ in names]
-        self._charts_made = set(kinds) & set(CHARTS)
-        self.places = np.array([kinds.index(kind) if kind in kinds else -1 for kind in CHARTS], dtype=np.int32)
-        self.rules = np.array(
-            [(1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1) for kind in kinds],
-            dtype=np.int32,
-        )
         fresh = Monitor(config, 0, points=False, model=model)
         state = fresh.state
         self._predictors, self._training = state.watch.predictors, state.watch.training
         self._board = state.board
         self.least_s = state.watch.signals.silences[0].least_s
         (self.figures,) = (item.message for item in fresh.alarms.end_row(0) if isinstance(item.message, AlarmKpis))
-        self.remembered = remembered
 
     @staticmethod
     def of(config: MonitorConfig, model: ProcessModel | None) -> "QuietForm | None":
-        """The form of plants with these settings; None if they cannot be held.
+        """The form of plants with these settings; None if they cannot be packed.
 
         Args:
-            config: of their monitors.
-            model: of the plant; None: there is none.
+            config: settings of the monitors.
+            model: process model of the plants; None: there is none.
         """
-        if model is None or model.breakpoints or len(model.input_names) != 1 or model.output_names != config.outputs:
+        step = RowStep.of(config, model)
+        if model is None or step is None:
             return None
-        if (
-            {check.name for check in CHECKS} != CHECKED
-            or not set(config.charts) <= set(CHARTS)
-            or (len(config.outputs) < 2 and Mewma.name in config.charts)
-        ):
-            return None
-        form = QuietForm(config, model)
+        form = QuietForm(config, model, step)
         return form if form.keeps >= form.remembered else None
 
     # --- from a monitor --------------------------------------------------------------------------------------
 
-    def written(self, monitor: Monitor, record: Records) -> tuple[Rest, NewestRows] | None:
-        """Fill a record with what a monitor remembers; None if the plant is not quiet.
+    def demote(self, monitor: Monitor, record: Records) -> tuple[Rest, NewestRows] | None:
+        """Fill a record with the state of a monitor; None if the plant is not in its normal state.
 
         Args:
-            monitor: of the plant.
-            record: shape (1,).
+            monitor: monitor of the plant.
+            record: filled, shape (1,).
         """
-        receive_stats = monitor.receive_stats
-        if monitor.is_replaying_history or monitor.phase != "watching":
+        receive_stats, pipeline = monitor.receive_stats, monitor.pipeline
+        if monitor.is_replaying_history or monitor.phase != "watching" or not pipeline.is_normal:
             return None
         if receive_stats.received_ns is None or receive_stats.counted_ns is None:
             return None
@@ -172,17 +150,19 @@ class QuietForm:
         board = msgspec.msgpack.decode(state.board, type=AnnunciatorState)
         if watched is None or not isinstance(watched.reference, ProcessReferenceState):
             return None
-        if watched.left_out or set(watched.charts.charts) != self._charts_made:
+        if board.kpis_changed or board.told is None or board.kpi_minute is None:
             return None
-        if not _is_at_rest(board, self._alarms) or not is_in_order(alignment) or not run_on(state.runs, alignment):
+        if not is_in_order(alignment) or not run_on(state.runs, alignment):
             return None
         rows = self._rows(alignment, watched.suspicion)
-        if rows is None or not is_usual(state.watch, watched, watched.reference, rows.times_ns[-1]):
+        sampling, reference = state.watch.sampling, watched.reference
+        if rows is None or sampling.last_ns != rows.times_ns[-1]:
             return None
         record[:] = np.zeros(1, self.record)
         p = record[0]
-        for name, known in receive_stats._asdict().items():
-            p[name] = known
+        for name in STATS:
+            p[name] = getattr(receive_stats, name)
+        p["receipts"] = pipeline.signals.receipts[0]
         write_runs(p, state.runs)
         p["received"], p["published"] = state.received, state.published
         p["first_ns"], p["watching_since_ns"] = state.first_ns, state.watching_since_ns
@@ -191,23 +171,15 @@ class QuietForm:
         p["unit"] = [unit_digest(state.units[signal]) for signal in self._signals]
         p["kpi_minute"], p["arl0"], p["rows_watched"] = board.kpi_minute, watched.arl0, watched.rows_watched
         write_alignment(p, alignment)
-        sampling = state.watch.sampling
-        p["last_ns"], p["period_ns"], p["spacing_ns"] = sampling.last_ns, sampling.period_ns, sampling.spacing_ns
-        write_signals(p, state.watch.signals)
-        write_reference(p, watched.reference, self._model)
-        for place, item in enumerate(watched.whiteners):
-            write_whitener(p, place, item)
-        self._write_charts(p, watched.charts)
-        for place, name in enumerate(self._alarms):
-            memory = board.alarms[name]
-            p["recent"][place], p["in_a_row"][place] = memory.rule.recent, memory.rule.in_a_row
-            p["above"][place] = memory.above
+        p["spacing_ns"], p["reach"] = sampling.spacing_ns, reference.reach
+        p["noise"] = [*reference.noise.measurement_sd, *reference.noise.process_sd]
+        p["typical_sd"] = reference.typical_sd
         looked = watched.suspicion
         rest = Rest(
             None if self._never_came_up(board) else monitor.alarms,
             state.refused or None,
             state.failures or None,
-            msgspec.msgpack.encode([(item.runs, item.arl0) for item in state.watch.signals.stuck]),
+            msgspec.msgpack.encode(pipeline.signals.trainings),
             tuple(state.units[signal] for signal in self._signals),
             tuple(watched.checks),
             state.watch.refusals,
@@ -243,42 +215,47 @@ class QuietForm:
         same = all(msgspec.structs.replace(memory, rule=plain.rule) == plain for memory in board.alarms.values())
         return same and board.incident == Incident() and board.kpis == KpiState() and not board.suspects
 
-    def _write_charts(self, p: np.void, charts: ChartsState) -> None:
-        for kind in (Shewhart, Ewma, Cusum):
-            if kind.name in charts.charts:
-                numbers = SignalState.from_bytes(charts.charts[kind.name]).numbers
-                p[kind.name] = np.frombuffer(numbers, dtype="<f8").reshape(-1, len(self.config.outputs))
-        if Mewma.name in charts.charts:
-            state = MewmaState.from_bytes(charts.charts[Mewma.name])
-            p["mean"], p["covariance"], p["average"] = state.mean, state.covariance, state.average
-            p["whitening"] = Mewma.from_state(state).whitening.matrix
-            p["mewma_limit"] = state.limit
-
     # --- to a monitor ----------------------------------------------------------------------------------------
 
-    def read(self, plant: str, p: np.void, rest: Rest, rows: NewestRows, waiting: Sequence[int]) -> MonitorState:
-        """All that a monitor of the plant would remember.
+    def promote(
+        self, plant: str, p: np.void, numbers: RowNumbers, rest: Rest, rows: NewestRows, waiting: Sequence[int]
+    ) -> MonitorState:
+        """State of a monitor of a plant.
 
         Args:
-            plant: its name.
-            p: its record.
-            rest: of it.
-            rows: its newest.
-            waiting: times of rows that were lined up and are not judged yet.
+            plant: name of the plant.
+            p: record of the plant.
+            numbers: numbers of its stages, without the axis of plants.
+            rest: state beside the numbers.
+            rows: newest rows.
+            waiting: times of rows that were aligned and are not processed yet.
         """
         looked = None
         if self._looks:
             minutes = np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns])
             known = packed(np.column_stack([minutes, rows.values]))
             looked = SuspicionState(known, rest.cause[0], None, None, rest.cause[1], rest.cause[2], None)
-        equal = msgspec.msgpack.decode(rest.runs, type=list[EqualRuns])
         outputs = range(len(self.config.outputs))
+        whiteners = [Prewhitener(None, numbers.whiteners[i : i + 1]).state for i in outputs]
+        last_ns, last_input = int(numbers.timing["last_ns"]), float(numbers.timing["input"])
+        belief, noise, states = numbers.belief.tolist(), p["noise"].tolist(), len(self._model.states)
+        reference = ProcessReferenceState(
+            NoiseLevels(tuple(noise[: len(outputs)]), tuple(noise[len(outputs) :])),
+            FilterState(
+                float(numbers.timing["time_min"]), (last_input,), tuple(belief[:states]), tuple(belief[states:])
+            ),
+            last_input,
+            False,
+            p["typical_sd"].tolist(),
+            0,
+            float(p["reach"]),
+        )
         watched = TrainedState(
-            reference_of(p, len(self._model.states)),
+            reference,
             list(rest.checks),
             {},
-            [whitener_of(p, place) for place in outputs],
-            self._charts(p),
+            whiteners,
+            ChartsState(self._charts(numbers), p["width"].tolist(), [item.learned.passed for item in whiteners]),
             looked,
             float(p["arl0"]),
             [False] * len(outputs),
@@ -286,8 +263,8 @@ class QuietForm:
             rest.until_drift,
         )
         watch = PipelineState(
-            SamplingState(int(p["last_ns"]), [], float(p["period_ns"]), int(p["spacing_ns"])),
-            signals_of(p, equal, self.config.silence_periods, self.least_s),
+            SamplingState(last_ns, [], float(numbers.timing["period_ns"]), int(p["spacing_ns"])),
+            self._signals_of(p, numbers, msgspec.msgpack.decode(rest.runs, type=list[EqualRuns])),
             self._predictors,
             rest.refusals,
             int(p["began_ns"]),
@@ -298,12 +275,12 @@ class QuietForm:
             {},
             runs_of(p),
             alignment_of(p, [*rows.times_ns, *waiting]),
-            self._board_of(plant, p, rest),
+            self._board_of(plant, p, numbers, rest),
             watch,
             dict(zip(self._signals, rest.units, strict=True)),
             dict(zip(self._signals, p["heard_from_ns"].tolist(), strict=True)),
             int(p["first_ns"]),
-            int(p["last_ns"]),
+            last_ns,
             int(p["watching_since_ns"]),
             None,
             int(p["received"]),
@@ -312,27 +289,41 @@ class QuietForm:
             dict(rest.failures or {}),
         )
 
-    def _charts(self, p: np.void) -> ChartsState:
+    def _signals_of(self, p: np.void, numbers: RowNumbers, trainings: list[EqualRuns]) -> SignalChecksState:
+        receipts = np.array([p["receipts"]])
+        return SignalChecksState(
+            [
+                DataTimeout(
+                    self.config.silence_periods, self.least_s, numbers.timeouts[i : i + 1], None if i else receipts
+                ).state
+                for i in range(len(numbers.timeouts))
+            ],
+            [Stuck.of_numbers(arl0, runs, numbers.stuck[i : i + 1]).state for i, (runs, arl0) in enumerate(trainings)],
+            [
+                SpikeState(limit, "quiet", 0.0, []) if isfinite(limit) else None
+                for limit in numbers.spike_limits.tolist()
+            ],
+        )
+
+    def _charts(self, numbers: RowNumbers) -> dict[str, bytes]:
         charts: dict[str, bytes] = {}
         for name in dict.fromkeys(self.config.charts):
             if name == Mewma.name:
-                mean, covariance, average = (p[field].tolist() for field in ("mean", "covariance", "average"))
-                weight, limit = self.config.chart_settings["mewma_weight"], float(p["mewma_limit"])
-                charts[name] = MewmaState(mean, covariance, weight, limit, average).to_bytes()
+                state = Mewma.state_of_numbers(numbers.mewma, self.config.chart_settings["mewma_weight"])
+                charts[name] = state.to_bytes()
             else:
-                numbers = p[name].astype("<f8").tobytes()
-                charts[name] = SignalState(name, len(self.config.outputs), numbers).to_bytes()
-        passed = [whitener_of(p, place).learned.passed for place in range(len(self.config.outputs))]
-        return ChartsState(charts, p["width"].tolist(), passed)
+                values = getattr(numbers, name).astype("<f8").tobytes()
+                charts[name] = SignalState(name, len(self.config.outputs), values).to_bytes()
+        return charts
 
-    def _board_of(self, plant: str, p: np.void, rest: Rest) -> bytes:
+    def _board_of(self, plant: str, p: np.void, numbers: RowNumbers, rest: Rest) -> bytes:
         board = msgspec.msgpack.decode(
             self._board if rest.board is None else rest.board.to_bytes(), type=AnnunciatorState
         )
-        for place, name in enumerate(self._alarms):
+        for (recent, in_a_row, _), name in zip(numbers.delays.tolist(), self._alarms, strict=True):
             rule = board.alarms[name].rule
-            rule.recent, rule.in_a_row = int(p["recent"][place]), int(p["in_a_row"][place])
-        last_ns = int(p["last_ns"])
+            rule.recent, rule.in_a_row = recent, in_a_row
+        last_ns = int(numbers.timing["last_ns"])
         if rest.board is None:
             told = AlarmKpis()
             told.CopyFrom(self.figures)
@@ -340,13 +331,3 @@ class QuietForm:
             board = msgspec.structs.replace(board, plant=plant, told=told.SerializeToString())
         board = msgspec.structs.replace(board, time_ns=last_ns, kpi_minute=int(p["kpi_minute"]), kpis_changed=False)
         return msgspec.msgpack.encode(board)
-
-
-def _is_at_rest(board: AnnunciatorState, of_charts: list[str]) -> bool:
-    """Whether no alarm stands or is shelved, and none but those of charts has anything in its memory."""
-    if board.kpis_changed or board.told is None or board.kpi_minute is None:
-        return False
-    return all(
-        not memory.rule.standing and memory.state is not State.SHELVED and (name in of_charts or not memory.rule.recent)
-        for name, memory in board.alarms.items()
-    )

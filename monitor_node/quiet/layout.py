@@ -1,15 +1,11 @@
-"""The form of a plant's record: all that changes from row to row, as numbers in one line of an array."""
+"""Record of a plant in a fleet, beside the numbers of its stages: pending samples, counts, newest rows."""
 
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from monitor_node.signal_checks.stuck import MOVEMENT_STEPS
-from reactorwatch.spc.charts.cusum import Cusum
-from reactorwatch.spc.charts.ewma import Ewma
-from reactorwatch.spc.charts.shewhart import Shewhart
-from reactorwatch.spc.prewhitening import LARGEST_ORDER
+from monitor_node.signal_checks.timeout import RECEIPTS
 
 Records: TypeAlias = NDArray[np.void]
 Array: TypeAlias = NDArray[np.float64]
@@ -22,15 +18,14 @@ LEVELS = 64
 held for ten rows on average has 60 in 600."""
 
 
-def record_type(outputs: int, states: int, alarms: int) -> np.dtype[Any]:
-    """The form of a plant's record.
+def record_type(outputs: int, states: int) -> np.dtype[Any]:
+    """Type of a plant's record.
 
     Args:
-        outputs: how many are watched.
-        states: of its model.
-        alarms: how many its charts can raise.
+        outputs: number of monitored outputs.
+        states: number of states of the model.
     """
-    signals, memory, noise = outputs + 1, states + states**2, outputs + states
+    signals, noise = outputs + 1, outputs + states
     f, i, u = np.float64, np.int64, np.uint64
     columns: list[tuple[str, DTypeLike, tuple[int, ...]]] = [
         # samples on their way into a row
@@ -41,11 +36,11 @@ def record_type(outputs: int, states: int, alarms: int) -> np.dtype[Any]:
         ("heard_from_ns", i, (signals,)),
         ("values", f, (signals,)),
         ("pending_ns", i, ()),
-        ("left_ns", i, ()),  # time of the row that left last
-        ("have", np.int32, ()),  # which signals of the pending row have come, a bit each
-        ("left", np.int32, ()),  # rows that left and are remembered
-        ("shut", np.int32, ()),  # from here on, samples are for the plant's own monitor
-        ("odd", np.int32, ()),  # likewise, rows
+        ("left_ns", i, ()),  # time of the row that was emitted last
+        ("have", np.int32, ()),  # signals of the pending row that have arrived, a bit each
+        ("left", np.int32, ()),  # number of emitted rows that are remembered
+        ("shut", np.int32, ()),  # 1: from here on, samples are for the plant's own monitor
+        ("odd", np.int32, ()),  # 1: so are rows
         # counts and times
         ("received", i, ()),
         ("published", i, ()),
@@ -62,61 +57,18 @@ def record_type(outputs: int, states: int, alarms: int) -> np.dtype[Any]:
         ("heard_ns", i, ()),
         ("health_due_ns", i, ()),
         ("kpi_minute", i, ()),
+        ("receipts", RECEIPTS, ()),
+        ("spacing_ns", i, ()),  # interval before the newest row
+        # constants of the plant
         ("arl0", f, ()),
-        # how rows and samples come
-        ("last_ns", i, ()),
-        ("period_ns", f, ()),
-        ("spacing_ns", i, ()),
-        ("received_ns", i, ()),
-        ("counted_ns", i, ()),
-        ("receipt_mean", f, ()),
-        ("receipt_deviation", f, ()),
-        ("receipt_count", np.int32, ()),
-        ("silence_count", np.int32, (signals + 1,)),
-        ("silence_mean", f, (signals + 1,)),
-        ("silence_deviation", f, (signals + 1,)),
-        # the filter
-        ("time_min", f, ()),
-        ("input", f, ()),
-        ("reach", f, ()),  # see `references.input_reach`
-        ("memory", f, (memory,)),
-        ("noise", f, (noise,)),  # standard deviations, of sensors and process
-        ("variance", f, (noise,)),
-        ("typical_sd", f, (outputs,)),
-        # prewhitening
-        ("order", np.int32, (outputs,)),
-        ("learned_rows", np.int32, (outputs,)),
-        ("constant", f, (outputs,)),
-        ("coefficients", f, (outputs, LARGEST_ORDER)),
-        ("sigma", f, (outputs,)),
-        ("sigma_variance", f, (outputs,)),
-        ("passed_variance", f, (outputs,)),
-        ("past", f, (outputs, LARGEST_ORDER)),
-        # spikes and stuck sensors; a limit that is infinite is none
-        ("spike_limit", f, (outputs,)),
-        ("equal_limit", f, (outputs,)),
-        ("quietest", f, (outputs,)),
-        ("last", f, (outputs,)),
-        ("repeats", i, (outputs,)),
-        ("steps", f, (outputs, MOVEMENT_STEPS)),  # oldest first
-        ("stepped", np.int32, (outputs,)),
-        # charts, as the columns of a bank without what comes in and goes out, and their alarms
-        ("shewhart", f, (Shewhart.numbers, outputs)),
         ("width", f, (outputs,)),
-        ("ewma", f, (Ewma.numbers, outputs)),
-        ("cusum", f, (Cusum.numbers, outputs)),
-        ("average", f, (outputs,)),
-        ("mean", f, (outputs,)),
-        ("covariance", f, (outputs, outputs)),
-        ("whitening", f, (outputs, outputs)),
-        ("mewma_limit", f, ()),
-        ("recent", np.int32, (alarms,)),
-        ("in_a_row", np.int32, (alarms,)),
-        ("above", np.int32, (alarms,)),
+        ("reach", f, ()),  # see `references.input_reach`
+        ("noise", f, (noise,)),  # standard deviations, of sensors and process
+        ("typical_sd", f, (outputs,)),
         # the newest rows, in a ring
         ("kept", np.int32, ()),
         ("head", np.int32, ()),  # where the next one goes
-        ("unit_ns", i, ()),  # that spacings are kept in
+        ("unit_ns", i, ()),  # unit of the kept spacings
         ("usual_ns", i, ()),  # spacing that is kept as 0
         ("reference", i, (outputs,)),  # see `ring.Kept`
         ("levels", i, (LEVELS,)),

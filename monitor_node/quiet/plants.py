@@ -6,28 +6,24 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.baseline.references import GATE, ProcessReference
-from monitor_node.baseline.signal_range import signal_ranges
+from monitor_node.baseline.references import ProcessReference
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.health import NODE, health_message
 from monitor_node.ingest.alignment import Counts, Row
 from monitor_node.ingest.receive_stats import STALL_NS, ReceiveStats
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE, USABLE
-from monitor_node.quiet.form import QuietForm
+from monitor_node.quiet.form import STATS, QuietForm
 from monitor_node.quiet.lining_up import COUNTS
 from monitor_node.quiet.ring import kept_spacings, kept_values
-from monitor_node.quiet.rows import NEW_MINUTE, judge
-from monitor_node.quiet.samples import silent_from, take_samples
+from monitor_node.quiet.rows import NEW_MINUTE, step_rows
+from monitor_node.quiet.samples import find_deadlines, take_samples
 from monitor_node.quiet.slots import NEVER_NS, Slots
 from monitor_node.state.monitor_state import learning_settings, seal_state
-from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Sample
 from reactorwatch.contract.sample_bytes import SampleColumns, parse_samples
-from reactorwatch.kalman.ekf_step import row_function
-from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 
@@ -68,9 +64,6 @@ class QuietPlants:
         self._settings = learning_settings(config, model, points=False)
         self._signals = (config.input, *config.outputs)
         self._slots = Slots(form, self._signals)
-        self._rows = CompiledFunction(row_function(model))
-        self._parameters = model.values()
-        self._ranges = np.array([[item.lower, item.upper] for item in signal_ranges(model, self._signals)])
         self._scratch = np.zeros(1, form.record)
         self._shared: dict[Any, Any] = {}  # parts of `Rest`, which are equal for many plants, are kept once
         self._overdue_ns, self._looked_ns = NEVER_NS, 0  # when the first was overdue, and when that was seen
@@ -102,17 +95,19 @@ class QuietPlants:
             plant: its name.
             monitor: its; of no use afterwards if the plant was taken.
         """
-        found = self._form.written(monitor, self._scratch)
+        found = self._form.demote(monitor, self._scratch)
         if found is None:
             return False
         rest, rows = found
-        usual_ns = round(float(self._scratch[0]["period_ns"]))
+        usual_ns = round(float(monitor.pipeline.numbers.timing["period_ns"][0]))
         spacings = kept_spacings(rows.times_ns, usual_ns)
         values = kept_values(rows.values)
         if spacings is None or values is None:
             return False
         slot = self._slots.take(plant)
         self._slots.plants[slot] = self._scratch[0]
+        for ours, of_plant in zip(self._slots.numbers, monitor.pipeline.numbers, strict=True):
+            ours[slot] = of_plant[0]
         self._slots.health_due_ns[slot] = self._scratch[0]["health_due_ns"]
         p = self._slots.plants[slot]
         p["unit_ns"], p["usual_ns"] = spacings[0], usual_ns
@@ -129,7 +124,7 @@ class QuietPlants:
         """What a monitor of a plant's own would store of it."""
         slot = self._slots.of[plant]
         rest, rows = self._slots.rest(slot), self._slots.newest(slot)
-        state = self._form.read(plant, self._slots.plants[slot], rest, rows, [])
+        state = self._form.promote(plant, self._slots.plants[slot], self._slots.numbers_of(slot), rest, rows, [])
         return seal_state(msgspec.structs.replace(state, settings=self._settings | {"plant": plant}))
 
     def received_of(self, plant: str) -> int:
@@ -163,12 +158,15 @@ class QuietPlants:
         monitor = Monitor(msgspec.structs.replace(self._config, plant=plant), 0, points=False, model=self._model)
         monitor.failures.passes = ()
         try:
-            monitor.restore(self._form.read(plant, p, self._slots.rest(slot), rows, [row.time_ns for row in waiting]))
+            numbers, times_ns = self._slots.numbers_of(slot), [row.time_ns for row in waiting]
+            monitor.restore(self._form.promote(plant, p, numbers, self._slots.rest(slot), rows, times_ns))
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
             monitor.failures.add("promotion", error, "the plant is learned again")
         monitor.on_history_end()
         p["health_due_ns"] = self._slots.health_due_ns[slot]
-        monitor.receive_stats = ReceiveStats(*(p[name].item() for name in ReceiveStats._fields))
+        stats: dict[str, Any] = {name: p[name].item() for name in STATS}
+        stats |= {name: int(p["receipts"][name]) for name in ("received_ns", "counted_ns")}
+        monitor.receive_stats = ReceiveStats(**stats)
         self._slots.leave(plant)
         return monitor
 
@@ -231,27 +229,19 @@ class QuietPlants:
         """Judge rows; returns, by slot, those that are out of the ordinary, and all after them."""
         waiting: dict[int, list[Row]] = {}
         found = np.empty(rows.slots.size, np.int32)
-        judge(
-            self._slots.plants,
-            self._scratch,
-            self._slots.times,
-            self._slots.ring,
-            self._slots.others,
-            rows.slots,
-            rows.times_ns,
+        slots, step = self._slots, self._form.step
+        step_rows(
+            slots.plants,
+            slots.numbers,
+            step.scratch,
+            step.outcome,
+            step.settings,
+            slots.times,
+            slots.ring,
+            slots.others,
+            rows,
             np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns.tolist()]),
-            rows.values,
             rows.values.view(np.int64),
-            self._rows.address,
-            self._parameters,
-            self._ranges,
-            LONGEST_ROW_MIN,
-            GATE,
-            self._config.silence_periods,
-            self._form.places,
-            self._form.rules,
-            1.0 - self._config.dead_band,
-            self._config.chart_settings["mewma_weight"],
             found,
         )
         for place in np.flatnonzero(found).tolist():
@@ -305,9 +295,9 @@ class QuietPlants:
 
     def _silent_from_ns(self) -> NDArray[np.int64]:
         """By slot, when it is too long since something came; never for a slot without a plant."""
-        return silent_from(
-            self._slots.plants[: len(self._slots.names)], self._config.silence_periods, int(self._form.least_s * 1e9)
-        )
+        count = len(self._slots.names)
+        plants, timeouts = self._slots.plants[:count], self._slots.numbers.timeouts[:count]
+        return find_deadlines(plants, timeouts, self._config.silence_periods, int(self._form.least_s * 1e9))
 
     def _health(self, slot: int, now_ns: int, phase: str) -> Publication:
         p, rest, plant = self._slots.plants[slot], self._slots.rest(slot), self._slots.names[slot]

@@ -126,11 +126,12 @@ def values_of(kept: Kept) -> Array:
     return np.ascontiguousarray(np.column_stack([inputs, measured])).view(np.float64)
 
 
-def newest_rows(p: np.void, times: Places, ring: Bytes, others: Ints) -> NewestRows:
+def newest_rows(p: np.void, last_ns: int, times: Places, ring: Bytes, others: Ints) -> NewestRows:
     """The rows that a ring keeps.
 
     Args:
         p: record of the plant.
+        last_ns: time of the newest row.
         times: spacings, shape (rows kept,).
         ring: values, shape (rows kept, bytes).
         others: inputs at no level, shape (rows kept,).
@@ -141,7 +142,7 @@ def newest_rows(p: np.void, times: Places, ring: Bytes, others: Ints) -> NewestR
     at_no_level = others[order] if others.size else others
     kept = Kept(ring[order], p["reference"], p["levels"], p["level_rows"], at_no_level)
     since = np.concatenate([[0], np.cumsum(over[:0:-1])])  # from each row to the newest, newest first
-    return NewestRows((p["last_ns"] - since)[::-1].tolist(), values_of(kept))
+    return NewestRows((last_ns - since)[::-1].tolist(), values_of(kept))
 
 
 def times_ns_of(times_min: Array) -> list[int]:

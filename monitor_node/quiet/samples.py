@@ -15,19 +15,8 @@ from monitor_node.ingest.sequence_check import ALIKE, TOLERANCE
 from monitor_node.ingest.sequence_check import DEVIATIONS as RUN_DEVIATIONS
 from monitor_node.ingest.sequence_check import MEMORY as RUN_MEMORY
 from monitor_node.quiet.layout import Array, Ints, Places, Records
-from monitor_node.signal_checks.timeout import BURST, DEVIATIONS, LEARN_FROM, MEMORY
+from monitor_node.signal_checks.timeout import LEARN_FROM, receive, timeout_ns
 from reactorwatch.codegen.numba_kernel import jit
-
-# Under names of this module: compiled code keeps them as they are now.
-_MEMORY, _LEARN_FROM = MEMORY, LEARN_FROM
-
-
-@jit
-def allowed_ns(limit: float, count: int, mean: float, deviation: float) -> int:
-    """As `Spacing.allowed_ns`; -1: too little is known."""
-    if count < _LEARN_FROM:
-        return -1
-    return int(limit * (mean + DEVIATIONS * deviation))
 
 
 @jit
@@ -42,25 +31,6 @@ def _follows(p: Any, signal: int, time_ns: int) -> bool:
     p.run_spacing_ns[signal] += off / RUN_MEMORY
     p.run_deviation_ns[signal] += (abs(off) - p.run_deviation_ns[signal]) / RUN_MEMORY
     return True
-
-
-@jit
-def _heard(p: Any, now_ns: int, silence_limit: float, least_ns: int) -> None:
-    """Note that something came; as `DataTimeout.on_receipt`."""
-    before_ns, p.received_ns = p.counted_ns, now_ns
-    spacing = now_ns - before_ns
-    if spacing < 0:
-        p.counted_ns = now_ns
-    elif p.receipt_count < _MEMORY or float(spacing) >= BURST * p.receipt_mean:
-        p.counted_ns = now_ns
-        patience = allowed_ns(silence_limit, p.receipt_count, p.receipt_mean, p.receipt_deviation)
-        if patience >= 0:
-            spacing = min(spacing, max(patience, least_ns))
-        p.receipt_count = min(p.receipt_count + 1, _MEMORY)
-        off = float(spacing) - p.receipt_mean
-        p.receipt_mean += off / p.receipt_count
-        if p.receipt_count > 1:
-            p.receipt_deviation += (abs(off) - p.receipt_deviation) / p.receipt_count
 
 
 @jit
@@ -130,7 +100,7 @@ def take_samples(
             p.lag_ns = now_ns - received_ns[k]
         if now_ns >= p.heard_ns + HEARD_AGAIN_NS:
             p.heard_ns = now_ns
-            _heard(p, now_ns, silence_limit, least_ns)
+            receive(p.receipts, now_ns, silence_limit, least_ns)
         p.expected[signal] += 1
         p.values[signal] = value[k]
         p.pending_ns = time_ns[k]
@@ -149,12 +119,12 @@ def take_samples(
 
 
 @jit
-def silent_from(plants: Records, silence_limit: float, least_ns: int) -> Ints:
-    """When it is too long since something came from each plant, as `DataTimeout.due_ns`; never where there is none."""
-    found = np.empty(plants.size, np.int64)
+def find_deadlines(plants: Records, timeouts: Records, silence_limit: float, least_ns: int) -> Ints:
+    """Time by slot at which the plant's data timeout expires, as `DataTimeout.due_ns`; never where there is none."""
+    due_ns = np.empty(plants.size, np.int64)
     for slot in range(plants.size):
-        p = plants[slot]
-        patience = allowed_ns(silence_limit, p.receipt_count, p.receipt_mean, p.receipt_deviation)
-        known = patience >= 0 and p.silence_count[0] >= _LEARN_FROM
-        found[slot] = p.received_ns + max(patience, least_ns) if known else np.int64(2**63 - 1)
-    return found
+        receipts = plants[slot].receipts
+        allowed = timeout_ns(receipts, silence_limit, least_ns)
+        is_known = allowed >= 0 and timeouts[slot, 0].spacing.count >= LEARN_FROM
+        due_ns[slot] = receipts.received_ns + allowed if is_known else np.int64(2**63 - 1)
+    return due_ns

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from monitor_node.quiet.form import QuietForm, Rest
 from monitor_node.quiet.layout import Records
 from monitor_node.quiet.ring import Kept, NewestRows, newest_rows, row_bytes
+from monitor_node.row_step import RowNumbers
 from reactorwatch.contract import keys
 
 FIRST_ROOM = 16
@@ -31,6 +32,7 @@ class Slots:
         rests: by slot.
         codes: by key of a sample, the slot times the signals plus the signal.
         plants: records.
+        numbers: numbers of the stages.
         times: rings of spacings, shape (slots, rows kept). It takes no memory where all are zero: whoever writes there
             leaves out what is there already.
         ring: rings of values, shape (slots, rows kept, bytes).
@@ -47,6 +49,7 @@ class Slots:
         self.codes: dict[str, int] = {}
         self._used: NDArray[np.int64] | None = None
         self.plants: Records
+        self.numbers: RowNumbers
         self.times: NDArray[np.int32]
         self.ring: NDArray[np.uint8]
         self.others: NDArray[np.int64]
@@ -99,6 +102,8 @@ class Slots:
     def copy(self, of: int, slot: int) -> None:
         """Fill record and rings of a plant with those of another."""
         self.plants[slot], self.ring[slot] = self.plants[of], self.ring[of]
+        for numbers in self.numbers:
+            numbers[slot] = numbers[of]
         self.health_due_ns[slot] = self.health_due_ns[of]
         _write(self.times[slot], self.times[of])
         _write(self.others[slot], self.others[of])
@@ -111,7 +116,12 @@ class Slots:
 
     def newest(self, slot: int) -> NewestRows:
         """The newest rows of a plant."""
-        return newest_rows(self.plants[slot], self.times[slot], self.ring[slot], self.others[slot])
+        last_ns = int(self.numbers.timing["last_ns"][slot])
+        return newest_rows(self.plants[slot], last_ns, self.times[slot], self.ring[slot], self.others[slot])
+
+    def numbers_of(self, slot: int) -> RowNumbers:
+        """Numbers of the stages of one plant."""
+        return RowNumbers(*(numbers[slot] for numbers in self.numbers))
 
     def _room(self, plants: int) -> None:
         """Make room for so many."""
@@ -119,12 +129,16 @@ class Slots:
         records, times = _zeros((plants,), form.record), _zeros((plants, form.keeps), np.dtype(np.int32))
         ring = _zeros((plants, form.keeps, row_bytes(form.columns)), np.dtype(np.uint8))
         others = _zeros((plants, form.keeps if form.columns else 0), np.dtype(np.int64))
+        numbers = form.step.shape(plants, _zeros)
         if before:
             records[:before], ring[:before] = self.plants, self.ring
+            for larger, smaller in zip(numbers, self.numbers, strict=True):
+                larger[:before] = smaller
             for now, then in ((times, self.times), (others, self.others)):
                 written = np.flatnonzero(then.any(axis=1))
                 now[written] = then[written]
         self.plants, self.times, self.ring, self.others = records, times, ring, others
+        self.numbers = numbers
         due_ns = np.full(plants, NEVER_NS)
         due_ns[:before] = self.health_due_ns[:before]
         self.health_due_ns = due_ns

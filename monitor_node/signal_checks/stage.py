@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import ANY, SignalRange
@@ -59,6 +61,8 @@ class SignalChecks:
         known = ranges or [ANY] * (1 + len(config.outputs))
         self._checks = [check(config, board, known) for check in CHECKS]
         self._silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
+        self._stuck = next(check for check in self._checks if isinstance(check, StuckCheck))
+        self._spike = next(check for check in self._checks if isinstance(check, SpikeCheck))
         self._on_row: list[Callable[..., list[Publication]]] = self._hooks("on_row")
         self._measured: list[Callable[..., tuple[float, ...]]] = self._hooks("measured")
         self._on_values: list[Callable[..., list[Publication]]] = self._hooks("on_values")
@@ -84,6 +88,26 @@ class SignalChecks:
         if len(self._invalid) == 1:
             return self._invalid[0].invalid
         return [any(flags) for flags in zip(*(check.invalid for check in self._invalid), strict=True)]
+
+    @property
+    def is_normal(self) -> bool:
+        """True if each check is, see `SignalCheck`."""
+        return all(check.is_normal for check in self._checks)
+
+    @property
+    def numbers(self) -> tuple[NDArray[np.void], NDArray[np.void], NDArray[np.float64]]:
+        """Numbers of the timeouts and of the stuck sensors, and limits of spikes: the checks' own arrays."""
+        return self._silence.numbers, self._stuck.numbers, self._spike.limits
+
+    @property
+    def receipts(self) -> NDArray[np.void]:
+        """Numbers of the plant's timeout in receive time, shape (1,)."""
+        return self._silence.of_plant.receipts
+
+    @property
+    def trainings(self) -> list[tuple[dict[int, int], float]]:
+        """See `StuckCheck.trainings`."""
+        return self._stuck.trainings
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """Learn from the training; arguments as for `SignalCheck.start`."""

@@ -57,8 +57,8 @@ def health_message(said: list[Publication], plant: str) -> Health:
         (SignalChecks, "check_row", "row"),
         (Annunciator, "end_row", "row"),
         (PlantPipeline, "snapshots", "models"),
-        (QuietForm, "written", "demotion"),
-        (QuietForm, "read", "promotion"),
+        (QuietForm, "demote", "demotion"),
+        (QuietForm, "promote", "promotion"),
     ],
 )
 def test_an_error_in_one_plant_of_a_fleet_changes_nothing_for_the_others(
@@ -72,7 +72,7 @@ def test_an_error_in_one_plant_of_a_fleet_changes_nothing_for_the_others(
     """Whatever the stage: the others are judged as alone, value for value; the error is counted and reported once."""
     if owner is QuietForm:
         method = getattr(QuietForm, name)
-        place = 0 if name == "read" else 1  # the arguments that name the plant
+        place = 0 if name == "promote" else 1  # the arguments that name the plant
 
         def failing(self: QuietForm, *arguments: Any) -> Any:
             plant = arguments[0] if place == 0 else arguments[0].config.plant

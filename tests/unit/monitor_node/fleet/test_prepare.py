@@ -15,9 +15,9 @@ from reactorwatch.identification import information
 from ..fleets import QUICK, SECOND_NS, fleet, row_by_row, run_of
 
 LONG_COMPILED: tuple[tuple[ModuleType, str], ...] = (
-    (plants, "judge"),
+    (plants, "step_rows"),
     (plants, "take_samples"),
-    (plants, "silent_from"),
+    (plants, "find_deadlines"),
     (information, "learn_one"),
     (sample_bytes, "_read"),
 )
