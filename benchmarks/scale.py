@@ -47,7 +47,7 @@ from benchmarks.fleet.traffic import (
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.node import UNCACHED, FleetNode, watch
-from monitor_node.quiet.slots import NEVER_NS
+from monitor_node.fleet.packed.array import NEVER_NS
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.runtime import bus_zenoh

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from monitor_node.alarms.alarms import ChartAlarm, Explanation, chart_point
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.alarms.on_off_delay import DELAY
 from monitor_node.config import MonitorConfig, PriorityName
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
@@ -203,8 +202,6 @@ class ChartWatch:
             for pair in alarm_names(config)
         }
         self._names = list[str](dict.fromkeys(name for name, _ in self._alarms))
-        self.delays = np.zeros(len(self._alarms), DELAY)
-        """Numbers of the alarms while none is active, see `load_delays`."""
         self._watched: dict[str, _Watched] = {}
         self._evaluated: list[bool] = []
         self._chosen: list[str] = []
@@ -223,20 +220,24 @@ class ChartWatch:
         """True if all charts are made, and at most their alarms remember points."""
         return list(self._watched) == self._names and self._board.is_at_rest(self._alarms.values())
 
-    def numbers(self, name: str) -> Array | None:
-        """Numbers of the charts of a name; None if there are none."""
-        watched = self._watched.get(name)
-        return None if watched is None or isinstance(watched.charts, _OfEach) else watched.charts.numbers
-
-    def load_delays(self) -> None:
-        """Fill `delays` from the alarms."""
-        for p, alarm in zip(self.delays, self._alarms.values(), strict=True):
+    def load(self, p: np.void) -> None:
+        """Fill the numbers of a plant, see `row_step.row_type`, from the charts and their alarms."""
+        for name, watched in self._watched.items():
+            assert not isinstance(watched.charts, _OfEach)
+            p[name] = watched.charts.numbers
+        for delay, alarm in zip(p["delays"], self._alarms.values(), strict=False):
             rule = alarm.memory.rule
-            p["recent"], p["in_a_row"], p["above"] = rule.recent, rule.in_a_row, alarm.memory.above
+            delay["recent"], delay["in_a_row"], delay["above"] = rule.recent, rule.in_a_row, alarm.memory.above
 
-    def store_delays(self) -> None:
-        """Take over into the alarms what compiled steps have written into `delays`."""
-        for (recent, in_a_row, _), alarm in zip(self.delays.tolist(), self._alarms.values(), strict=True):
+    def store(self, p: np.void) -> None:
+        """Take over into the charts what compiled steps have written into the numbers of a plant."""
+        for name, watched in self._watched.items():
+            assert not isinstance(watched.charts, _OfEach)
+            watched.charts.numbers[:] = p[name]
+
+    def store_delays(self, p: np.void) -> None:
+        """Take over into the alarms what compiled steps have written into the numbers of a plant."""
+        for (recent, in_a_row, _), alarm in zip(p["delays"].tolist(), self._alarms.values(), strict=False):
             rule = alarm.memory.rule
             rule.recent, rule.in_a_row = recent, in_a_row
         for watched in self._watched.values():
@@ -247,7 +248,7 @@ class ChartWatch:
 
         Args:
             time_ns: time of the row.
-            points: numbers of a `Judgement` in each row, one row an alarm, shape (alarms, 5).
+            points: numbers of a `Judgement` in each row, one row an alarm; shape (at least the number of alarms, 5).
         """
         paths = [path for watched in self._watched.values() for path in watched.keys]
         judgements = [
@@ -256,7 +257,7 @@ class ChartWatch:
         ]
         return [
             Publication(path, chart_point(time_ns, judgement))
-            for path, judgement in zip(paths, judgements, strict=True)
+            for path, judgement in zip(paths, judgements, strict=False)
         ]
 
     def choose(self, evaluated: list[bool], e: Array) -> dict[str, str]:

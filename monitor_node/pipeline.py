@@ -29,7 +29,7 @@ from monitor_node.failures import Failures
 from monitor_node.ingest.alignment import Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.isolation.stage import Suspicion, has_causes
-from monitor_node.row_step import CHARTS, EVENT, VIOLATING, RowNumbers, RowStep
+from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.signal_checks.stage import SignalChecks
 from monitor_node.state.pipeline_state import PipelineState, TrainedState
 from reactorwatch.contract import keys
@@ -41,7 +41,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.prewhitening import WHITENER, Prewhitener, Prewhitening
+from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
 
 
 def check_promise(config: MonitorConfig, period_min: float) -> None:
@@ -99,7 +99,9 @@ class PlantPipeline:
         self._is_process = self._is_process_given = model is not None or config.reference == "process"
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
-        self.signals = SignalChecks(config, board, signal_ranges(self.model, (config.input, *config.outputs)))
+        self._numbers: Records = np.zeros(1, numbers_type(config))
+        ranges = signal_ranges(self.model, (config.input, *config.outputs))
+        self.signals = SignalChecks(config, board, ranges, self._numbers)
         self._drift = DriftWatch(config, board, told=points)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
@@ -107,9 +109,8 @@ class PlantPipeline:
         self._checks: list[Check] = []
         self._reference: Reference | None = None
         self._whiteners: list[Prewhitener] = []
-        self._whitener_numbers = np.zeros(len(config.outputs), WHITENER)
         self._step: RowStep | None = None
-        self._numbers: RowNumbers | None = None
+        self._kalman: FilterNumbers | None = None
         self._row = np.empty(1 + len(config.outputs))
         self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
@@ -128,6 +129,8 @@ class PlantPipeline:
     @property
     def state(self) -> PipelineState:
         """A copy of the state between two rows, without the alarms."""
+        if self.is_normal:
+            self._charts.store(self._numbers[0])
         return PipelineState(
             self._sampling.copy_state(),
             self.signals.state,
@@ -180,7 +183,8 @@ class PlantPipeline:
         self._leave_out(watched.left_out)
         self._set_reference(self._restore_reference(watched.reference), learned, watched.arl0)
         self._whiteners = [
-            Prewhitener.from_state(item, self._whitener_numbers[i : i + 1]) for i, item in enumerate(watched.whiteners)
+            Prewhitener.from_state(item, self._numbers["whiteners"][0, i : i + 1])
+            for i, item in enumerate(watched.whiteners)
         ]
         self._charts.restore(watched.charts, self._evaluated)
         if (watched.suspicion is None) != (self._suspicion is None):
@@ -198,7 +202,7 @@ class PlantPipeline:
 
     def resume_from_alarms(self) -> None:
         """Follow alarms that were set from outside."""
-        self.is_normal = False
+        self._leave_normal()
         self.signals.resume_from_alarms()
 
     @property
@@ -246,6 +250,7 @@ class PlantPipeline:
         follows = self._sampling.follows(time_ns) and not row.restarted
         if self.is_normal and not row.restarted and self._step_row(row, units, publications, follows=follows):
             return
+        self._leave_normal()
         publications.extend(self.signals.check_row(time_ns, row.values))
         measured = self.signals.mask_values(time_ns, row.values, publications) if self._is_process else row.values
         input_value, *values = measured
@@ -363,7 +368,7 @@ class PlantPipeline:
         self._checks = trained.checks
         self._set_reference(trained.reference, trained.learned, arl0)
         self._whiteners = [
-            Prewhitener(item, self._whitener_numbers[i : i + 1]) for i, item in enumerate(trained.learned)
+            Prewhitener(item, self._numbers["whiteners"][0, i : i + 1]) for i, item in enumerate(trained.learned)
         ]
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
@@ -377,7 +382,10 @@ class PlantPipeline:
         self._is_process = self._is_process_given or isinstance(reference, ProcessReference)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
-        self._step, self._numbers = RowStep.of(self._config, self._reference_model), None
+        self._step, self._kalman = RowStep.of(self._config, self._reference_model), None
+        if self._step is not None and isinstance(reference, ProcessReference):
+            belief, variances = reference.numbers
+            self._kalman = FilterNumbers(belief[None], variances[None])
 
     @property
     def _reference_model(self) -> ProcessModel | None:
@@ -404,34 +412,10 @@ class PlantPipeline:
     # --- ordinary rows ----------------------------------------------------------------------------------------
 
     @property
-    def numbers(self) -> RowNumbers:
-        """Numbers of all stages, as views of their own arrays; of a plant in its normal state."""
-        if self._numbers is None:
-            assert self._step is not None
-            assert isinstance(self._reference, ProcessReference)
-            empty = self._step.shape(1, np.zeros)
-            timeouts, stuck, limits = self.signals.numbers
-            belief, variances = self._reference.numbers
-            charts = [self._charts.numbers(name) for name in CHARTS]
-            shewhart, ewma, cusum, mewma = (
-                numbers[None] if numbers is not None else none
-                for numbers, none in zip(charts, (empty.shewhart, empty.ewma, empty.cusum, empty.mewma), strict=True)
-            )
-            self._numbers = RowNumbers(
-                timing=empty.timing,
-                timeouts=timeouts[None],
-                belief=belief[None],
-                variances=variances[None],
-                whiteners=self._whitener_numbers[None],
-                stuck=stuck[None],
-                spike_limits=limits[None],
-                shewhart=shewhart,
-                ewma=ewma,
-                cusum=cusum,
-                mewma=mewma,
-                delays=self._charts.delays[None],
-            )
-        return self._numbers
+    def numbers(self) -> tuple[Records, FilterNumbers]:
+        """Numbers of the stages and of the filter, each with a first axis of one; of a plant in its normal state."""
+        assert self._kalman is not None
+        return self._numbers, self._kalman
 
     def _find_normal(self, time_ns: int) -> bool:
         """True if the compiled step may take the row after this one; it then finds its numbers."""
@@ -442,26 +426,33 @@ class PlantPipeline:
             return False
         if not (self.signals.is_normal and reference.is_normal(time_min)):
             return False
-        numbers = self.numbers
-        if numbers.timeouts["last_ns"][0, 0] != time_ns or not all(item.is_ready for item in self._whiteners):
+        p = self._numbers[0]
+        if p["timeouts"]["last_ns"][0] != time_ns or not all(item.is_ready for item in self._whiteners):
             return False
-        numbers.timing[0] = (time_ns, sampling.period_ns, time_min, reference.last_input)
-        self._charts.load_delays()
+        p["last_ns"], p["period_ns"] = time_ns, sampling.period_ns
+        p["time_min"], p["input"] = time_min, reference.last_input
+        self._charts.load(p)
         return True
+
+    def _leave_normal(self) -> None:
+        """Take over into the charts what compiled steps have computed."""
+        if self.is_normal:
+            self._charts.store(self._numbers[0])
+            self.is_normal = False
 
     def _step_row(self, row: Row, units: list[str], publications: list[Publication], *, follows: bool) -> bool:
         """Process a row by the compiled step; returns False if it is an event, for which nothing has changed."""
         assert self._step is not None
+        assert self._kalman is not None
         assert isinstance(self._reference, ProcessReference)
         time_ns, values = row.time_ns, row.values
         time_min = time_ns / MINUTE_NS
         self._row[:] = values
-        verdict = self._step.update(self.numbers, time_ns, time_min, self._row)
+        verdict = self._step.update(self._numbers, self._kalman, time_ns, time_min, self._row)
         if verdict == EVENT:
-            self.is_normal = False
             return False
         if verdict == VIOLATING:
-            self._charts.store_delays()
+            self._charts.store_delays(self._numbers[0])
         self._reference.accept_row(time_min, values[0])
         self.rows_watched += 1
         if self._points:
@@ -478,13 +469,13 @@ class PlantPipeline:
         self, time_ns: int, values: list[float], units: list[str], publications: list[Publication]
     ) -> None:
         assert self._step is not None
-        outcome, count = self._step.outcome, len(values)
-        outputs = outcome.outputs.tolist()
+        work, count = self._step.work[0], len(values)
+        outputs = work["outputs"].tolist()
         predictions, sds = outputs[:count], outputs[2 * count : 3 * count]
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
-        expected = outcome.expected.tolist()
+        expected = work["expected"].tolist()
         publications.extend(self._estimates(time_ns, values, predictions, sds, scales, expected, units))
-        publications.extend(self._charts.points(time_ns, outcome.points))
+        publications.extend(self._charts.points(time_ns, work["points"]))
 
     # --- events -----------------------------------------------------------------------------------------------
 

@@ -1,8 +1,9 @@
 """A row through all stages of a monitor in one compiled step, for one plant as for ten thousand.
 
 Most rows of most plants are alike: every signal has a value, the filter predicts it, no alarm changes. All that the
-stages then update are numbers, in arrays that belong to the stages. A monitor of one plant steps over its stages' own
-arrays (first axis 1), a fleet over arrays of all its plants; the steps themselves are in the stages' modules.
+stages then update are numbers: one record a plant, whose type is composed of the stages' own (`row_type`). A monitor of
+one plant steps over an array of one record, a fleet over one with a record for each plant; the steps themselves are in
+the stages' modules.
 
 Any other row is an event, and changes nothing here: the stages process it one by one (`pipeline`), with the same
 numbers. Events are: a row after a gap or a missing row; one by which the filter restarts; a value out of the signal's
@@ -40,7 +41,7 @@ from reactorwatch.spc.charts.mewma import Mewma, count_numbers
 from reactorwatch.spc.charts.mewma import move as move_mewma
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.charts.shewhart import _judge as judge_shewhart
-from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, STATISTIC, CompiledChart, X
+from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, STATISTIC, X
 from reactorwatch.spc.prewhitening import WHITENER, expected_value, innovation
 
 ORDINARY, VIOLATING, EVENT = 0, 1, 2
@@ -59,133 +60,115 @@ POINT = 5
 """Numbers of a chart's point: those of a `Judgement`."""
 
 Records: TypeAlias = NDArray[np.void]
-Indices: TypeAlias = NDArray[np.int32]
-
-TIMING = np.dtype([("last_ns", "i8"), ("period_ns", "f8"), ("time_min", "f8"), ("input", "f8")], align=True)
-"""Time of the newest row, sampling period, time and input of the filter's newest row."""
 
 
-class RowNumbers(NamedTuple):
-    """Numbers of the stages of some plants; the first axis of each array is the plant.
+def row_type(outputs: int, alarms: int) -> np.dtype[Any]:
+    """Type of the numbers of a plant's stages, composed of the stages' own; the filter has its belief elsewhere.
+
+    Args:
+        outputs: number of monitored outputs.
+        alarms: number of alarms that the charts can raise.
+    """
+    return np.dtype(
+        [
+            ("last_ns", "i8"),  # time of the newest row
+            ("period_ns", "f8"),  # sampling period
+            ("time_min", "f8"),  # time of the filter's newest row
+            ("input", "f8"),  # input of that row
+            ("timeouts", TIMEOUT, (2 + outputs,)),  # of the plant, the input and each output
+            ("whiteners", WHITENER, (outputs,)),
+            ("stuck", STUCK, (outputs,)),
+            ("spike_limits", "f8", (outputs,)),
+            ("shewhart", "f8", (Shewhart.numbers, outputs)),
+            ("ewma", "f8", (Ewma.numbers, outputs)),
+            ("cusum", "f8", (Cusum.numbers, outputs)),
+            ("mewma", "f8", (count_numbers(outputs),)),
+            ("delays", DELAY, (max(alarms, 1),)),
+        ],
+        align=True,
+    )
+
+
+def work_type(outputs: int, alarms: int) -> np.dtype[Any]:
+    """Type of the results of a step.
+
+    Args:
+        outputs: number of monitored outputs.
+        alarms: number of alarms that the charts can raise.
+    """
+    rows = SETTINGS + max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
+    return np.dtype(
+        [
+            ("new", "f8", (5 + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
+            ("outputs", "f8", (5 * outputs + 1,)),  # its results
+            ("expected", "f8", (outputs,)),  # expected values of the prewhitening filters
+            ("e", "f8", (outputs,)),  # prewhitened residuals
+            ("columns", "f8", (rows, outputs)),  # columns of a bank of charts, see `compiled_chart`
+            ("points", "f8", (max(alarms, 1), POINT)),  # points of the charts, one row an alarm
+        ],
+        align=True,
+    )
+
+
+def settings_type(outputs: int, alarms: int) -> np.dtype[Any]:
+    """Type of the constants of a step.
+
+    Args:
+        outputs: number of monitored outputs.
+        alarms: number of alarms that the charts can raise.
+    """
+    return np.dtype(
+        [
+            ("filter_address", "i8"),  # address of the filter's machine code
+            ("ranges", "f8", (1 + outputs, 2)),  # smallest and largest value of each signal
+            ("silence_limit", "f8"),  # see `DataTimeout`
+            ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
+            ("rules", "i8", (max(alarms, 1), 2)),  # violating points that raise each alarm, mask of its window
+            ("reach", "f8"),  # see `is_normal`
+            ("weight", "f8"),  # weight of the MEWMA chart
+        ],
+        align=True,
+    )
+
+
+class FilterNumbers(NamedTuple):
+    """Numbers of the filters of some plants.
 
     Attributes:
-        timing: newest row, see `TIMING`, shape (plants,).
-        timeouts: timeouts of the plant and of each signal, shape (plants, 1 + signals).
-        belief: state of the filter and its covariance, shape (plants, states + states^2).
+        belief: state and covariance, shape (plants, states + states^2).
         variances: variances of the sensors and of the process, shape (plants, outputs + states).
-        whiteners: shape (plants, outputs).
-        stuck: shape (plants, outputs).
-        spike_limits: shape (plants, outputs).
-        shewhart: numbers of the charts, shape (plants, numbers of one chart, outputs); so for the next two.
-        ewma: see `shewhart`.
-        cusum: see `shewhart`.
-        mewma: shape (plants, numbers).
-        delays: delays of the charts' alarms, shape (plants, alarms).
     """
 
-    timing: Records
-    timeouts: Records
     belief: Array
     variances: Array
-    whiteners: Records
-    stuck: Records
-    spike_limits: Array
-    shewhart: Array
-    ewma: Array
-    cusum: Array
-    mewma: Array
-    delays: Records
-
-
-class Outcome(NamedTuple):
-    """Results of a step, for publication, and arrays to work in.
-
-    Attributes:
-        outputs: results of the filter, see `ekf_step.row_function`.
-        expected: expected values of the prewhitening filters, shape (outputs,).
-        e: prewhitened residuals, shape (outputs,).
-        points: points of the charts, one row an alarm, shape (alarms, POINT).
-        new: new values of the filter, see `ekf_step.row_function`.
-        constants: constants of the filter; begin with the parameters of the model.
-        belief: belief of the filter after the row.
-        columns: columns of a bank of charts, see `compiled_chart`.
-    """
-
-    outputs: Array
-    expected: Array
-    e: Array
-    points: Array
-    new: Array
-    constants: Array
-    belief: Array
-    columns: Array
-
-
-class StepSettings(NamedTuple):
-    """Constants of a step.
-
-    Attributes:
-        filter_address: address of the filter's machine code.
-        parameters: number of parameters of the model.
-        ranges: smallest and largest value of each signal, shape (signals, 2).
-        silence_limit: see `DataTimeout`.
-        charts: index of the first alarm of each of `CHARTS`; -1: there is no such chart.
-        rules: number of violating points that raises each alarm, and mask of its window, shape (alarms, 2).
-        reach: see `is_normal`.
-        weight: weight of the MEWMA chart.
-    """
-
-    filter_address: int
-    parameters: int
-    ranges: Array
-    silence_limit: float
-    charts: Indices
-    rules: Indices
-    reach: float
-    weight: float
-
-
-@jit
-def _copy(source: Any, i: int, into: Any, j: int) -> None:
-    """Copy what a step changes."""
-    into.timing[j] = source.timing[i]
-    for k in range(source.timeouts.shape[1]):
-        into.timeouts[j, k] = source.timeouts[i, k]
-    for k in range(source.whiteners.shape[1]):
-        into.whiteners[j, k] = source.whiteners[i, k]
-        into.stuck[j, k] = source.stuck[i, k]
-    for row in range(source.shewhart.shape[1]):
-        for k in range(source.shewhart.shape[2]):
-            into.shewhart[j, row, k] = source.shewhart[i, row, k]
-    for row in range(source.ewma.shape[1]):
-        for k in range(source.ewma.shape[2]):
-            into.ewma[j, row, k] = source.ewma[i, row, k]
-    for row in range(source.cusum.shape[1]):
-        for k in range(source.cusum.shape[2]):
-            into.cusum[j, row, k] = source.cusum[i, row, k]
-    for k in range(source.mewma.shape[1]):
-        into.mewma[j, k] = source.mewma[i, k]
-    for k in range(source.delays.shape[1]):
-        into.delays[j, k] = source.delays[i, k]
 
 
 @jit
 def _predict(
-    timing: Any, belief: Array, variances: Array, outcome: Any, settings: Any, time_min: float, values: Array
+    p: Any,
+    belief: Array,
+    variances: Array,
+    parameters: Array,
+    after: Array,
+    work: Any,
+    filter_address: int,
+    time_min: float,
+    values: Array,
 ) -> bool:
     """Filter a row that is at most two integration steps after the one before; returns True if all went well."""
-    count, new, constants = values.size - 1, outcome.new, outcome.constants
-    step = 0.5 * (time_min - timing.time_min)
+    count, new = values.size - 1, work.new
+    step = 0.5 * (time_min - p.time_min)
     if not (step > 0.0 and 2.0 * step <= LONGEST_ROW_MIN):
         return False
-    new[0], new[1], new[2], new[3], new[4] = timing.input, values[0], time_min, step, step
+    new[0], new[1], new[2], new[3], new[4] = p.input, values[0], time_min, step, step
     for i in range(count):
         new[5 + i], new[5 + count + i] = values[1 + i], GATE
+    first = parameters.size - variances.size
     for i in range(variances.size):
-        constants[settings.parameters + i] = variances[i]
-    before, given, known = belief.ctypes.data, new.ctypes.data, constants.ctypes.data
-    call_at(settings.filter_address, (1, before, given, known, outcome.belief.ctypes.data, outcome.outputs.ctypes.data))
-    return bool(outcome.outputs[outcome.outputs.size - 1] != 0.0)
+        parameters[first + i] = variances[i]
+    before, given, constants = belief.ctypes.data, new.ctypes.data, parameters.ctypes.data
+    call_at(filter_address, (1, before, given, constants, after.ctypes.data, work.outputs.ctypes.data))
+    return bool(work.outputs[work.outputs.size - 1] != 0.0)
 
 
 @jit
@@ -209,52 +192,54 @@ def _lay_out(columns: Array, numbers: Array, e: Array) -> None:
 
 
 @jit
-def _take_points(delays: Any, outcome: Any, numbers: Array, settings: Any, first: int) -> int:
+def _take_points(p: Any, work: Any, numbers: Array, settings: Any, first: int) -> int:
     """Take over what a bank of charts has computed; returns the verdict."""
-    columns, verdict = outcome.columns, ORDINARY
+    columns, points, verdict = work.columns, work.points, ORDINARY
     for i in range(numbers.shape[1]):
         for row in range(numbers.shape[0]):
             numbers[row, i] = columns[SETTINGS + row, i]
-        point = outcome.points[first + i]
         for k in range(POINT):
-            point[k] = columns[STATISTIC + k, i]
-        verdict = max(verdict, _add_point(delays[first + i], point, settings, first + i))
+            points[first + i, k] = columns[STATISTIC + k, i]
+        verdict = max(verdict, _add_point(p.delays[first + i], points[first + i], settings, first + i))
     return verdict
 
 
 @jit
-def _update_charts(scratch: Any, outcome: Any, settings: Any) -> int:
+def _update_charts(p: Any, work: Any, settings: Any) -> int:
     """Update the charts with the prewhitened residuals; returns the verdict."""
-    charts, columns, e, delays, verdict = settings.charts, outcome.columns, outcome.e, scratch.delays[0], ORDINARY
+    charts, columns, e, verdict = settings.charts, work.columns, work.e, ORDINARY
     if charts[0] >= 0:
-        _lay_out(columns, scratch.shewhart[0], e)
+        _lay_out(columns, p.shewhart, e)
         judge_shewhart(columns)
-        verdict = max(verdict, _take_points(delays, outcome, scratch.shewhart[0], settings, charts[0]))
+        verdict = max(verdict, _take_points(p, work, p.shewhart, settings, charts[0]))
     if charts[1] >= 0:
-        _lay_out(columns, scratch.ewma[0], e)
+        _lay_out(columns, p.ewma, e)
         judge_ewma(columns)
-        verdict = max(verdict, _take_points(delays, outcome, scratch.ewma[0], settings, charts[1]))
+        verdict = max(verdict, _take_points(p, work, p.ewma, settings, charts[1]))
     if charts[2] >= 0:
-        _lay_out(columns, scratch.cusum[0], e)
+        _lay_out(columns, p.cusum, e)
         judge_cusum(columns)
-        verdict = max(verdict, _take_points(delays, outcome, scratch.cusum[0], settings, charts[2]))
+        verdict = max(verdict, _take_points(p, work, p.cusum, settings, charts[2]))
     if charts[3] >= 0:
-        limit, point = scratch.mewma[0, 0], outcome.points[charts[3]]
-        statistic = move_mewma(scratch.mewma[0], e, settings.weight)
+        statistic, limit, point = move_mewma(p.mewma, e, settings.weight), p.mewma[0], work.points[charts[3]]
         if statistic < 0.0:
             return EVENT
         point[0], point[1], point[2], point[3] = statistic, float(e.size), 0.0, limit
         point[4] = 1.0 if statistic > limit else 0.0
-        verdict = max(verdict, _add_point(delays[charts[3]], point, settings, charts[3]))
+        verdict = max(verdict, _add_point(p.delays[charts[3]], point, settings, charts[3]))
     return verdict
 
 
 @jit
 def step(
-    numbers: Any,
-    scratch: Any,
-    outcome: Any,
-    settings: Any,
+    numbers: Records,
+    scratch: Records,
+    works: Records,
+    constants: Records,
+    beliefs: Array,
+    variances: Array,
+    parameters: Array,
+    after: Array,
     plant: int,
     time_ns: int,
     time_min: float,
@@ -263,50 +248,57 @@ def step(
     """Take a row through all stages; returns the verdict.
 
     Args:
-        numbers: numbers of the plants.
-        scratch: numbers of one plant, to work in.
-        outcome: filled.
-        settings: constants.
+        numbers: numbers of the plants, shape (plants,), see `row_type`.
+        scratch: numbers of one plant, to work in, shape (1,).
+        works: filled, shape (1,), see `work_type`.
+        constants: constants of the step, shape (1,), see `settings_type`.
+        beliefs: beliefs of the filters, see `FilterNumbers`.
+        variances: variances of the filters, see `FilterNumbers`.
+        parameters: parameters of the model, and room for the variances, shape (parameters + outputs + states,).
+        after: belief of a filter, to work in.
         plant: index of the plant.
         time_ns: time of the row.
         time_min: the same in minutes.
         values: values of the row, the input first.
     """
-    _copy(numbers, plant, scratch, 0)
-    timing = scratch.timing[0]
-    spacing_ns = time_ns - timing.last_ns
-    if spacing_ns <= 0 or float(spacing_ns) > MOST_PERIODS * timing.period_ns:
+    scratch[0] = numbers[plant]
+    p, work, settings = scratch[0], works[0], constants[0]
+    spacing_ns = time_ns - p.last_ns
+    if spacing_ns <= 0 or float(spacing_ns) > MOST_PERIODS * p.period_ns:
         return EVENT
     for i in range(values.size):
         if not settings.ranges[i, 0] <= values[i] <= settings.ranges[i, 1]:
             return EVENT
-    belief = numbers.belief[plant]
-    if not _predict(timing, belief, numbers.variances[plant], outcome, settings, time_min, values):
+    belief, address = beliefs[plant], settings.filter_address
+    if not _predict(p, belief, variances[plant], parameters, after, work, address, time_min, values):
         return EVENT
-    for i in range(scratch.timeouts.shape[1]):
-        if update_timeout(scratch.timeouts[0, i], time_ns, True, settings.silence_limit, -1)[0]:
+    for i in range(p.timeouts.size):
+        if update_timeout(p.timeouts[i], time_ns, True, settings.silence_limit, -1)[0]:
             return EVENT
     outputs = values.size - 1
     for i in range(outputs):
-        value, whitener = values[1 + i], scratch.whiteners[0, i]
-        take_reading(scratch.stuck[0, i], value)
-        if is_stuck(scratch.stuck[0, i]):
+        value, whitener = values[1 + i], p.whiteners[i]
+        take_reading(p.stuck[i], value)
+        if is_stuck(p.stuck[i]):
             return EVENT
-        outcome.expected[i] = expected_value(whitener)
-        outcome.e[i] = innovation(whitener, (value - outcome.outputs[i]) / outcome.outputs[2 * outputs + i])
-        if not (abs(outcome.e[i]) <= numbers.spike_limits[plant, i] and abs(outcome.e[i]) < LARGEST_VALUE):
+        work.expected[i] = expected_value(whitener)
+        work.e[i] = innovation(whitener, (value - work.outputs[i]) / work.outputs[2 * outputs + i])
+        if not (abs(work.e[i]) <= p.spike_limits[i] and abs(work.e[i]) < LARGEST_VALUE):
             return EVENT
-    verdict = _update_charts(scratch, outcome, settings)
+    verdict = _update_charts(p, work, settings)
     if verdict == EVENT:
         return EVENT
-    timing.last_ns, timing.time_min, timing.input = time_ns, time_min, values[0]
+    p.last_ns, p.time_min, p.input = time_ns, time_min, values[0]
     for i in range(belief.size):
-        belief[i] = outcome.belief[i]
-    _copy(scratch, 0, numbers, plant)
+        belief[i] = after[i]
+    numbers[plant] = scratch[0]
     return verdict
 
 
-_STEP = Entry(step)
+@lru_cache
+def step_entry(outputs: int, alarms: int) -> Entry:
+    """Machine code of the step for the types of these numbers of outputs and alarms."""
+    return Entry(step)
 
 
 class RowStep:
@@ -317,41 +309,33 @@ class RowStep:
         model: process model of the plants.
 
     Attributes:
-        settings: constants of the step.
-        outcome: results of the newest step.
-        scratch: numbers of one plant, to work in.
+        numbers_type: type of the numbers of a plant's stages.
+        filter_sizes: sizes of belief and variances of a filter.
+        settings: constants of the step, shape (1,).
+        parameters: parameters of the model, and room for the variances of a filter.
+        work: results of the newest step, shape (1,).
+        scratch: numbers of one plant, to work in, shape (1,).
+        after: belief of a filter, to work in.
     """
 
     def __init__(self, config: MonitorConfig, model: ProcessModel) -> None:
         outputs, states = len(config.outputs), len(model.states)
         kinds = [chart for chart, _ in alarm_names(config)]
-        self._sizes = (1 + len(model.inputs) + outputs, outputs, states, len(kinds))
-        self._filter = compiled_filter(model)
-        rules = [(1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1) for kind in kinds]
-        ranges = signal_ranges(model, (config.input, *config.outputs))
-        parameters = model.values()
-        self.settings = StepSettings(
-            self._filter.address,
-            parameters.size,
-            np.array([[item.lower, item.upper] for item in ranges]),
-            float(config.silence_periods),
-            np.array([kinds.index(kind) if kind in kinds else -1 for kind in CHARTS], dtype=np.int32),
-            np.array(rules, dtype=np.int32).reshape(-1, 2),
-            float(1 - config.dead_band),
-            float(config.chart_settings["mewma_weight"]),
-        )
-        rows = SETTINGS + max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
-        self.outcome = Outcome(
-            np.empty(5 * outputs + 1),
-            np.empty(outputs),
-            np.empty(outputs),
-            np.empty((len(kinds), POINT)),
-            np.empty(5 + 2 * outputs),
-            np.concatenate([parameters, np.empty(outputs + states)]),
-            np.empty(states + states**2),
-            np.empty((rows, outputs)),
-        )
-        self.scratch = self.shape(1, np.zeros)
+        self._filter, self._step = compiled_filter(model), step_entry(outputs, len(kinds))
+        self.numbers_type = numbers_type(config)
+        self.filter_sizes = states + states**2, outputs + states
+        self.settings = np.zeros(1, settings_type(outputs, len(kinds)))
+        p, ranges = self.settings[0], signal_ranges(model, (config.input, *config.outputs))
+        p["filter_address"], p["silence_limit"] = self._filter.address, config.silence_periods
+        p["ranges"] = [[item.lower, item.upper] for item in ranges]
+        p["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
+        for i, kind in enumerate(kinds):
+            p["rules"][i] = (1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1)
+        p["reach"], p["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
+        self.work = np.zeros(1, work_type(outputs, len(kinds)))
+        self.scratch = np.zeros(1, self.numbers_type)
+        self.after: Array = np.empty(self.filter_sizes[0])
+        self.parameters: Array = np.concatenate([model.values(), np.empty(outputs + states)])
 
     @staticmethod
     def of(config: MonitorConfig, model: ProcessModel | None) -> "RowStep | None":
@@ -367,31 +351,16 @@ class RowStep:
             return None
         return None if len(config.outputs) < 2 and Mewma.name in config.charts else RowStep(config, model)
 
-    def shape(self, plants: int, make: Any) -> RowNumbers:
-        """Numbers of some plants, made by a function of shape and type."""
-        timeouts, outputs, states, alarms = self._sizes
-        f8, mewma = np.dtype(np.float64), count_numbers(outputs) if self.settings.charts[3] >= 0 else 0
-        kinds: tuple[type[CompiledChart], ...] = (Shewhart, Ewma, Cusum)
-        counts = [kind.numbers if self.settings.charts[i] >= 0 else 0 for i, kind in enumerate(kinds)]
-        return RowNumbers(
-            timing=make((plants,), TIMING),
-            timeouts=make((plants, timeouts), TIMEOUT),
-            belief=make((plants, states + states**2), f8),
-            variances=make((plants, outputs + states), f8),
-            whiteners=make((plants, outputs), WHITENER),
-            stuck=make((plants, outputs), STUCK),
-            spike_limits=make((plants, outputs), f8),
-            shewhart=make((plants, counts[0], outputs), f8),
-            ewma=make((plants, counts[1], outputs), f8),
-            cusum=make((plants, counts[2], outputs), f8),
-            mewma=make((plants, mewma), f8),
-            delays=make((plants, alarms), DELAY),
-        )
-
-    def update(self, numbers: RowNumbers, time_ns: int, time_min: float, values: Array) -> int:
+    def update(self, numbers: Records, kalman: FilterNumbers, time_ns: int, time_min: float, values: Array) -> int:
         """Take a row of one plant through all stages; returns the verdict."""
-        verdict: int = _STEP.call(numbers, self.scratch, self.outcome, self.settings, 0, time_ns, time_min, values)
+        own = (self.scratch, self.work, self.settings, *kalman, self.parameters, self.after)
+        verdict: int = self._step.call(numbers, *own, 0, time_ns, time_min, values)
         return verdict
+
+
+def numbers_type(config: MonitorConfig) -> np.dtype[Any]:
+    """Type of the numbers of the stages of a plant with these settings."""
+    return row_type(len(config.outputs), len(alarm_names(config)))
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)

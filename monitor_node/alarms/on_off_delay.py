@@ -24,7 +24,7 @@ class OnOffDelayState:
     standing: bool = False
 
 
-DELAY = np.dtype([("recent", "i8"), ("in_a_row", "i8"), ("above", "i8")], align=True)
+DELAY = np.dtype([("recent", "i4"), ("in_a_row", "i4"), ("above", "i4")], align=True)
 """Numbers of an alarm that is not active: last points, normal points in a row, 1 if its last limit was the upper."""
 
 

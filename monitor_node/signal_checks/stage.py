@@ -50,19 +50,29 @@ class SignalChecks:
     Args:
         config: of the monitor.
         board: the alarms of the plant; those of the signals are declared here.
-        ranges: of the input and of each output; None: no bounds are known.
+        ranges: ranges of the input and of each output; None: no bounds are known.
+        numbers: numbers of the plant's stages, see `row_step.row_type`; None: the checks have their own.
     """
 
     CHANCE_ALARMS = sum(check.can_be_false for check in CHECKS)
     """Number of an output's alarms that can be false alarms."""
 
-    def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange] | None = None) -> None:
+    def __init__(
+        self,
+        config: MonitorConfig,
+        board: Annunciator,
+        ranges: Sequence[SignalRange] | None = None,
+        numbers: NDArray[np.void] | None = None,
+    ) -> None:
         self._board, self._outputs = board, config.outputs
         known = ranges or [ANY] * (1 + len(config.outputs))
         self._checks = [check(config, board, known) for check in CHECKS]
         self._silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
         self._stuck = next(check for check in self._checks if isinstance(check, StuckCheck))
         self._spike = next(check for check in self._checks if isinstance(check, SpikeCheck))
+        if numbers is not None:
+            self._silence.use(numbers["timeouts"][0])
+            self._stuck.numbers, self._spike.limits = numbers["stuck"][0], numbers["spike_limits"][0]
         self._on_row: list[Callable[..., list[Publication]]] = self._hooks("on_row")
         self._measured: list[Callable[..., tuple[float, ...]]] = self._hooks("measured")
         self._on_values: list[Callable[..., list[Publication]]] = self._hooks("on_values")
@@ -93,11 +103,6 @@ class SignalChecks:
     def is_normal(self) -> bool:
         """True if each check is, see `SignalCheck`."""
         return all(check.is_normal for check in self._checks)
-
-    @property
-    def numbers(self) -> tuple[NDArray[np.void], NDArray[np.void], NDArray[np.float64]]:
-        """Numbers of the timeouts and of the stuck sensors, and limits of spikes: the checks' own arrays."""
-        return self._silence.numbers, self._stuck.numbers, self._spike.limits
 
     @property
     def receipts(self) -> NDArray[np.void]:

@@ -467,6 +467,13 @@ class SilenceCheck(SignalCheck):
         times_ns = self.numbers["last_ns"]
         return not self.numbers["is_active"].any() and bool((times_ns == times_ns[0]).all())
 
+    def use(self, numbers: Numbers) -> None:
+        """Keep the numbers in an array of the plant from now on."""
+        numbers[:] = self.numbers
+        self.numbers = numbers
+        for i, silence in enumerate(self._silences):
+            silence.numbers = numbers[i : i + 1]
+
     def arm(self, now_ns: int) -> None:
         """Wait, after a stop, for the plant's next sample."""
         self.of_plant.arm(now_ns)

@@ -7,8 +7,8 @@ from typing import Any
 import numba
 import pytest
 
+from monitor_node.fleet.packed import plants
 from monitor_node.fleet.watched_plants import WatchedPlants
-from monitor_node.quiet import plants
 from reactorwatch.contract import sample_bytes
 from reactorwatch.identification import information
 

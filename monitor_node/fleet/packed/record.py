@@ -72,6 +72,6 @@ def record_type(outputs: int, states: int) -> np.dtype[Any]:
         ("usual_ns", i, ()),  # spacing that is kept as 0
         ("reference", i, (outputs,)),  # see `ring.Kept`
         ("levels", i, (LEVELS,)),
-        ("level_rows", np.int32, (LEVELS,)),
+        ("level_rows", np.int16, (LEVELS,)),
     ]
     return np.dtype([(name, kind, shape) for name, kind, shape in columns], align=True)

@@ -1,7 +1,7 @@
-"""Between all that a monitor remembers of a plant and its record.
+"""Conversion of a monitor to a packed plant and back.
 
 The numbers of the stages are copied. What changes with a row is in them, in the record and in the ring of the newest
-rows. What seldom changes, and is no number, is kept beside it (`Rest`), and shared between plants where it is the same.
+rows. What seldom changes, and is no number, is kept beside them (`Rest`), and shared between plants where it is equal.
 """
 
 from collections.abc import Sequence
@@ -19,20 +19,20 @@ from monitor_node.baseline.references import ProcessReferenceState
 from monitor_node.chart_stage import ChartsState, alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.ingest.alignment import REMEMBERED, AlignmentState
-from monitor_node.ingest.sampling import SamplingState
-from monitor_node.isolation.stage import SuspicionState, has_causes
-from monitor_node.quiet.layout import Records, record_type
-from monitor_node.quiet.lining_up import (
+from monitor_node.fleet.packed.pending import (
     alignment_of,
+    are_runs_complete,
     is_in_order,
-    run_on,
     runs_of,
     write_alignment,
     write_runs,
 )
-from monitor_node.quiet.ring import NewestRows, times_ns_of
-from monitor_node.row_step import RowNumbers, RowStep
+from monitor_node.fleet.packed.record import Array, Records, record_type
+from monitor_node.fleet.packed.ring import NewestRows, times_ns_of
+from monitor_node.ingest.alignment import REMEMBERED, AlignmentState
+from monitor_node.ingest.sampling import SamplingState
+from monitor_node.isolation.stage import SuspicionState, has_causes
+from monitor_node.row_step import RowStep
 from monitor_node.signal_checks.spike import SpikeState
 from monitor_node.signal_checks.stage import SignalChecksState
 from monitor_node.signal_checks.stuck import Stuck
@@ -83,7 +83,7 @@ class Rest(NamedTuple):
     cause: tuple[int, str, str]
 
 
-class QuietForm:
+class Conversion:
     """Conversion between monitors with certain settings and packed plants.
 
     Args:
@@ -118,7 +118,7 @@ class QuietForm:
         (self.figures,) = (item.message for item in fresh.alarms.end_row(0) if isinstance(item.message, AlarmKpis))
 
     @staticmethod
-    def of(config: MonitorConfig, model: ProcessModel | None) -> "QuietForm | None":
+    def of(config: MonitorConfig, model: ProcessModel | None) -> "Conversion | None":
         """The form of plants with these settings; None if they cannot be packed.
 
         Args:
@@ -128,7 +128,7 @@ class QuietForm:
         step = RowStep.of(config, model)
         if model is None or step is None:
             return None
-        form = QuietForm(config, model, step)
+        form = Conversion(config, model, step)
         return form if form.keeps >= form.remembered else None
 
     # --- from a monitor --------------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ class QuietForm:
             return None
         if board.kpis_changed or board.told is None or board.kpi_minute is None:
             return None
-        if not is_in_order(alignment) or not run_on(state.runs, alignment):
+        if not is_in_order(alignment) or not are_runs_complete(state.runs, alignment):
             return None
         rows = self._rows(alignment, watched.suspicion)
         sampling, reference = state.watch.sampling, watched.reference
@@ -189,7 +189,7 @@ class QuietForm:
         return rest, rows
 
     def _rows(self, alignment: AlignmentState, looked: SuspicionState | None) -> NewestRows | None:
-        """The newest rows; None if they are not known that far back, or not all were complete and in order."""
+        """Newest rows; None if not enough are known, or not all were complete and in order."""
         left = list(alignment.left.items())
         times_ns = [time_ns for time_ns, _ in left]
         newest = alignment.newest_numbers
@@ -218,14 +218,22 @@ class QuietForm:
     # --- to a monitor ----------------------------------------------------------------------------------------
 
     def promote(
-        self, plant: str, p: np.void, numbers: RowNumbers, rest: Rest, rows: NewestRows, waiting: Sequence[int]
+        self,
+        plant: str,
+        p: np.void,
+        numbers: np.void,
+        belief: Array,
+        rest: Rest,
+        rows: NewestRows,
+        waiting: Sequence[int],
     ) -> MonitorState:
         """State of a monitor of a plant.
 
         Args:
             plant: name of the plant.
             p: record of the plant.
-            numbers: numbers of its stages, without the axis of plants.
+            numbers: numbers of its stages.
+            belief: belief of its filter.
             rest: state beside the numbers.
             rows: newest rows.
             waiting: times of rows that were aligned and are not processed yet.
@@ -236,14 +244,13 @@ class QuietForm:
             known = packed(np.column_stack([minutes, rows.values]))
             looked = SuspicionState(known, rest.cause[0], None, None, rest.cause[1], rest.cause[2], None)
         outputs = range(len(self.config.outputs))
-        whiteners = [Prewhitener(None, numbers.whiteners[i : i + 1]).state for i in outputs]
-        last_ns, last_input = int(numbers.timing["last_ns"]), float(numbers.timing["input"])
-        belief, noise, states = numbers.belief.tolist(), p["noise"].tolist(), len(self._model.states)
+        whiteners = [Prewhitener(None, numbers["whiteners"][i : i + 1]).state for i in outputs]
+        last_ns, last_input = int(numbers["last_ns"]), float(numbers["input"])
+        noise, states = p["noise"].tolist(), len(self._model.states)
+        x, P = tuple(belief[:states].tolist()), tuple(belief[states:].tolist())
         reference = ProcessReferenceState(
             NoiseLevels(tuple(noise[: len(outputs)]), tuple(noise[len(outputs) :])),
-            FilterState(
-                float(numbers.timing["time_min"]), (last_input,), tuple(belief[:states]), tuple(belief[states:])
-            ),
+            FilterState(float(numbers["time_min"]), (last_input,), x, P),
             last_input,
             False,
             p["typical_sd"].tolist(),
@@ -263,7 +270,7 @@ class QuietForm:
             rest.until_drift,
         )
         watch = PipelineState(
-            SamplingState(last_ns, [], float(numbers.timing["period_ns"]), int(p["spacing_ns"])),
+            SamplingState(last_ns, [], float(numbers["period_ns"]), int(p["spacing_ns"])),
             self._signals_of(p, numbers, msgspec.msgpack.decode(rest.runs, type=list[EqualRuns])),
             self._predictors,
             rest.refusals,
@@ -289,41 +296,44 @@ class QuietForm:
             dict(rest.failures or {}),
         )
 
-    def _signals_of(self, p: np.void, numbers: RowNumbers, trainings: list[EqualRuns]) -> SignalChecksState:
+    def _signals_of(self, p: np.void, numbers: np.void, trainings: list[EqualRuns]) -> SignalChecksState:
         receipts = np.array([p["receipts"]])
         return SignalChecksState(
             [
                 DataTimeout(
-                    self.config.silence_periods, self.least_s, numbers.timeouts[i : i + 1], None if i else receipts
+                    self.config.silence_periods, self.least_s, numbers["timeouts"][i : i + 1], None if i else receipts
                 ).state
-                for i in range(len(numbers.timeouts))
+                for i in range(len(numbers["timeouts"]))
             ],
-            [Stuck.of_numbers(arl0, runs, numbers.stuck[i : i + 1]).state for i, (runs, arl0) in enumerate(trainings)],
+            [
+                Stuck.of_numbers(arl0, runs, numbers["stuck"][i : i + 1]).state
+                for i, (runs, arl0) in enumerate(trainings)
+            ],
             [
                 SpikeState(limit, "quiet", 0.0, []) if isfinite(limit) else None
-                for limit in numbers.spike_limits.tolist()
+                for limit in numbers["spike_limits"].tolist()
             ],
         )
 
-    def _charts(self, numbers: RowNumbers) -> dict[str, bytes]:
+    def _charts(self, numbers: np.void) -> dict[str, bytes]:
         charts: dict[str, bytes] = {}
         for name in dict.fromkeys(self.config.charts):
             if name == Mewma.name:
-                state = Mewma.state_of_numbers(numbers.mewma, self.config.chart_settings["mewma_weight"])
+                state = Mewma.state_of_numbers(numbers["mewma"], self.config.chart_settings["mewma_weight"])
                 charts[name] = state.to_bytes()
             else:
-                values = getattr(numbers, name).astype("<f8").tobytes()
+                values = numbers[name].astype("<f8").tobytes()
                 charts[name] = SignalState(name, len(self.config.outputs), values).to_bytes()
         return charts
 
-    def _board_of(self, plant: str, p: np.void, numbers: RowNumbers, rest: Rest) -> bytes:
+    def _board_of(self, plant: str, p: np.void, numbers: np.void, rest: Rest) -> bytes:
         board = msgspec.msgpack.decode(
             self._board if rest.board is None else rest.board.to_bytes(), type=AnnunciatorState
         )
-        for (recent, in_a_row, _), name in zip(numbers.delays.tolist(), self._alarms, strict=True):
+        for (recent, in_a_row, _), name in zip(numbers["delays"].tolist(), self._alarms, strict=False):
             rule = board.alarms[name].rule
             rule.recent, rule.in_a_row = recent, in_a_row
-        last_ns = int(numbers.timing["last_ns"])
+        last_ns = int(numbers["last_ns"])
         if rest.board is None:
             told = AlarmKpis()
             told.CopyFrom(self.figures)

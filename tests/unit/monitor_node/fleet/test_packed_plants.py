@@ -14,7 +14,7 @@ from monitor_node.state.monitor_state import MonitorState
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Health, Quality, Sample
 
-from .fleets import alone, fleet, of, row_by_row, run_of, stage_by_stage
+from ..fleets import alone, fleet, of, row_by_row, run_of, stage_by_stage
 
 ALL = MonitorConfig(training_min=20.0, isolation=False, charts=("shewhart", "ewma", "cusum", "mewma"))
 LOOKING = MonitorConfig(training_min=20.0)

@@ -1,7 +1,7 @@
-"""Samples of many plants lined up into rows by compiled code, as `SequenceCheck`, `Aligner` and `DataTimeout` do it.
+"""Alignment of samples of many plants, compiled, for samples in order; others are for `SequenceCheck` and `Aligner`.
 
-A sample that is not good, or not the very one that comes next of its signal, shuts the record: that one and all after
-it are for the plant's own monitor.
+A sample that is not good, or not the next of its signal, shuts the record: it and all after it are for the plant's own
+monitor.
 """
 
 from typing import Any
@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from monitor_node.fleet.packed.record import Array, Ints, Places, Records
 from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS
 from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_VALUE
 from monitor_node.ingest.sequence_check import ALIKE, TOLERANCE
 from monitor_node.ingest.sequence_check import DEVIATIONS as RUN_DEVIATIONS
 from monitor_node.ingest.sequence_check import MEMORY as RUN_MEMORY
-from monitor_node.quiet.layout import Array, Ints, Places, Records
 from monitor_node.signal_checks.timeout import LEARN_FROM, receive, timeout_ns
 from reactorwatch.codegen.numba_kernel import jit
 
@@ -52,28 +52,28 @@ def take_samples(
     row_values: Array,
     others: Places,
 ) -> tuple[int, int]:
-    """Line samples up into rows.
+    """Align samples to rows.
 
     Args:
         plants: records, shape (plants,).
-        codes: of each sample its plant times the signals plus its signal; -1: it is for somebody else.
-        plain: whether each is a good one.
-        time_ns: of each.
-        sequence: of each.
-        value: of each.
-        unit: of each, its digest.
-        received_ns: when each came.
-        now_ns: the time.
-        silence_limit: periods.
-        least_ns: of receipt time without anything that are always allowed.
-        most_left: rows that left that are remembered.
-        rows: filled: the plant of each row.
-        row_time_ns: filled: its time.
-        row_values: filled: its values, input first.
-        others: filled: the samples that are for the plants' own monitors, or somebody else.
+        codes: slot times the number of signals plus the index of the signal, of each sample; -1: of another plant.
+        plain: True for each usable sample.
+        time_ns: sample times.
+        sequence: sequence numbers.
+        value: values.
+        unit: digests of the units.
+        received_ns: receive times.
+        now_ns: present time.
+        silence_limit: see `DataTimeout`.
+        least_ns: least allowed receive time without a sample.
+        most_left: number of emitted rows that are remembered.
+        rows: filled with the slot of each row.
+        row_time_ns: filled with its time.
+        row_values: filled with its values, the input first.
+        others: filled with the indices of samples that are not processed.
 
     Returns:
-        How many rows, and how many such samples.
+        Number of rows, and of samples that are not processed.
     """
     signals = row_values.shape[1]
     whole = (1 << signals) - 1
@@ -119,12 +119,12 @@ def take_samples(
 
 
 @jit
-def find_deadlines(plants: Records, timeouts: Records, silence_limit: float, least_ns: int) -> Ints:
+def find_deadlines(plants: Records, numbers: Records, silence_limit: float, least_ns: int) -> Ints:
     """Time by slot at which the plant's data timeout expires, as `DataTimeout.due_ns`; never where there is none."""
     due_ns = np.empty(plants.size, np.int64)
     for slot in range(plants.size):
         receipts = plants[slot].receipts
         allowed = timeout_ns(receipts, silence_limit, least_ns)
-        is_known = allowed >= 0 and timeouts[slot, 0].spacing.count >= LEARN_FROM
+        is_known = allowed >= 0 and numbers[slot].timeouts[0].spacing.count >= LEARN_FROM
         due_ns[slot] = receipts.received_ns + allowed if is_known else np.int64(2**63 - 1)
     return due_ns

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.quiet.layout import LEVELS, Array, Bytes, Ints, Places, Records
-from monitor_node.quiet.ring import VALUE_BYTES, ZERO
+from monitor_node.fleet.packed.record import LEVELS, Array, Bytes, Ints, Places, Records
+from monitor_node.fleet.packed.ring import VALUE_BYTES, ZERO
 from monitor_node.row_step import EVENT, step
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.records.record import MINUTE_NS
@@ -19,7 +19,7 @@ _MINUTE_NS = int(MINUTE_NS)
 
 @jit
 def _level(p: Any, bits: int) -> int:
-    """Which level the input is at, perhaps a new one in place of one that no row has; `LEVELS` if there is none."""
+    """Index of the level that the input is at, perhaps one that was unused; `LEVELS` if there is none."""
     free = LEVELS
     for level in range(LEVELS):
         if p.level_rows[level] == 0:
@@ -62,14 +62,20 @@ def _fits(p: Any, spacing_ns: int, bits: NDArray[np.int64], is_kept: bool) -> bo
 @jit
 def step_rows(
     plants: Records,
-    numbers: Any,
-    scratch: Any,
-    outcome: Any,
-    settings: Any,
+    numbers: Records,
+    scratch: Records,
+    works: Records,
+    settings: Records,
+    beliefs: Array,
+    variances: Array,
+    parameters: Array,
+    after: Array,
     times: Places,
     ring: Bytes,
     others: Ints,
-    rows: Any,
+    row_slots: Places,
+    row_time_ns: Ints,
+    row_values: Array,
     row_time_min: Array,
     row_bits: Ints,
     kinds: Places,
@@ -78,28 +84,50 @@ def step_rows(
 
     Args:
         plants: records.
-        numbers: numbers of the stages, see `RowNumbers`.
+        numbers: numbers of the stages, see `row_step.row_type`.
         scratch: numbers of one plant, to work in.
-        outcome: see `Outcome`.
-        settings: see `StepSettings`.
+        works: see `row_step.work_type`.
+        settings: see `row_step.settings_type`.
+        beliefs: beliefs of the filters, see `FilterNumbers`.
+        variances: variances of the filters, see `FilterNumbers`.
+        parameters: see `row_step.step`.
+        after: see `row_step.step`.
         times: spacing before each of the newest rows, shape (plants, rows kept).
         ring: values of these rows, see `ring.Kept`, shape (plants, rows kept, bytes); without columns if there is no
             isolation.
         others: inputs at no level, shape (plants, rows kept).
-        rows: slot, time and values of each row, shapes (rows,), (rows,) and (rows, signals).
+        row_slots: slot of each row.
+        row_time_ns: time of each row.
+        row_values: values of each row, the input first, shape (rows, signals).
         row_time_min: time of each row in minutes.
         row_bits: values of each row as bits.
         kinds: filled with the kind of each row; after a row that is odd, all of its plant are.
     """
     keeps, is_kept = times.shape[1], ring.shape[2] > 0
-    for k in range(rows.slots.size):
-        slot, time_ns = rows.slots[k], rows.times_ns[k]
+    for k in range(row_slots.size):
+        slot, time_ns = row_slots[k], row_time_ns[k]
         p = plants[slot]
-        spacing_ns = time_ns - numbers.timing[slot].last_ns
+        spacing_ns = time_ns - numbers[slot].last_ns
         is_odd = p.odd or not _fits(p, spacing_ns, row_bits[k], is_kept)
-        if is_odd or (
-            step(numbers, scratch, outcome, settings, slot, time_ns, row_time_min[k], rows.values[k]) == EVENT
-        ):
+        if not is_odd:
+            is_odd = (
+                step(
+                    numbers,
+                    scratch,
+                    works,
+                    settings,
+                    beliefs,
+                    variances,
+                    parameters,
+                    after,
+                    slot,
+                    time_ns,
+                    row_time_min[k],
+                    row_values[k],
+                )
+                == EVENT
+            )
+        if is_odd:
             kinds[k] = ODD
             p.odd = 1
             continue
