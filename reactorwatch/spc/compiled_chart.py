@@ -151,6 +151,11 @@ class Bank(Generic[Kind]):
         self._out_offset = OUT * plants * self._columns.itemsize
 
     @property
+    def numbers(self) -> Array:
+        """Settings and memory of the charts, shape (numbers of one chart, plants): a view, contiguous."""
+        return self._columns[SETTINGS:]
+
+    @property
     def state(self) -> SignalState:
         """A copy of the full state of the charts."""
         numbers = self._columns[SETTINGS:].astype("<f8").tobytes()
