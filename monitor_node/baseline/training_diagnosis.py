@@ -7,6 +7,7 @@ them.
 """
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import msgspec
@@ -15,6 +16,8 @@ import numpy as np
 from monitor_node.baseline.training import TrainingState
 from reactorwatch.contract.messages_pb2 import Baseline
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
+from reactorwatch.errors import InputError
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME
@@ -97,13 +100,19 @@ def diagnose_training(job: DiagnosisJob) -> Finding:
     return Finding(job.first_ns, found.verdict, _reason(found), _json(lasting.to_object()))
 
 
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
 def read_equations(text: str) -> ProcessModel:
     """The model in `Baseline.model`, its clock that of samples on the bus: minutes since 1970-01-01 UTC.
+
+    It is the same object for the same text: what is prepared for one is prepared for all.
 
     Raises:
         InputError: it is no model of this software.
     """
-    return parse_extended_model(text).rebase(0).build()
+    try:
+        return parse_extended_model(text).rebase(0).build()
+    except InputError as error:
+        raise InputError(f"the model of the baseline {error}") from error
 
 
 def _reason(found: Diagnosis) -> str:

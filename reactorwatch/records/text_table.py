@@ -79,7 +79,7 @@ class TextTable:
         if column not in self._known:
             cells = self._table.column(str(column))
             if str(cells.type) == "double":
-                values = np.asarray(cells.to_numpy())
+                values = np.array(cells.to_numpy())  # a copy: users may change it
             else:
                 text = cells.combine_chunks()
                 values, bad = to_numbers(text, self.layout.decimal, self.layout.missing)

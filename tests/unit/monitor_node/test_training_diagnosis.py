@@ -12,8 +12,9 @@ from monitor_node.replay import backtest
 from monitor_node.replay.verification import verify
 from monitor_node.state.monitor_state import SEAL, equations_text
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from reactorwatch.contract.messages_pb2 import Sample
+from reactorwatch.contract.messages_pb2 import Baseline, Sample
 from reactorwatch.diagnosis.result import NAMED, NOMINAL
+from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import ExtendedModel
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
@@ -227,3 +228,14 @@ def test_a_recording_with_a_change_of_the_model_is_verified_value_for_value(warm
 def test_a_recording_without_the_change_is_not_reproduced(warm: Run) -> None:
     log = [message for message in recording(warm) if not message.key.endswith("/baseline/monitor")]
     assert not verify(lambda: log, CONFIG).exact
+
+
+def test_a_recorded_change_whose_model_cannot_be_read_is_one_line(warm: Run) -> None:
+    (change,) = changes(warm.published)
+    change = Baseline(time_ns=change.time_ns, model=change.model[:-9])
+    log = [
+        encode(Publication(item.key, change)) if item.key.endswith("/baseline/monitor") else item
+        for item in recording(warm)
+    ]
+    with pytest.raises(InputError, match=r"^the model of the baseline is not JSON: "):
+        verify(lambda: log, CONFIG)

@@ -258,6 +258,8 @@ def test_the_option_that_is_named_settles_it(tmp_path: Path, name: str, stated: 
         ({"separator": ",", "decimal": ","}, "--separator and --decimal must differ"),
         ({"period": "4"}, "--period must be a positive number with its unit, such as 4 s, got '4'"),
         ({"period": "-4 s"}, "--period must be a positive number"),
+        ({"time_format": "%Y-%Q"}, "--time-format '%Y-%Q': unknown directive '%Q'"),
+        ({"time_format": "%Y-%Y"}, "--time-format '%Y-%Y': each part once"),
         ({"zone": "Mars/Olympus"}, "--zone must be a time zone such as Europe/Berlin"),
     ],
 )
@@ -313,3 +315,11 @@ def test_files_of_other_signals_are_no_record(tmp_path: Path) -> None:
         (tmp_path / f"{name}.csv").write_text(f"time_min,{name}\n0,1\n1,2\n")
     with pytest.raises(InputError, match=r"b\.csv: expected the signals of a\.csv, a, got b"):
         join_files([read_table(tmp_path / f"{name}.csv") for name in ("a", "b")])
+
+
+def test_values_may_be_changed_in_place(tmp_path: Path) -> None:
+    (tmp_path / "record.csv").write_text("time_min,qc,T\n0,1,2\n1,1,2\n", encoding="utf-8")
+    record = read_table(tmp_path / "record.csv")
+    for values in (record.time_min, *record.columns.values()):
+        values[1:] += 1.0
+    assert record.columns["T"].tolist() == [2.0, 3.0]

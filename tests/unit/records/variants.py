@@ -164,6 +164,7 @@ def _variants() -> dict[str, Variant]:
         "hours": _text(table([repr(row / 60) for row in range(ROWS)], cells(), ("t [h]", "qc", "C", "T"))),
         "a name that says nothing": _text(table(SECONDS, cells(), ("ts", "qc", "C", "T"))),
         "a stated unit": _text(table(MINUTES, cells(), ("t", "qc", "C", "T")), stated=FileFormat(time_unit="min")),
+        "a standard name and another unit": _text(table(SECONDS, cells()), stated=FileFormat(time_unit="s")),
         "a row number in seconds": _text(table(SECONDS, cells(), ("sample", "qc", "C", "T"))),
         "a period": _text(table(["x"] * ROWS, cells(), ("remark", "qc", "C", "T")), stated=FileFormat(period="60 s")),
         "a period and no header": _text("\n".join(" ".join(row) for row in cells()) + "\n", stated=FileFormat(period="1min"), names=only_numbers, suffix=".dat"),
