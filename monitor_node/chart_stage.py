@@ -65,6 +65,11 @@ def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
     return names
 
 
+def _are_idle(alarms: list[ChartAlarm]) -> bool:
+    """True if points within the limits would change no alarm."""
+    return not any(alarm.memory.rule.standing or alarm.memory.rule.recent for alarm in alarms)
+
+
 def _without(known: list[bool], withheld: tuple[bool, ...]) -> list[bool]:
     return [here and not outlier for here, outlier in zip(known, withheld, strict=True)]
 
@@ -78,22 +83,27 @@ class _Banked:
 
     def __init__(self, bank: Bank[CompiledChart], kind: type[CompiledChart]) -> None:
         self._bank, self._has_memory = bank, kind.has_memory
+        self._charts = [bank.chart(index) for index in range(bank.numbers.shape[1])]  # to explain alarms
+        self._judgements: list[Judgement] | None = None
 
     def to_bytes(self) -> bytes:
         return self._bank.state.to_bytes()
 
     def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
         self._known = _without(known, withheld) if True in withheld and self._has_memory else known
+        self._judgements = None
         return self._bank.judge(e, self._known)
 
     def judgement(self, index: int) -> Judgement | None:
-        return self._bank.judgement(index) if self._known[index] else None
+        if self._judgements is None:
+            self._judgements = self._bank.judgements()
+        return self._judgements[index] if self._known[index] else None
 
     def restart(self, index: int) -> None:
         self._bank.restart(np.arange(len(self._known)) == index)
 
     def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
-        return self._bank.chart(index).explain(judgement, signals[index])
+        return self._charts[index].explain(judgement, signals[index])
 
     @property
     def numbers(self) -> Array:
@@ -241,7 +251,7 @@ class ChartWatch:
             rule = alarm.memory.rule
             rule.recent, rule.in_a_row = recent, in_a_row
         for watched in self._watched.values():
-            watched.at_rest = all(alarm.is_idle for alarm in watched.alarms)
+            watched.at_rest = _are_idle(watched.alarms)
 
     def points(self, time_ns: int, points: Array) -> list[Publication]:
         """Publications of points of all charts.
@@ -350,7 +360,7 @@ class ChartWatch:
             pairs = [pair for pair in self._alarms if pair[0] == name]
             alarms = [self._alarms[pair] for pair in pairs]
             paths = [keys.key(self._config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
-            self._watched[name] = _Watched(made(chart(name)), alarms, paths, all(alarm.is_idle for alarm in alarms))
+            self._watched[name] = _Watched(made(chart(name)), alarms, paths, _are_idle(alarms))
 
     def update(
         self,
@@ -393,11 +403,13 @@ class ChartWatch:
                 if judgement.out or rule.standing or rule.recent:
                     stood = rule.standing
                     explain = None if stood else self._explaining(watched.charts, index, scales, units)
-                    publications.extend(self._board.evaluate(alarm, time_ns, judgement, SD, explain))
+                    event = alarm.evaluate(time_ns, judgement, SD, explain)
+                    if event is not None:
+                        publications.append(self._board.change(alarm, event, time_ns))
                     raised |= rule.standing and not stood
                     if stood and not rule.standing:
                         watched.charts.restart(index)
-            watched.at_rest = all(alarm.is_idle for alarm in watched.alarms)
+            watched.at_rest = _are_idle(watched.alarms)
         return raised
 
     def _explaining(

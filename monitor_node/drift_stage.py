@@ -88,14 +88,12 @@ class DriftWatch:
         return notes
 
     def update(self, time_ns: int, predictors: list[ArxPredictor]) -> list[Publication]:
-        """Look, if it is time.
+        """Compare, if it is time; to be called only if `wanted`.
 
         Args:
             time_ns: of the row.
             predictors: as at the start.
         """
-        if not self.wanted:
-            return []
         self.until_next -= 1
         if self.until_next:
             return []

@@ -251,8 +251,11 @@ class PlantPipeline:
         if self.is_normal and not row.restarted and self._step_row(row, units, publications, follows=follows):
             return
         self._leave_normal()
-        publications.extend(self.signals.check_row(time_ns, row.values))
-        measured = self.signals.mask_values(time_ns, row.values, publications) if self._is_process else row.values
+        signals, measured = self.signals, row.values
+        for on_row in signals.on_row:
+            publications.extend(on_row(time_ns, measured))
+        for measure in signals.measured if self._is_process else ():
+            measured = measure(time_ns, measured, publications)
         input_value, *values = measured
         if self._reference is None:
             self._train(time_ns, input_value, values, units, publications, follows=follows)
@@ -420,10 +423,11 @@ class PlantPipeline:
     def _find_normal(self, time_ns: int) -> bool:
         """True if the compiled step may take the row after this one; it then finds its numbers."""
         reference, sampling, time_min = self._reference, self._sampling.state, time_ns / MINUTE_NS
-        if self._step is None or not isinstance(reference, ProcessReference) or not self._charts.is_normal:
+        if self._step is None or self._board.has_unexplained or not self._charts.is_normal:
             return False
         if self.left_out or True in self._quarantined or sampling.period_ns is None or sampling.spacing_ns is None:
             return False
+        assert isinstance(reference, ProcessReference)
         if not (self.signals.is_normal and reference.is_normal(time_min)):
             return False
         p = self._numbers[0]
@@ -495,7 +499,8 @@ class PlantPipeline:
             self._note_late_signals(input_value, values)
             input_value = 0.0 if self._config.input in self.left_out else input_value  # as in the training
             values = [value if evaluated else nan for value, evaluated in zip(values, self._evaluated, strict=True)]
-        publications.extend(self.signals.check_values(time_ns, values, units))
+        for on_values in self.signals.on_values:
+            publications.extend(on_values(time_ns, values, units))
         stuck = self.signals.stuck
         if True in stuck:
             values = [nan if still else value for value, still in zip(values, stuck, strict=True)]
@@ -507,12 +512,15 @@ class PlantPipeline:
         elif self._drift.wanted:
             for predictor, value in zip(self._predictors, values, strict=True):
                 predictor.buffer(time_ns, input_value, value, follows=follows)
-        if self._sampling.gap:  # the input in it is unknown
+        sampling, missing = self._sampling, 0
+        is_regular = sampling.state.spacing_ns == sampling.state.period_ns  # as mostly
+        if not is_regular and sampling.gap:  # the input in it is unknown
             reference.restart()
             self.signals.restart()
             for whitener in self._whiteners:
                 whitener.restart()
-        missing = self._sampling.missing
+        if not is_regular:
+            missing = sampling.missing
         predictions, sds = reference.update(time_ns, input_value, values, self._quarantined, missing)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
@@ -529,7 +537,8 @@ class PlantPipeline:
                 if outlier:
                     whitener.reject_last()
         self._charts.update(time_ns, e, quarantined, scales, units, publications, points=self._points)
-        publications.extend(self._drift.update(time_ns, self._predictors))
+        if self._drift.wanted:
+            publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
             publications.extend(self._search_causes(time_ns, input_value, values, units, stuck))
 

@@ -85,6 +85,7 @@ class Annunciator:
     def __init__(self, config: MonitorConfig) -> None:
         self._config = config
         self._alarms: dict[str, ChartAlarm] = {}
+        self._keys: dict[str, str] = {}
         self._undeclared: dict[str, AlarmMemory] = {}  # from a stored state; settings may declare them again
         self._transient: set[str] = set()
         self._incidents = Incidents(config.incident_min)
@@ -133,6 +134,7 @@ class Annunciator:
         if is_transient:
             self._transient.add(alarm.name)
         self._alarms[alarm.name] = alarm
+        self._keys[alarm.name] = keys.key(config.plant, keys.ALARM, alarm.name)
         return alarm
 
     # --- samples ---------------------------------------------------------------------------------------------
@@ -155,10 +157,12 @@ class Annunciator:
             explain: returns the explanation if the alarm is raised.
         """
         event = alarm.evaluate(time_ns, judgement, unit, explain)
-        if event is None:
-            return []
+        return [] if event is None else [self.change(alarm, event, time_ns)]
+
+    def change(self, alarm: ChartAlarm, event: Event, time_ns: int) -> Publication:
+        """Apply an event that an alarm's evaluation has returned."""
         self._change(alarm, event, time_ns)
-        return [self._publication(alarm, event, time_ns)]
+        return self._publication(alarm, event, time_ns)
 
     def end_row(self, time_ns: int) -> list[Publication]:
         """End shelving where its time is over; publish KPIs after a change and each minute.
@@ -384,7 +388,7 @@ class Annunciator:
         self.has_unexplained = any(alarm.memory.rule.standing and not alarm.names_cause for alarm in alarms)
 
     def _publication(self, alarm: ChartAlarm, event: str, time_ns: int) -> Publication:
-        return Publication(keys.key(self._config.plant, keys.ALARM, alarm.name), alarm.message(time_ns, event))
+        return Publication(self._keys[alarm.name], alarm.message(time_ns, event))
 
     def _publish_kpis(self, time_ns: int) -> Publication:
         before = self._newest_kpis

@@ -31,6 +31,7 @@ class SignalCheck:
 
     Attributes:
         name: of its alarms.
+        invalid: outputs whose readings, by their alarms, are no measurements; empty: the check has no such alarms.
         can_be_false: whether chance can raise its alarms, one an output, which then share the promised false alarms.
     """
 
@@ -39,6 +40,7 @@ class SignalCheck:
 
     def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
         self.board, self.outputs = board, config.outputs
+        self.invalid: list[bool] = []
 
     @property
     def is_normal(self) -> bool:
@@ -77,11 +79,6 @@ class SignalCheck:
     def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
         """Check the outputs of a row."""
         return []
-
-    @property
-    def invalid(self) -> list[bool]:
-        """The outputs whose readings, by their alarms, are no measurements."""
-        return [False] * len(self.outputs)
 
     def on_residuals(
         self, time_ns: int, e: list[float], scales: list[float], units: list[str], publications: list[Publication]

@@ -39,7 +39,8 @@ class RangeCheck(SignalCheck):
                 continue
             lower, upper, unit = self._ranges[index]
             out = not lower <= value <= upper
-            if not out and alarm.is_idle:
+            rule = alarm.memory.rule
+            if not (out or rule.standing or rule.recent):
                 continue
             name = self._names[index]
             text = (

@@ -45,7 +45,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import Flags, SignalCheck
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Judgement, finite, format_quantity, positive
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, format_quantity, positive
 from reactorwatch.stored_state import StoredState
 
 NORMAL = 0.5
@@ -184,7 +184,9 @@ class Spike:
         """Decide on a residual about 0."""
         if self._phase == "quiet" and abs(z) <= self.limit:  # as nearly always
             return NO_SPIKE
-        beyond, normal = abs(finite(z)) > self.limit, abs(z) <= NORMAL * self.limit
+        if not abs(z) < LARGEST_VALUE:
+            finite(z)
+        beyond, normal = abs(z) > self.limit, abs(z) <= NORMAL * self.limit
         held, self._held = self._held, 0.0
         if self._phase in ("quiet", "changed"):
             if self._phase == "changed" and not normal:
@@ -299,7 +301,8 @@ class SpikeCheck(SignalCheck):
             alarm, verdict = self._alarms[index], spike.update(e[index], is_moved=is_moved)
             if verdict.quarantine:
                 flags = (*flags[:index], True, *flags[index + 1 :])
-            if verdict.spike or not alarm.is_idle:
+            rule = alarm.memory.rule
+            if verdict.spike or rule.standing or rule.recent:
                 name = self.outputs[index]
                 size = verdict.size if verdict.spike else 0.0
                 judgement = Judgement(size, 0.0, -spike.limit, spike.limit, verdict.spike)

@@ -52,6 +52,11 @@ class SignalChecks:
         board: the alarms of the plant; those of the signals are declared here.
         ranges: ranges of the input and of each output; None: no bounds are known.
         numbers: numbers of the plant's stages, see `row_step.row_type`; None: the checks have their own.
+
+    Attributes:
+        on_row: hook `on_row` of the checks that have it, see `SignalCheck`.
+        measured: hook `measured` of the checks that have it.
+        on_values: hook `on_values` of the checks that have it.
     """
 
     CHANCE_ALARMS = sum(check.can_be_false for check in CHECKS)
@@ -73,11 +78,10 @@ class SignalChecks:
         if numbers is not None:
             self._silence.use(numbers["timeouts"][0])
             self._stuck.numbers, self._spike.limits = numbers["stuck"][0], numbers["spike_limits"][0]
-        self._on_row: list[Callable[..., list[Publication]]] = self._hooks("on_row")
-        self._measured: list[Callable[..., tuple[float, ...]]] = self._hooks("measured")
-        self._on_values: list[Callable[..., list[Publication]]] = self._hooks("on_values")
+        self.on_row: list[Callable[..., list[Publication]]] = self._hooks("on_row")
+        self.measured: list[Callable[..., tuple[float, ...]]] = self._hooks("measured")
+        self.on_values: list[Callable[..., list[Publication]]] = self._hooks("on_values")
         self._on_residuals: list[Callable[..., Flags]] = self._hooks("on_residuals")
-        self._invalid = [check for check in self._checks if type(check).invalid is not SignalCheck.invalid]
 
     def _hooks(self, name: str) -> list[Callable[..., Any]]:
         """A hook of those checks that have it."""
@@ -95,9 +99,8 @@ class SignalChecks:
     @property
     def stuck(self) -> list[bool]:
         """Outputs whose sensors are stuck: their readings are no measurements."""
-        if len(self._invalid) == 1:
-            return self._invalid[0].invalid
-        return [any(flags) for flags in zip(*(check.invalid for check in self._invalid), strict=True)]
+        flags = [check.invalid for check in self._checks if check.invalid]
+        return flags[0] if len(flags) == 1 else [any(each) for each in zip(*flags, strict=True)]
 
     @property
     def is_normal(self) -> bool:
@@ -153,26 +156,6 @@ class SignalChecks:
         self._silence.arm(now_ns)
 
     # --- rows ------------------------------------------------------------------------------------------------
-
-    def check_row(self, time_ns: int, values: tuple[float, ...]) -> list[Publication]:
-        """Check a row, input first; values are NaN where missing."""
-        if len(self._on_row) == 1:  # as mostly: a row passes here
-            return self._on_row[0](time_ns, values)
-        return [item for on_row in self._on_row for item in on_row(time_ns, values)]
-
-    def mask_values(
-        self, time_ns: int, values: tuple[float, ...], publications: list[Publication]
-    ) -> tuple[float, ...]:
-        """The values of a row, with NaN in place of those that are no measurements; see `SignalCheck.measured`."""
-        for measured in self._measured:
-            values = measured(time_ns, values, publications)
-        return values
-
-    def check_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
-        """Check the outputs of a row."""
-        if len(self._on_values) == 1:
-            return self._on_values[0](time_ns, values, units)
-        return [item for on_values in self._on_values for item in on_values(time_ns, values, units)]
 
     def check_residuals(
         self, time_ns: int, e: list[float], scales: list[float], units: list[str], publications: list[Publication]

@@ -44,7 +44,7 @@ from monitor_node.signal_checks.base import SignalCheck
 from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Judgement, finite, format_quantity
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, format_quantity
 from reactorwatch.stored_state import StoredState
 
 SMALLEST = 5
@@ -276,7 +276,8 @@ class Stuck:
         Raises:
             ValueError: the reading is not finite.
         """
-        finite(value)
+        if not abs(value) < LARGEST_VALUE:
+            finite(value)
         if self._learning:
             self._end_learning()
         self._take(value)
@@ -410,18 +411,14 @@ class StuckCheck(SignalCheck):
             if not isfinite(value):
                 continue
             alarm, judgement = self._alarms[index], self._stuck[index].update(value)
-            if judgement.out or not alarm.is_idle:
+            rule = alarm.memory.rule
+            if judgement.out or rule.standing or rule.recent:
                 name, times = self.outputs[index], judgement.statistic
                 reading = format_quantity(value, units[index], ".6g")
                 text = f"{name} is stuck: it has read {reading} {times:.0f} times in a row"
                 publications += self.judge(alarm, time_ns, judgement, READINGS, text, name, cause=STUCK_SENSOR)
                 self._note_alarms()
         return publications
-
-    @property
-    def invalid(self) -> list[bool]:
-        """See `SignalCheck`."""
-        return self._invalid
 
     @property
     def is_normal(self) -> bool:
@@ -439,4 +436,4 @@ class StuckCheck(SignalCheck):
             stuck.restart()
 
     def _note_alarms(self) -> None:
-        self._invalid = [alarm.memory.rule.standing for alarm in self._alarms]
+        self.invalid = [alarm.memory.rule.standing for alarm in self._alarms]

@@ -8,12 +8,14 @@ as selections, so that the compiler can turn the loop into vector instructions.)
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
+from functools import cache
 from struct import Struct
 from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reactorwatch.codegen.numba_kernel import Entry
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, SignalChart, finite
 
@@ -145,7 +147,8 @@ class Bank(Generic[Kind]):
 
     def _hold(self, columns: Array) -> None:
         self._columns = np.ascontiguousarray(columns)
-        self._plants = plants = columns.shape[1]
+        self._plants, self._kernel = columns.shape[1], _entry(self._kind)
+        plants = self._plants
         self._numbers = self._columns.reshape(-1).data  # all of them, one row after the other
         self._come, self._out = Struct(f"{2 * plants}d").pack_into, Struct(f"{plants}d").unpack_from
         self._out_offset = OUT * plants * self._columns.itemsize
@@ -191,23 +194,23 @@ class Bank(Generic[Kind]):
         return Judgements(said[0], said[1], said[2], said[3], present & (columns[OUT] > 0.0))
 
     def judge(self, values: list[float], present: list[bool]) -> bool:
-        """As `update`, for the few charts of one plant at every row: whether any is out; `judgement` says the rest.
+        """As `update`, for the few charts of one plant at every row: True if any is out; see `judgements`.
 
         Args:
             values: one a chart, finite where present.
             present: False leaves a chart as it is.
         """
         self._come(self._numbers, 0, *values, *present)  # X and PRESENT are the first rows
-        self._kind.kernel(self._columns)
+        self._kernel.call(self._columns)
         out = self._out(self._numbers, self._out_offset)
         return any(out) and any(here and much > 0.0 for here, much in zip(present, out, strict=True))
 
-    def judgement(self, plant: int) -> Judgement:
-        """What a chart said of its last value."""
-        plants = self._plants
-        told = self._numbers[STATISTIC * plants + plant : SETTINGS * plants : plants].tolist()
-        statistic, centre, lower, upper, out = told
-        return Judgement(statistic, centre, lower, upper, out > 0.0)
+    def judgements(self) -> list[Judgement]:
+        """Results of all charts for their last values."""
+        results = self._columns[STATISTIC:SETTINGS].T.tolist()
+        return [
+            Judgement(statistic, centre, lower, upper, out > 0.0) for statistic, centre, lower, upper, out in results
+        ]
 
     def restart(self, plants: NDArray[np.bool_] | None = None) -> None:
         """Forget the values seen, of all plants or of those that are True."""
@@ -224,6 +227,11 @@ class Bank(Generic[Kind]):
         columns = self._columns[:, plant : plant + 1].copy()
         columns[PRESENT] = 1.0
         return self._kind._of(columns)
+
+
+@cache
+def _entry(kind: type[CompiledChart]) -> Entry:
+    return Entry(kind.kernel)
 
 
 def _restart(columns: Array, memories: int, plants: Any) -> None:

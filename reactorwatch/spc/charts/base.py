@@ -142,6 +142,11 @@ class SignalChart(Chart):
         return f"{signal.name} is {judgement.side} the limit of its {self.name} chart", {signal.name: 1.0}
 
 
+def describe(judgement: Judgement, unit: str, *sizes: float) -> tuple[str, ...]:
+    """Side of the centre on which the statistic is, and sizes in a unit, as texts of alarms have them."""
+    return judgement.side, *(format_quantity(size, unit) for size in sizes)
+
+
 def format_quantity(value: float, unit: str, form: str = ".3g") -> str:
     """A number and its unit, as texts of alarms have it.
 

@@ -18,7 +18,7 @@ import numpy as np
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.base import Array, Judgement, Setting, Shown, finite, format_quantity, positive
+from reactorwatch.spc.charts.base import Array, Judgement, Setting, Shown, describe, finite, positive
 from reactorwatch.spc.compiled_chart import (
     CENTRE,
     LOWER,
@@ -98,8 +98,8 @@ class Ewma(CompiledChart):
 
     def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`: as the lasting shift of the signal that would look like this."""
-        size = format_quantity(abs(judgement.statistic) * signal.scale / signal.passed, signal.unit)
-        return f"{signal.name} is on average {size} {judgement.side} what the model expects", {signal.name: 1.0}
+        side, size = describe(judgement, signal.unit, abs(judgement.statistic) * signal.scale / signal.passed)
+        return f"{signal.name} is on average {size} {side} what the model expects", {signal.name: 1.0}
 
 
 def designed_limit(arl0: float, weight: float, learned: Prewhitening) -> float:

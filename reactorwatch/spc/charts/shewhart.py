@@ -29,7 +29,7 @@ from scipy import special
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.base import Array, Judgement, Shown, finite, format_quantity, positive
+from reactorwatch.spc.charts.base import Array, Judgement, Shown, describe, finite, positive
 from reactorwatch.spc.compiled_chart import (
     CENTRE,
     LOWER,
@@ -126,9 +126,9 @@ class Shewhart(CompiledChart):
 
     def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`."""
-        size = format_quantity(abs(judgement.statistic) * signal.scale, signal.unit)
-        allowed = format_quantity(judgement.upper_limit * signal.scale, signal.unit)
-        text = f"{signal.name} is {size} {judgement.side} what the model expects (allowed: {allowed})"
+        sizes = abs(judgement.statistic) * signal.scale, judgement.upper_limit * signal.scale
+        side, size, allowed = describe(judgement, signal.unit, *sizes)
+        text = f"{signal.name} is {size} {side} what the model expects (allowed: {allowed})"
         return text, {signal.name: 1.0}
 
     @property

@@ -17,6 +17,7 @@ from monitor_node.isolation.isolation import Isolation
 from monitor_node.isolation.window import Window
 from monitor_node.pipeline import PlantPipeline
 from monitor_node.signal_checks.stage import SignalChecks
+from monitor_node.signal_checks.timeout import SilenceCheck
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError
@@ -33,7 +34,8 @@ def fail_from(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, from_ns: 
     method = getattr(owner, name)
 
     def failing(self: Any, *arguments: Any, **others: Any) -> Any:
-        config = self._board._config if isinstance(self, SignalChecks) else self._config
+        board = getattr(self, "board", None) or getattr(self, "_board", None)
+        config = self._config if board is None else board._config
         times = [item for item in arguments if isinstance(item, int) and not isinstance(item, bool)]
         times += [item.time_ns for item in arguments if hasattr(item, "time_ns")]
         if config.plant == BROKEN and max(times, default=from_ns) >= from_ns:
@@ -54,7 +56,7 @@ def health_message(said: list[Publication], plant: str) -> Health:
     [
         (PlantPipeline, "update", "row"),
         (ChartWatch, "update", "row"),
-        (SignalChecks, "check_row", "row"),
+        (SilenceCheck, "on_row", "row"),
         (Annunciator, "end_row", "row"),
         (PlantPipeline, "snapshots", "models"),
         (Conversion, "demote", "demotion"),
