@@ -173,6 +173,12 @@ class ChartAlarm:
         """Resume from a state."""
         self.memory, self._rule.state = memory, memory.rule
 
+    @property
+    def is_idle(self) -> bool:
+        """True if a point within the limits would change nothing."""
+        rule = self.memory.rule
+        return not (rule.standing or rule.recent)
+
     def evaluate(
         self, time_ns: int, judgement: Judgement, unit: str, explain: Callable[[Judgement], Explanation] | None = None
     ) -> Event | None:
