@@ -368,7 +368,7 @@ class Monitor:
     @property
     def equations(self) -> ProcessModel | None:
         """Process model in force: `model`, or as the change of the baseline has it."""
-        return self._pipeline.equations
+        return self.pipeline.equations
 
     @property
     def reference(self) -> str:

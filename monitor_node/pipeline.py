@@ -503,8 +503,9 @@ class PlantPipeline:
     def _find_normal(self, time_ns: int) -> bool:
         """True if the compiled step may take the row after this one; it then finds its numbers."""
         reference, sampling, time_min = self._reference, self._sampling.state, time_ns / MINUTE_NS
-        if self._step is None or not isinstance(reference, ProcessReference) or not self._charts.is_normal:
+        if self._step is None or self._board.has_unexplained or not self._charts.is_normal:
             return False
+        assert isinstance(reference, ProcessReference)
         if self.left_out or True in self._quarantined or sampling.period_ns is None or sampling.spacing_ns is None:
             return False
         if not (self.signals.is_normal and reference.is_normal(time_min)):

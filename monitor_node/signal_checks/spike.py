@@ -45,7 +45,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import Flags, SignalCheck
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Judgement, finite, format_quantity, positive
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, format_quantity, positive
 from reactorwatch.stored_state import StoredState
 
 NORMAL = 0.5
@@ -184,7 +184,9 @@ class Spike:
         """Decide on a residual about 0."""
         if self._phase == "quiet" and abs(z) <= self.limit:  # as nearly always
             return NO_SPIKE
-        beyond, normal = abs(finite(z)) > self.limit, abs(z) <= NORMAL * self.limit
+        if not abs(z) < LARGEST_VALUE:
+            finite(z)
+        beyond, normal = abs(z) > self.limit, abs(z) <= NORMAL * self.limit
         held, self._held = self._held, 0.0
         if self._phase in ("quiet", "changed"):
             if self._phase == "changed" and not normal:

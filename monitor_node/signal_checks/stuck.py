@@ -44,7 +44,7 @@ from monitor_node.signal_checks.base import SignalCheck
 from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Judgement, finite, format_quantity
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, format_quantity
 from reactorwatch.stored_state import StoredState
 
 SMALLEST = 5
@@ -276,7 +276,8 @@ class Stuck:
         Raises:
             ValueError: the reading is not finite.
         """
-        finite(value)
+        if not abs(value) < LARGEST_VALUE:
+            finite(value)
         if self._learning:
             self._end_learning()
         self._take(value)
