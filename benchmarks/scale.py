@@ -47,9 +47,9 @@ from benchmarks.fleet.traffic import (
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.node import UNCACHED, FleetNode, watch
-from monitor_node.quiet.slots import NEVER_NS
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.records.record import NEVER_NS
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig

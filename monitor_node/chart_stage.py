@@ -24,6 +24,7 @@ from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.baseline import Baseline, complete_rows, memory_sds
 from reactorwatch.spc.charts.base import Chart, Judgement, Shown, SignalChart
 from reactorwatch.spc.charts.catalogue import chart
+from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.shewhart import designed_width
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalState
 from reactorwatch.spc.joint_chart import JointChart
@@ -95,6 +96,11 @@ class _Banked:
     def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
         return self._bank.chart(index).explain(judgement, signals[index])
 
+    @property
+    def numbers(self) -> Array:
+        """Settings and memory, shape (numbers of one chart, outputs)."""
+        return self._bank.numbers
+
 
 class _OfEach:
     """Charts without a compiled kernel, one an output."""
@@ -153,6 +159,12 @@ class _OfAll:
     def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
         return self._chart.explain(self._last, list(compress(signals, self._evaluated)))
 
+    @property
+    def numbers(self) -> Array:
+        """Numbers of a chart with a kernel."""
+        assert isinstance(self._chart, Mewma)
+        return self._chart.numbers
+
 
 _Charts: TypeAlias = _Banked | _OfEach | _OfAll
 
@@ -195,6 +207,51 @@ class ChartWatch:
             return None
         ranks: tuple[PriorityName, ...] = ("low", "medium", "high", "critical")
         return max((self._config.priorities.get(name, "medium") for name in self._config.outputs), key=ranks.index)
+
+    @property
+    def is_normal(self) -> bool:
+        """True if all charts are made, and at most their alarms remember points."""
+        return list(self._watched) == self._names and self._board.is_at_rest(self._alarms.values())
+
+    def load(self, p: np.void) -> None:
+        """Fill the numbers of a plant, see `row_step.row_type`, from the charts and their alarms."""
+        for name, watched in self._watched.items():
+            assert not isinstance(watched.charts, _OfEach)
+            p[name] = watched.charts.numbers
+        for delay, alarm in zip(p["delays"], self._alarms.values(), strict=False):
+            rule = alarm.memory.rule
+            delay["recent"], delay["in_a_row"], delay["above"] = rule.recent, rule.in_a_row, alarm.memory.above
+
+    def store(self, p: np.void) -> None:
+        """Take over into the charts what compiled steps have written into the numbers of a plant."""
+        for name, watched in self._watched.items():
+            assert not isinstance(watched.charts, _OfEach)
+            watched.charts.numbers[:] = p[name]
+
+    def store_delays(self, p: np.void) -> None:
+        """Take over into the alarms what compiled steps have written into the numbers of a plant."""
+        for (recent, in_a_row, _), alarm in zip(p["delays"].tolist(), self._alarms.values(), strict=False):
+            rule = alarm.memory.rule
+            rule.recent, rule.in_a_row = recent, in_a_row
+        for watched in self._watched.values():
+            watched.at_rest = all(alarm.is_idle for alarm in watched.alarms)
+
+    def points(self, time_ns: int, points: Array) -> list[Publication]:
+        """Publications of points of all charts.
+
+        Args:
+            time_ns: time of the row.
+            points: numbers of a `Judgement` in each row, one row an alarm; shape (at least the number of alarms, 5).
+        """
+        paths = [path for watched in self._watched.values() for path in watched.keys]
+        judgements = [
+            Judgement(statistic, centre, lower, upper, out > 0.0)
+            for statistic, centre, lower, upper, out in points.tolist()
+        ]
+        return [
+            Publication(path, chart_point(time_ns, judgement))
+            for path, judgement in zip(paths, judgements, strict=False)
+        ]
 
     def choose(self, evaluated: list[bool], e: Array) -> dict[str, str]:
         """Choose the charts that can be made; returns the others, by alarm, each with the reason.

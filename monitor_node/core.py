@@ -53,6 +53,7 @@ class Monitor:
         rejects: rejected messages.
         failures: contained errors of this software.
         alarms: alarms of the plant.
+        pipeline: pipeline of the plant's rows.
         first_ns: time of the first row; None before it.
         last_ns: time of the last row; None before the first.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
@@ -83,7 +84,7 @@ class Monitor:
         self._runs = [SequenceCheck() for _ in self._signals]
         self._replay_filter: ReplayFilter | None = None
         self.alarms = Annunciator(config)
-        self._pipeline = self._new_pipeline(self.alarms)
+        self.pipeline = self._new_pipeline(self.alarms)
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -243,7 +244,7 @@ class Monitor:
             self._runs,
             self._aligner.state,
             self.alarms.to_bytes(),
-            self._pipeline.state,
+            self.pipeline.state,
             self._units,
             self._heard_from_ns,
             self.first_ns,
@@ -269,7 +270,7 @@ class Monitor:
             pipeline.restore(state.watch, self.stats.start_ns)
         except ValueError as error:
             raise InputError(f"is no state of this software's monitor: {error}") from error
-        self.alarms, self._pipeline = board, pipeline
+        self.alarms, self.pipeline = board, pipeline
         self._republishes_baseline = True  # it may not have been published before the stop
         self._runs = state.runs
         self._aligner.state, self._replay_filter = state.alignment, ReplayFilter(state.alignment)
@@ -283,7 +284,7 @@ class Monitor:
 
     def _learning_settings(self) -> dict[str, Any]:
         if self._settings is None:
-            self._settings = learning_settings(self.config, self._pipeline.model, points=self._points)
+            self._settings = learning_settings(self.config, self.pipeline.model, points=self._points)
         return self._settings
 
     def count_duplicate(self) -> None:
@@ -307,7 +308,7 @@ class Monitor:
             InputError: see `Annunciator.from_bytes`; nothing has changed.
         """
         self.alarms.from_bytes(data)
-        self._silence.resume_from_alarms()
+        self.pipeline.resume_from_alarms()
 
     def resume_from_alarms(self, alarms: Iterable[Alarm]) -> None:
         """Resume from the alarms that another monitor of the plant published last, without its state.
@@ -318,7 +319,7 @@ class Monitor:
             alarms: the newest message of each alarm.
         """
         self.alarms.resume_from(alarms)
-        self._silence.resume_from_alarms()
+        self.pipeline.resume_from_alarms()
 
     @property
     def changes(self) -> int:
@@ -330,16 +331,16 @@ class Monitor:
     @property
     def awaits_diagnosis(self) -> bool:
         """True while there is a `diagnosis_job`."""
-        return self._pipeline.awaits_diagnosis
+        return self.pipeline.awaits_diagnosis
 
     @property
     def diagnosis_job(self) -> DiagnosisJob | None:
         """The diagnosis of the training, from its end until `on_finding`; None: there is none to make."""
-        return self._pipeline.diagnosis_job
+        return self.pipeline.diagnosis_job
 
     def on_finding(self, finding: Finding) -> None:
         """Process the result of `diagnosis_job`; what it found holds from the next row on."""
-        self._pipeline.on_finding(finding)
+        self.pipeline.on_finding(finding)
 
     def schedule(self, baseline: Baseline) -> None:
         """Schedule a recorded change of the baseline for the row that it names."""
@@ -348,7 +349,7 @@ class Monitor:
     @property
     def baseline(self) -> Baseline | None:
         """Change of the baseline in force; None: rows are evaluated by the equations as given."""
-        return self._pipeline.baseline
+        return self.pipeline.baseline
 
     # --- status ----------------------------------------------------------------------------------------------
 
@@ -362,22 +363,22 @@ class Monitor:
     @property
     def model(self) -> ProcessModel | None:
         """Process model of the plant; None if there is none."""
-        return self._pipeline.model
+        return self.pipeline.model
 
     @property
     def equations(self) -> ProcessModel | None:
         """Process model in force: `model`, or as the change of the baseline has it."""
-        return self._pipeline.equations
+        return self.pipeline.equations
 
     @property
     def reference(self) -> str:
         """Kind of the reference: `equations` or `arx`; empty before there is one."""
-        return self._pipeline.reference
+        return self.pipeline.reference
 
     @property
     def noise_levels(self) -> dict[str, dict[str, float]] | None:
         """Noise levels of the equations by sensor and by state; None with another reference."""
-        return self._pipeline.noise_levels
+        return self.pipeline.noise_levels
 
     @property
     def rows(self) -> int:
@@ -402,23 +403,23 @@ class Monitor:
     @property
     def expected_false_alarms(self) -> float:
         """Mean number of false alarms expected so far."""
-        return self._pipeline.expected_false_alarms
+        return self.pipeline.expected_false_alarms
 
     @property
     def excluded_signals(self) -> dict[str, str]:
         """Signals that are not monitored, with the reason: no value came, or the training could not use them."""
         never_came = (signal for signal in self._signals if signal not in self._heard_from_ns)
-        return dict.fromkeys(never_came, NO_VALUE) | self._pipeline.left_out
+        return dict.fromkeys(never_came, NO_VALUE) | self.pipeline.left_out
 
     @property
     def refused_trainings(self) -> int:
         """Number of refused trainings."""
-        return self._pipeline.refused_trainings
+        return self.pipeline.refused_trainings
 
     @property
     def notes(self) -> list[str]:
         """Notes to log; the caller empties the list."""
-        notes, failures = self._pipeline.notes, self.failures.notes
+        notes, failures = self.pipeline.notes, self.failures.notes
         notes += failures
         failures.clear()
         return notes
@@ -427,7 +428,7 @@ class Monitor:
 
     @property
     def _silence(self) -> SilenceCheck:
-        return self._pipeline.signals.silence
+        return self.pipeline.signals.silence
 
     @property
     def receipts_ns(self) -> tuple[int | None, int | None]:
@@ -475,11 +476,11 @@ class Monitor:
             self.span_ns += time_ns - self.last_ns
         self.last_ns = time_ns
         try:
-            self._pipeline.update(row, self._output_units, publications)
+            self.pipeline.update(row, self._output_units, publications)
             publications.extend(self.alarms.end_row(time_ns))
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
             self._contain("row", error)
-        if self._watching_since_ns is None and self._pipeline.watching:
+        if self._watching_since_ns is None and self.pipeline.watching:
             self._watching_since_ns = time_ns
         if due_ns is None or not 0 <= due_ns - time_ns <= self._snapshot_ns:
             self._snapshot_due_ns = time_ns + self._snapshot_ns
@@ -488,7 +489,7 @@ class Monitor:
 
     def _snapshots(self, time_ns: int) -> list[Publication]:
         try:
-            return self._pipeline.snapshots(time_ns)
+            return self.pipeline.snapshots(time_ns)
         except Exception as error:  # noqa: BLE001 # the plant's border, see `_on_row`
             self._contain("models", error)
             return []
@@ -521,9 +522,9 @@ class Monitor:
         self.failures.add(stage, error, "the plant is learned again, its alarms stay")
         alarms = self.alarms.all_alarms()
         self._changes = deque(item for item in self._changes if item.at_ns is not None)  # findings on its training
-        notes, receipts_ns = self._pipeline.notes, self.receipts_ns
-        self._pipeline = self._new_pipeline(self.alarms)
-        self._pipeline.notes, self.receipts_ns = notes, receipts_ns
+        notes, receipts_ns = self.pipeline.notes, self.receipts_ns
+        self.pipeline = self._new_pipeline(self.alarms)
+        self.pipeline.notes, self.receipts_ns = notes, receipts_ns
         self._watching_since_ns = None
         self.resume_from_alarms(alarms)
 
@@ -540,8 +541,8 @@ class Monitor:
                 self._heard_from_ns,
             ),
             self.stats,
-            reference=self._pipeline.reference,
-            training=self._pipeline.trained_share(self.last_ns),
+            reference=self.pipeline.reference,
+            training=self.pipeline.trained_share(self.last_ns),
         )
         self.stats.lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

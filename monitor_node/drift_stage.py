@@ -92,6 +92,8 @@ class DriftWatch:
             time_ns: time of the row.
             predictors: the predictors given to `start`.
         """
+        if not self.wanted:
+            return []
         self.until_next -= 1
         if self.until_next:
             return []

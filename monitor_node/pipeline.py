@@ -10,6 +10,8 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from math import isfinite, nan
 
+import numpy as np
+
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.predictor import ArxPredictor
@@ -31,6 +33,7 @@ from monitor_node.health import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.isolation.stage import Suspicion, has_causes
+from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.signal_checks.stage import SignalChecks
 from monitor_node.state.monitor_state import equations_text
 from monitor_node.state.pipeline_state import PipelineState, TrainedState
@@ -81,6 +84,7 @@ class PlantPipeline:
         model: process model of the plant; None if there is none.
         notes: notes to log, oldest first; the caller empties the list.
         rows_watched: number of evaluated rows.
+        is_normal: True if the compiled step may take the next row, see `row_step`.
         left_out: signals that are not monitored, with the reason, after the training.
         signals: signal checks.
     """
@@ -106,7 +110,9 @@ class PlantPipeline:
         self._is_process = self._is_process_given = model is not None or config.reference == "process"
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
-        self.signals = SignalChecks(config, board, signal_ranges(self.model, (config.input, *config.outputs)))
+        self._numbers: Records = np.zeros(1, numbers_type(config))
+        self._ranges = signal_ranges(self.model, (config.input, *config.outputs))
+        self.signals = SignalChecks(config, board, self._ranges, self._numbers)
         self._drift = DriftWatch(config, board, publish=points)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
@@ -115,6 +121,9 @@ class PlantPipeline:
         self._checks: list[Check] = []
         self._reference: Reference | None = None
         self._whiteners: list[Prewhitener] = []
+        self._step: RowStep | None = None
+        self._kalman: FilterNumbers | None = None
+        self._row = np.empty(1 + len(config.outputs))
         self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
@@ -124,6 +133,7 @@ class PlantPipeline:
         self._promise_checked = False
         self.notes: list[str] = []
         self.rows_watched = 0
+        self.is_normal = False
         self.left_out: dict[str, str] = {}
 
     # --- state -----------------------------------------------------------------------------------------------
@@ -131,6 +141,8 @@ class PlantPipeline:
     @property
     def state(self) -> PipelineState:
         """A copy of the state between two rows, without the alarms."""
+        if self.is_normal:
+            self._charts.store(self._numbers[0])
         return PipelineState(
             self._sampling.copy_state(),
             self.signals.state,
@@ -187,7 +199,10 @@ class PlantPipeline:
             raise ValueError(f"the state must be of {outputs} outputs, got {len(learned)}")
         self._leave_out(watched.left_out)
         self._set_reference(self._restore_reference(watched.reference), learned, watched.arl0)
-        self._whiteners = [Prewhitener.from_state(item) for item in watched.whiteners]
+        self._whiteners = [
+            Prewhitener.from_state(item, self._numbers["whiteners"][0, i : i + 1])
+            for i, item in enumerate(watched.whiteners)
+        ]
         self._charts.restore(watched.charts, self._evaluated)
         if (watched.suspicion is None) != (self._suspicion is None):
             raise ValueError("the state must tell of the search for causes as it is set")
@@ -227,6 +242,11 @@ class PlantPipeline:
     def baseline(self) -> Baseline | None:
         """Change of the model in force; None: the model is as given."""
         return self._update.baseline
+
+    def resume_from_alarms(self) -> None:
+        """Follow alarms that were set from outside."""
+        self._leave_normal()
+        self.signals.silence.resume_from_alarms()
 
     @property
     def watching(self) -> bool:
@@ -273,17 +293,22 @@ class PlantPipeline:
         if self._update.changes:
             self._change_model(time_ns, publications)
         interval = self._sampling.update(time_ns)
-        publications.extend(self.signals.check_row(time_ns, row.values))
-        measured = self.signals.mask_values(time_ns, row.values, publications) if self._is_process else row.values
-        input_value, *values = measured
+        input_value, *values = row.values
         follows = interval.follows and not row.restarted
-        measured_row = MeasuredRow(time_ns, input_value, values, units, interval, follows, publications)
+        measured = MeasuredRow(time_ns, input_value, values, units, interval, follows, publications)
+        if self.is_normal and not row.restarted and self._step_row(measured):
+            return
+        self._leave_normal()
+        publications.extend(self.signals.check_row(time_ns, row.values))
+        if self._is_process:
+            measured.input_value, *measured.values = self.signals.mask_values(time_ns, row.values, publications)
         if self._reference is None:
-            self._train(measured_row)
+            self._train(measured)
         else:
             if row.restarted:
                 self.signals.reset()
-            self._evaluate(measured_row)
+            self._evaluate(measured)
+            self.is_normal = self._find_normal(time_ns)
 
     def snapshots(self, time_ns: int) -> list[Publication]:
         """Snapshots of each output's models: the adaptive one, the one fitted to the training, and the reference.
@@ -386,6 +411,7 @@ class PlantPipeline:
         change = self._update.pop_due(time_ns)
         if change is None:
             return
+        self._leave_normal()
         try:
             trained = self._update.relearn(change, self._predictors)
         except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
@@ -425,7 +451,9 @@ class PlantPipeline:
         arl0 = false_alarm_budget.share_arl0(promised, self._chance_alarms, period_min)
         self._checks = trained.checks
         self._set_reference(trained.reference, trained.learned, arl0)
-        self._whiteners = [Prewhitener(item) for item in trained.learned]
+        self._whiteners = [
+            Prewhitener(item, self._numbers["whiteners"][0, i : i + 1]) for i, item in enumerate(trained.learned)
+        ]
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         if not again:
@@ -439,6 +467,14 @@ class PlantPipeline:
         self._is_process = self._is_process_given or isinstance(reference, ProcessReference)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
+        self._step, self._kalman = RowStep.of(self._config, self._reference_model, self._ranges), None
+        if self._step is not None and isinstance(reference, ProcessReference):
+            belief, variances = reference.numbers
+            self._kalman = FilterNumbers(belief[None], variances[None])
+
+    @property
+    def _reference_model(self) -> ProcessModel | None:
+        return self._reference.model if isinstance(self._reference, ProcessReference) else None
 
     def _new_suspicion(self, reference: Reference) -> Suspicion | None:
         if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.model)):
@@ -456,7 +492,72 @@ class PlantPipeline:
             self._suspicion = self._new_suspicion(self._reference)
             return []
 
-    # --- monitoring ------------------------------------------------------------------------------------------
+    # --- ordinary rows ----------------------------------------------------------------------------------------
+
+    @property
+    def numbers(self) -> tuple[Records, FilterNumbers]:
+        """Numbers of the stages and of the filter, each with a first axis of one; of a plant in its normal state."""
+        assert self._kalman is not None
+        return self._numbers, self._kalman
+
+    def _find_normal(self, time_ns: int) -> bool:
+        """True if the compiled step may take the row after this one; it then finds its numbers."""
+        reference, sampling, time_min = self._reference, self._sampling.state, time_ns / MINUTE_NS
+        if self._step is None or self._board.has_unexplained or not self._charts.is_normal:
+            return False
+        assert isinstance(reference, ProcessReference)
+        if self.left_out or True in self._quarantined or sampling.period_ns is None or sampling.spacing_ns is None:
+            return False
+        if not (self.signals.is_normal and reference.is_normal(time_min)):
+            return False
+        p = self._numbers[0]
+        if p["timeouts"]["last_ns"][0] != time_ns or not all(item.is_ready for item in self._whiteners):
+            return False
+        p["last_ns"], p["period_ns"] = time_ns, sampling.period_ns
+        p["time_min"], p["input"] = time_min, reference.last_input
+        self._charts.load(p)
+        return True
+
+    def _leave_normal(self) -> None:
+        """Take over into the charts what compiled steps have computed."""
+        if self.is_normal:
+            self._charts.store(self._numbers[0])
+            self.is_normal = False
+
+    def _step_row(self, row: MeasuredRow) -> bool:
+        """Process a row by the compiled step; returns False if it is an event, for which nothing has changed."""
+        assert self._step is not None
+        assert self._kalman is not None
+        assert isinstance(self._reference, ProcessReference)
+        time_ns, time_min = row.time_ns, row.time_ns / MINUTE_NS
+        self._row[0], self._row[1:] = row.input_value, row.values
+        verdict = self._step.update(self._numbers, self._kalman, time_ns, time_min, self._row)
+        if verdict == EVENT:
+            return False
+        if verdict == VIOLATING:
+            self._charts.store_delays(self._numbers[0])
+        self._reference.accept_row(time_min, row.input_value)
+        self.rows_watched += 1
+        if self._points:
+            self._publish_step(row)
+        if self._drift.wanted:
+            self._buffer(row)
+            row.publications.extend(self._drift.update(time_ns, self._predictors))
+        if self._suspicion is not None:
+            self._suspicion.add(time_min, row.input_value, row.values)
+        return True
+
+    def _publish_step(self, row: MeasuredRow) -> None:
+        assert self._step is not None
+        work, count = self._step.work[0], len(row.values)
+        outputs = work["outputs"].tolist()
+        predictions, sds = outputs[:count], outputs[2 * count : 3 * count]
+        scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
+        expected = work["expected"].tolist()
+        row.publications.extend(self._estimates(row, predictions, sds, scales, expected))
+        row.publications.extend(self._charts.points(row.time_ns, work["points"]))
+
+    # --- events -----------------------------------------------------------------------------------------------
 
     def _evaluate(self, row: MeasuredRow) -> None:
         reference, time_ns, units, publications = self._reference, row.time_ns, row.units, row.publications
@@ -484,7 +585,8 @@ class PlantPipeline:
         predictions, sds = reference.update(time_ns, row.input_value, values, self._quarantined, row.interval.missing)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
-            publications.extend(self._estimates(row, predictions, sds, scales))
+            expected = [whitener.expected_value() for whitener in self._whiteners]
+            publications.extend(self._estimates(row, predictions, sds, scales, expected))
         e = [
             whitener.update((value - prediction) / sd)
             for whitener, value, prediction, sd in zip(self._whiteners, values, predictions, sds, strict=True)
@@ -511,16 +613,18 @@ class PlantPipeline:
                 )
 
     def _estimates(
-        self, row: MeasuredRow, predictions: Sequence[float], sds: Sequence[float], scales: list[float]
+        self,
+        row: MeasuredRow,
+        predictions: Sequence[float],
+        sds: Sequence[float],
+        scales: list[float],
+        expected: list[float],
     ) -> Iterator[Publication]:
-        """Estimates of a row, made before the prewhitening filter is updated with it."""
-        for index, whitener in enumerate(self._whiteners):
+        """Estimates of a row, with the values that the prewhitening filters expected before it."""
+        for index, mean in enumerate(expected):
             prediction, residual = predictions[index], row.values[index] - predictions[index]
             if isfinite(residual):
-                usual, reach = (
-                    prediction + sds[index] * whitener.expected_value(),
-                    scales[index] * self._charts.widths[index],
-                )
+                usual, reach = prediction + sds[index] * mean, scales[index] * self._charts.widths[index]
                 estimate = _estimate(row.time_ns, prediction, residual, row.units[index])
                 estimate.residual_sd = scales[index]
                 estimate.lower_limit, estimate.upper_limit = usual - reach, usual + reach

@@ -6,7 +6,7 @@ from typing import Annotated, NamedTuple, TypeAlias
 import msgspec
 
 from monitor_node.alarms.incidents import Count
-from monitor_node.alarms.on_off_delay import OnOffDelay, OnOffDelayState
+from monitor_node.alarms.on_off_delay import IS_NORMAL, OnOffDelay, OnOffDelayState
 from monitor_node.alarms.states import Event, State, next_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, ChartPoint, Contribution, Priority, Suspect
@@ -181,7 +181,8 @@ class ChartAlarm:
         Returns:
             True if the alarm is raised, False if it is cleared, which `record` has to follow; None if nothing changes.
         """
-        return self._rule.update(judgement.out, self._is_normal(judgement))
+        out = bool(judgement.out)
+        return self._rule.update(out, not out and IS_NORMAL.call(*judgement[:4], self.memory.above, self._reach))
 
     def record(self, time_ns: int, judgement: Judgement, unit: str, explanation: Explanation | None) -> Event:
         """Record the change of the condition that `update` returned; returns the event, which is applied.
@@ -239,14 +240,6 @@ class ChartAlarm:
             event=event,
             **{field: getattr(memory, field) for field in SHARED},
         )
-
-    def _is_normal(self, judgement: Judgement) -> bool:
-        if judgement.out:
-            return False
-        deviation = judgement.statistic - judgement.centre
-        if self.memory.above:
-            return deviation <= self._reach * (judgement.upper_limit - judgement.centre)
-        return deviation >= self._reach * (judgement.lower_limit - judgement.centre)
 
 
 def chart_point(time_ns: int, judgement: Judgement) -> ChartPoint:

@@ -191,6 +191,13 @@ class Annunciator:
                 publications.append(self._publication(alarm, SUSPECTED, time_ns))
         return publications
 
+    def is_at_rest(self, counting: Iterable[ChartAlarm]) -> bool:
+        """True if no alarm is active or shelved, and no alarms but the given ones remember points."""
+        if self._shelved or any(alarm.memory.rule.standing for alarm in self._alarms.values()):
+            return False
+        known = {alarm.name for alarm in counting}
+        return all(name in known or not alarm.memory.rule.recent for name, alarm in self._alarms.items())
+
     @property
     def incident(self) -> int:
         """Number of the latest incident; 0 before the first."""

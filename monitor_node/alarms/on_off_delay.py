@@ -9,6 +9,9 @@ normal, so that a value near its limit gives one alarm and not many. The remaini
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.spc.m_of_n import check_rule
 
 
@@ -19,6 +22,45 @@ class OnOffDelayState:
     recent: int = 0
     in_a_row: int = 0
     standing: bool = False
+
+
+DELAY = np.dtype([("recent", "i4"), ("in_a_row", "i4"), ("above", "i4")], align=True)
+"""Numbers of an alarm that is not active: last points, normal points in a row, 1 if its last limit was the upper."""
+
+
+@jit
+def add_point(recent: int, in_a_row: int, mask: int, violating: bool, normal: bool) -> tuple[int, int]:
+    """Last points and number of normal points in a row, with the next point."""
+    return ((recent << 1) | (1 if violating else 0)) & mask, in_a_row + 1 if normal else 0
+
+
+@jit
+def raises(recent: int, raise_count: int, violating: bool) -> bool:
+    """True if the last points raise an alarm that is not active."""
+    count = 0
+    while recent:
+        count += recent & 1
+        recent >>= 1
+    return violating and count >= raise_count
+
+
+@jit
+def is_normal(statistic: float, centre: float, lower: float, upper: float, above: bool, reach: float) -> bool:
+    """True if a point is within the limit that was crossed, by the dead band.
+
+    Args:
+        statistic: statistic of the point.
+        centre: centre of the chart.
+        lower: lower limit.
+        upper: upper limit.
+        above: True if the upper limit was crossed.
+        reach: share of the way from the centre to the limit that is normal.
+    """
+    deviation = statistic - centre
+    return deviation <= reach * (upper - centre) if above else deviation >= reach * (lower - centre)
+
+
+_ADD_POINT, _RAISES, IS_NORMAL = Entry(add_point), Entry(raises), Entry(is_normal)
 
 
 class OnOffDelay:
@@ -50,13 +92,14 @@ class OnOffDelay:
             True if the alarm is raised, False if it is cleared, None if nothing changes.
         """
         state = self.state
-        state.recent = ((state.recent << 1) | violating) & self._mask
-        state.in_a_row = state.in_a_row + 1 if normal or (normal is None and not violating) else 0
+        if normal is None:
+            normal = not violating
+        state.recent, state.in_a_row = _ADD_POINT.call(state.recent, state.in_a_row, self._mask, violating, normal)
         if state.standing:
             if state.in_a_row >= self._clear_count:
                 state.standing, state.recent = False, 0
                 return False
-        elif violating and state.recent.bit_count() >= self._raise_count:
+        elif _RAISES.call(state.recent, self._raise_count, violating):
             state.standing = True
             return True
         return None

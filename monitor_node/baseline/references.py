@@ -123,7 +123,7 @@ class ProcessReference:
         self._indices = output_indices(model, outputs)
         self._count = len(model.outputs)
         self._accept_all = len(outputs) == self._count and self._indices == list(range(self._count))
-        self._last_input, self._guessed, self._held_rows = nan, False, 0
+        self.last_input, self._guessed, self._held_rows = nan, False, 0
         self._reach = 0.0
         self.typical_sd = [1.0] * len(outputs)
         """Median standard deviation of each residual in the last `run`, in the outputs' units."""
@@ -141,7 +141,7 @@ class ProcessReference:
         if len(state.filter.inputs) not in (0, len(model.inputs)):
             raise ValueError(f"the filter's state must have {len(model.inputs)} inputs, got {state.filter.inputs}")
         reference._filter.state = state.filter
-        reference._last_input, reference._guessed = state.last_input, state.guessed
+        reference.last_input, reference._guessed = state.last_input, state.guessed
         reference._held_rows, reference._reach = state.held_rows, state.reach
         reference.typical_sd = list(state.typical_sd)
         return reference
@@ -160,7 +160,7 @@ class ProcessReference:
         return ProcessReferenceState(
             self.noise,
             self._filter.state,
-            self._last_input,
+            self.last_input,
             self._guessed,
             list(self.typical_sd),
             self._held_rows,
@@ -183,30 +183,46 @@ class ProcessReference:
                 self._filter.restart()
             elif unknown:
                 between = self._unknown_input(time_min, input_value)
-            self._last_input, self._guessed, self._held_rows = input_value, False, 0
-        elif unknown or not isfinite(self._last_input):
+            self.last_input, self._guessed, self._held_rows = input_value, False, 0
+        elif unknown or not isfinite(self.last_input):
             self._held_rows += missing + 1
             unknown_values = [nan] * len(values)
             return RowPrediction(unknown_values, unknown_values)
         else:
             self._guessed = True
         if self._accept_all:
-            step = self._filter.update(time_min, (self._last_input,), values, gate=GATE, accept=accept, between=between)
+            step = self._filter.update(time_min, (self.last_input,), values, gate=GATE, accept=accept, between=between)
             return RowPrediction(step.prediction, step.sd)
         measured, accepted = [nan] * self._count, [False] * self._count
         for i, value, is_accepted in zip(self._indices, values, accept, strict=True):
             measured[i], accepted[i] = value, is_accepted
         step = self._filter.update(
-            time_min, (self._last_input,), measured, gate=GATE, accept=tuple(accepted), between=between
+            time_min, (self.last_input,), measured, gate=GATE, accept=tuple(accepted), between=between
         )
         return RowPrediction([step.prediction[i] for i in self._indices], [step.sd[i] for i in self._indices])
+
+    def is_normal(self, time_min: float) -> bool:
+        """True if the filter's newest row has this time, and its input was not missing."""
+        state = self._filter.state
+        known = not self._guessed and not self._held_rows and state.time_min == time_min
+        return self._accept_all and known and state.inputs == (self.last_input,)
+
+    @property
+    def numbers(self) -> tuple[Array, Array]:
+        """Belief of the filter, and its variances: its own numbers, see `Filter`."""
+        return self._filter.belief, self._filter.variances
+
+    def accept_row(self, time_min: float, input_value: float) -> None:
+        """Note a row that a kernel has filtered in `numbers`."""
+        self.last_input = input_value
+        self._filter.accept_row(time_min, (input_value,))
 
     def _unknown_input(self, time_min: float, input_value: float) -> tuple[float, list[tuple[float]]] | None:
         """Start of the time in which the input is unknown, and its possible values: a row, or its input, is missing.
 
         None: the input was as before and after, or the filter starts with this row.
         """
-        before_min, ends = self._filter.state.time_min, {self._last_input, input_value}
+        before_min, ends = self._filter.state.time_min, {self.last_input, input_value}
         if before_min is None or (len(ends) == 1 and not self._reach):
             return None
         lower, upper = self.model.inputs[0].lower, self.model.inputs[0].upper
@@ -235,7 +251,7 @@ class ProcessReference:
             steps = self._filter.run(times, _mask_before_missing(time_min, inputs), measured, gate=GATE)
             z = steps.residual / steps.sd
             if not np.any(np.abs(z) > GATE):  # no acceptance depended on the row before
-                self._last_input, self._guessed, self._held_rows = float(inputs[-1]), False, 0
+                self.last_input, self._guessed, self._held_rows = float(inputs[-1]), False, 0
                 self.typical_sd = _median_sds(steps.sd)
                 return steps.residual, z
             self._filter.restart()

@@ -1,7 +1,7 @@
 """The plants that one monitor of a fleet owns, each in one of two forms.
 
-A plant in its normal state is packed with the quiet ones (`quiet`); any other has an active monitor, until it is normal
-again. Publications are the same.
+A plant in its normal state is packed (`packed`); any other has an active monitor, until it is normal again.
+Publications are the same.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -12,9 +12,9 @@ from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.deadline_queue import DeadlineQueue
+from monitor_node.fleet.packed.conversion import Conversion
+from monitor_node.fleet.packed.plants import PackedPlants
 from monitor_node.isolation import stage
-from monitor_node.quiet.form import QuietForm
-from monitor_node.quiet.plants import QuietPlants
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.errors import InputError
 from reactorwatch.identification.rls import RecursiveLeastSquares
@@ -59,8 +59,8 @@ class WatchedPlants:
         first = Monitor(config, start_ns, points=points, model=model)  # inconsistent settings are refused here
         self._first_model = first.model
         self.alarms = tuple(alarm.alarm for alarm in first.alarms.all_alarms())
-        form = None if points or first.model is None else QuietForm.of(config, first.model)
-        self._quiet = None if form is None or first.model is None else QuietPlants(form, config, first.model)
+        form = None if points or first.model is None else Conversion.of(config, first.model)
+        self._quiet = None if form is None or first.model is None else PackedPlants(form, config, first.model)
         self._monitors: dict[str, Monitor] = {}  # of plants that are not quiet
         self._demote_at_row: dict[str, int] = {}  # row of the next attempt to pack
         self._deadlines = DeadlineQueue()
@@ -130,7 +130,7 @@ class WatchedPlants:
     def copy(self, plant: str, name: str) -> None:
         """Add a copy of a quiet plant, for trials with many plants."""
         assert self._quiet is not None
-        self._quiet.copied(plant, name)
+        self._quiet.copy(plant, name)
 
     def active_monitor(self, plant: str) -> Monitor | None:
         """Monitor of a plant; None if it is quiet, or there is no such plant."""
@@ -165,7 +165,7 @@ class WatchedPlants:
     def count_not_stored(self, plant: str) -> None:
         """Count a failure to store the state of a plant."""
         if self._quiet is not None and plant in self._quiet:
-            self._quiet.not_stored(plant)
+            self._quiet.count_not_stored(plant)
         elif (monitor := self._monitors.get(plant)) is not None:
             monitor.stats.not_stored += 1
 

@@ -10,18 +10,36 @@ tell chance from change.
 
 from dataclasses import dataclass, field, replace
 from statistics import median
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
+from reactorwatch.codegen.numba_kernel import jit, python_function
 
 LEARN_FROM = 32  # spacings
 TOLERANCE = 0.1  # of the period
 LARGEST_GAP = 2.5  # periods
 WHOLE = 0.25  # of a period: tolerance of an interval of several whole periods, in which rows are missing
+
+
+SPACING = np.dtype([("mean_ns", "f8"), ("deviation_ns", "f8"), ("count", "i8")], align=True)
+"""Numbers of a spacing, see `Spacing`."""
+
+
+@jit
+def learn_spacing(s: Any, spacing_ns: float, memory: int) -> None:
+    """Update exponential means, over `memory` spacings, with a spacing."""
+    s.count = min(s.count + 1, memory)
+    deviation = spacing_ns - s.mean_ns
+    s.mean_ns += deviation / s.count
+    if s.count > 1:
+        s.deviation_ns += (abs(deviation) - s.deviation_ns) / s.count
+
+
+_LEARN = python_function(learn_spacing)
 
 
 class Spacing(msgspec.Struct, forbid_unknown_fields=True):
@@ -37,13 +55,19 @@ class Spacing(msgspec.Struct, forbid_unknown_fields=True):
     mean_ns: float = 0.0
     deviation_ns: float = 0.0
 
+    @staticmethod
+    def of_numbers(numbers: np.void) -> "Spacing":
+        """Spacing with given numbers, see `SPACING`."""
+        return Spacing(int(numbers["count"]), float(numbers["mean_ns"]), float(numbers["deviation_ns"]))
+
+    @property
+    def numbers(self) -> tuple[float, float, int]:
+        """The numbers, in the order of `SPACING`."""
+        return self.mean_ns, self.deviation_ns, self.count
+
     def learn(self, spacing_ns: float, memory: int) -> None:
         """Update the means, over `memory` spacings, with a spacing."""
-        self.count = min(self.count + 1, memory)
-        deviation = spacing_ns - self.mean_ns
-        self.mean_ns += deviation / self.count
-        if self.count > 1:
-            self.deviation_ns += (abs(deviation) - self.deviation_ns) / self.count
+        _LEARN(self, spacing_ns, memory)
 
 
 @dataclass

@@ -167,11 +167,8 @@ class Suspicion:
             units: units of the outputs.
             stuck: flags of the outputs whose sensors are stuck; their values are missing.
         """
-        time_min, measured = time_ns / MINUTE_NS, self._model_outputs(values)
-        if self._rows and time_min <= self._rows[-1][0]:  # the plant's clock was set back
-            self._rows.clear()
-            self._isolation = None
-        self._rows.append((time_min, input_value, measured))
+        time_min = time_ns / MINUTE_NS
+        measured = self.add(time_min, input_value, values)
         board = self._board
         if not board.has_unexplained and True not in stuck:  # the usual case
             self._reconstruction = None
@@ -222,6 +219,15 @@ class Suspicion:
         publications = self._board.set_suspects(time_ns, causes, stopped=isolation.stopped)
         self._follow(suspects[0])
         return publications
+
+    def add(self, time_min: float, input_value: float, values: list[float]) -> list[float]:
+        """Add a row; returns its outputs of the model."""
+        measured = self._model_outputs(values)
+        if self._rows and time_min <= self._rows[-1][0]:  # the plant's clock was set back
+            self._rows.clear()
+            self._isolation = None
+        self._rows.append((time_min, input_value, measured))
+        return measured
 
     def _made_isolation(self) -> Isolation:
         """Make the isolation at the first alarm: few of thousands of plants ever have one."""

@@ -41,6 +41,11 @@ class SignalCheck:
         self.board, self.outputs = board, config.outputs
 
     @property
+    def is_normal(self) -> bool:
+        """True if only the numbers of a compiled check change with the next row, unless that row is an event."""
+        return True
+
+    @property
     def state(self) -> Any:
         """The full state; the alarms belong to the board."""
         return b""

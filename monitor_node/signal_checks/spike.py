@@ -45,7 +45,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import Flags, SignalCheck
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Judgement, finite, format_quantity, positive
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, format_quantity, positive
 from reactorwatch.stored_state import StoredState
 
 NORMAL = 0.5
@@ -146,6 +146,11 @@ class Spike:
         """A copy of the state."""
         return SpikeState(self.limit, self._phase, self._held, list(self._recent))
 
+    @property
+    def is_normal(self) -> bool:
+        """True if a value within the limit would change nothing."""
+        return self._phase == "quiet" and not self._recent
+
     def update(self, z: float, *, is_moved: bool = False) -> Verdict:
         """Update with the next standardised residual; leave missing ones out.
 
@@ -179,7 +184,9 @@ class Spike:
         """Decide on a residual about 0."""
         if self._phase == "quiet" and abs(z) <= self.limit:  # as nearly always
             return NO_SPIKE
-        beyond, normal = abs(finite(z)) > self.limit, abs(z) <= NORMAL * self.limit
+        if not abs(z) < LARGEST_VALUE:
+            finite(z)
+        beyond, normal = abs(z) > self.limit, abs(z) <= NORMAL * self.limit
         held, self._held = self._held, 0.0
         if self._phase in ("quiet", "changed"):
             if self._phase == "changed" and not normal:
@@ -254,6 +261,8 @@ class SpikeCheck(SignalCheck):
             for name in self.outputs
         ]
         self._spikes: list[Spike | None] = []
+        self.limits = np.full(len(self.outputs), np.inf)
+        """Limit of each output, within which a residual is no spike; infinite without a check."""
         self._none = (False,) * len(self.outputs)
 
     @property
@@ -264,11 +273,22 @@ class SpikeCheck(SignalCheck):
     def restore(self, state: list[SpikeState | None]) -> None:
         """See `SignalCheck`."""
         self._spikes = [None if item is None else Spike.from_state(item) for item in state]
+        self._set_limits()
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """See `SignalCheck`."""
         known = [[size for size in residuals if isfinite(size)] for residuals in e]
         self._spikes = [Spike(spike_limit(z, arl0)) if len(z) >= FEWEST_ROWS else None for z in known]
+        self._set_limits()
+
+    def _set_limits(self) -> None:
+        for index, spike in enumerate(self._spikes):
+            self.limits[index] = np.inf if spike is None else spike.limit
+
+    @property
+    def is_normal(self) -> bool:
+        """See `SignalCheck`."""
+        return all(spike is None or spike.is_normal for spike in self._spikes)
 
     def on_residuals(
         self, time_ns: int, e: list[float], scales: list[float], units: list[str], publications: list[Publication]

@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import ANY, SignalRange
@@ -49,17 +51,29 @@ class SignalChecks:
         config: configuration of the monitor.
         board: the alarms of the plant; those of the signals are declared here.
         ranges: ranges of the input and of each output; None: no bounds are known.
+        numbers: numbers of the plant's stages, see `row_step.row_type`; None: the checks have their own.
     """
 
     CHANCE_ALARMS = sum(check.can_be_false for check in CHECKS)
     """Number of an output's alarms that can be false alarms."""
 
-    def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange] | None = None) -> None:
+    def __init__(
+        self,
+        config: MonitorConfig,
+        board: Annunciator,
+        ranges: Sequence[SignalRange] | None = None,
+        numbers: NDArray[np.void] | None = None,
+    ) -> None:
         self._outputs = config.outputs
         known = ranges or [ANY] * (1 + len(config.outputs))
         self._checks = [check(config, board, known) for check in CHECKS]
         self.silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
         """The check for missing data, which a receive time can decide as well."""
+        self._stuck = next(check for check in self._checks if isinstance(check, StuckCheck))
+        if numbers is not None:
+            self.silence.use(numbers["timeouts"][0])
+            self._stuck.numbers = numbers["stuck"][0]
+            next(check for check in self._checks if isinstance(check, SpikeCheck)).limits = numbers["spike_limits"][0]
         self.check_row: Callable[[int, tuple[float, ...]], list[Publication]]
         self.check_row = self._only("on_row", _in_one_list)
         """Checks a row, see `SignalCheck.on_row`."""
@@ -82,6 +96,16 @@ class SignalChecks:
             if getattr(type(check), name) is not getattr(SignalCheck, name)
         ]
         return hooks[0] if len(hooks) == 1 else combine(hooks)
+
+    @property
+    def is_normal(self) -> bool:
+        """True if each check is, see `SignalCheck`."""
+        return all(check.is_normal for check in self._checks)
+
+    @property
+    def trainings(self) -> list[tuple[dict[int, int], float]]:
+        """See `StuckCheck.trainings`."""
+        return self._stuck.trainings
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """Learn from the training; arguments as for `SignalCheck.start`."""

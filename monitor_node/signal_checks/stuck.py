@@ -28,10 +28,12 @@ A run continues over missing samples, since equal values are no likelier across 
 counts from one. Signals that operators set, like a valve position, rest for any time: check measurements only.
 """
 
-from collections import deque
 from collections.abc import Sequence
-from math import ceil, inf, isfinite, log
+from math import ceil, inf, isfinite, log, nan
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from scipy.special import betaincinv
 
 from monitor_node.alarms.alarms import STUCK_SENSOR
@@ -39,6 +41,7 @@ from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import SignalCheck
+from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, format_quantity
@@ -63,6 +66,87 @@ CONFIDENCE = 0.95
 
 READINGS = "readings"
 """The unit of the alarm."""
+
+
+STUCK = np.dtype(
+    [
+        ("limit", "f8"),  # most equal readings in a row without a fault
+        ("quietest", "f8"),
+        ("last", "f8"),  # NaN before the first reading
+        ("steps", "f8", (MOVEMENT_STEPS,)),  # newest last
+        ("repeats", "i8"),
+        ("step_count", "i8"),
+    ],
+    align=True,
+)
+"""Numbers of the check of one signal, see `StuckState`."""
+
+
+@jit
+def movement(p: Any) -> float:
+    """Mean of the last absolute steps."""
+    total = 0.0
+    for k in range(p.step_count):
+        total += p.steps[k]
+    return total / MOVEMENT_STEPS
+
+
+@jit
+def _add_step(p: Any, size: float) -> None:
+    if p.step_count < MOVEMENT_STEPS:
+        p.steps[p.step_count] = size
+        p.step_count += 1
+        return
+    for k in range(MOVEMENT_STEPS - 1):
+        p.steps[k] = p.steps[k + 1]
+    p.steps[MOVEMENT_STEPS - 1] = size
+
+
+@jit
+def take_reading(p: Any, value: float) -> bool:
+    """Count a reading; returns True if it differs from the one before."""
+    last, p.last = p.last, value
+    if last != last:
+        return False
+    if value == last:
+        p.repeats += 1
+        return False
+    for _ in range(min(p.repeats, MOVEMENT_STEPS)):
+        _add_step(p, 0.0)
+    _add_step(p, abs(value - last))
+    p.repeats = 0
+    return True
+
+
+@jit
+def allowed_readings(p: Any) -> float:
+    """Most equal readings in a row; infinite if the signal came to rest before them."""
+    moved = p.step_count == MOVEMENT_STEPS and movement(p) >= AT_REST * p.quietest
+    return float(p.limit) if moved else inf
+
+
+@jit
+def is_stuck(p: Any) -> bool:
+    """True if more readings in a row are equal than a sound sensor has."""
+    return bool(p.repeats > 0 and p.repeats + 1.0 > allowed_readings(p))
+
+
+@jit
+def _take(numbers: Any, value: float) -> bool:
+    return take_reading(numbers[0], value)
+
+
+@jit
+def _allowed_readings(numbers: Any) -> float:
+    return allowed_readings(numbers[0])
+
+
+@jit
+def _movement(numbers: Any) -> float:
+    return movement(numbers[0])
+
+
+_TAKE, _ALLOWED, _MOVEMENT = Entry(_take), Entry(_allowed_readings), Entry(_movement)
 
 
 class StuckState(StoredState, frozen=True):
@@ -100,6 +184,7 @@ class Stuck:
 
     Args:
         arl0: least mean number of readings between two false alarms.
+        numbers: numbers of the check, shape (1,), as a view of those of a plant; None: its own.
 
     Raises:
         InputError: arl0 is not a number above 1.
@@ -107,50 +192,71 @@ class Stuck:
 
     name = "stuck"
 
-    def __init__(self, arl0: float) -> None:
+    def __init__(self, arl0: float, numbers: NDArray[np.void] | None = None) -> None:
         if not 1.0 < arl0 < inf:
             raise InputError(f"arl0 must be a number above 1, got {arl0}")
         self._arl0 = float(arl0)
         self._runs: dict[int, int] = {}
-        self._quietest = inf
-        self._last: float | None = None
-        self._repeats = 0
-        self._steps: deque[float] = deque(maxlen=MOVEMENT_STEPS)
         self._learning = False
-        self._limit: float | None = None
-        self._single: Judgement | None = None  # of a reading that differs from the one before, made once
+        self.numbers = np.empty(1, STUCK) if numbers is None else numbers
+        self.numbers[0] = (inf, inf, nan, np.zeros(MOVEMENT_STEPS), 0, 0)
 
     @classmethod
-    def from_state(cls, state: StuckState) -> "Stuck":
+    def from_state(cls, state: StuckState, numbers: NDArray[np.void] | None = None) -> "Stuck":
         """Resume from a state.
 
         Raises:
             ValueError: the state is damaged.
         """
-        stuck = cls(state.arl0)
         counts = [state.repeats, *state.runs, *state.runs.values()]
         if min(counts) < 0 or len(state.steps) > MOVEMENT_STEPS or not all(0.0 <= step < inf for step in state.steps):
             raise ValueError(
                 f"state of {cls.name} must hold counts and at most {MOVEMENT_STEPS} sizes of steps, got {state}"
             )
-        stuck._runs, stuck._quietest = dict(state.runs), state.quietest
-        stuck._last, stuck._repeats, stuck._learning = state.last, state.repeats, state.learning
-        stuck._steps.extend(state.steps)
+        stuck = cls(state.arl0, numbers)
+        p = stuck.numbers[0]
+        p["quietest"], p["last"] = state.quietest, nan if state.last is None else state.last
+        p["repeats"], p["step_count"], p["steps"][: len(state.steps)] = state.repeats, len(state.steps), state.steps
+        stuck._resume(state.runs, learning=state.learning)
+        return stuck
+
+    @classmethod
+    def of_numbers(cls, arl0: float, runs: dict[int, int], numbers: NDArray[np.void]) -> "Stuck":
+        """Check with given numbers, after its training."""
+        stuck = cls.__new__(cls)
+        stuck._arl0, stuck._runs, stuck._learning, stuck.numbers = arl0, runs, False, numbers
         return stuck
 
     @property
     def state(self) -> StuckState:
         """A copy of the state."""
+        p = self.numbers[0]
+        last, steps = float(p["last"]), p["steps"][: p["step_count"]].tolist()
         return StuckState(
-            self._arl0, dict(self._runs), self._quietest, self._last, self._repeats, list(self._steps), self._learning
+            self._arl0,
+            dict(self._runs),
+            float(p["quietest"]),
+            None if last != last else last,
+            int(p["repeats"]),
+            steps,
+            self._learning,
         )
+
+    @property
+    def training(self) -> tuple[dict[int, int], float]:
+        """Number of the training's runs by number of repeats, and `arl0`."""
+        return self._runs, self._arl0
+
+    @property
+    def is_ready(self) -> bool:
+        """True if the training is over and there was a reading since the last restart."""
+        last = float(self.numbers["last"][0])
+        return not self._learning and last == last
 
     @property
     def limit(self) -> float:
         """Most equal readings in a row without a fault; infinite if the training cannot tell."""
-        if self._limit is None:
-            self._limit = longest_normal_run(self._runs, self._arl0)
-        return self._limit
+        return longest_normal_run(self._runs, self._arl0) if self._learning else float(self.numbers["limit"][0])
 
     def learn(self, value: float) -> None:
         """Learn from the next reading of the training; leave missing ones out.
@@ -158,9 +264,11 @@ class Stuck:
         Raises:
             ValueError: the reading is not finite.
         """
-        self._learning, self._limit, self._single = True, None, None
-        if self._take(finite(value)) and len(self._steps) == MOVEMENT_STEPS:
-            self._quietest = min(self._quietest, self._movement())
+        self._learning = True
+        if self._take(finite(value)):
+            p = self.numbers[0]
+            if p["step_count"] == MOVEMENT_STEPS:
+                p["quietest"] = min(float(p["quietest"]), _MOVEMENT.call(self.numbers))
 
     def update(self, value: float) -> Judgement:
         """Evaluate the next reading; leave missing ones out. The statistic is the number of equal readings in a row.
@@ -168,52 +276,42 @@ class Stuck:
         Raises:
             ValueError: the reading is not finite.
         """
-        last = self._last
-        if self._single and not self._repeats and last is not None and last != value and abs(value) < LARGEST_VALUE:
-            self._last = value  # as nearly always
-            self._steps.append(abs(value - last))
-            return self._single
-        finite(value)
+        if not abs(value) < LARGEST_VALUE:
+            finite(value)
         if self._learning:
-            self._end_run()
-            self._learning = False
-        if self._take(value) or not self._repeats:
-            if self._single is None:
-                self._single = Judgement(1.0, 0.0, 0.0, self.limit, False)
-            return self._single
-        equal = self._repeats + 1.0
-        moved = len(self._steps) == MOVEMENT_STEPS and self._movement() >= AT_REST * self._quietest
-        limit = self.limit if moved else inf
-        return Judgement(equal, 0.0, 0.0, limit, equal > limit)
+            self._end_learning()
+        self._take(value)
+        p = self.numbers[0]
+        equal = float(p["repeats"]) + 1.0
+        limit: float = _ALLOWED.call(self.numbers) if equal > 1.0 else float(p["limit"])
+        return Judgement(equal, 0.0, 0.0, limit, equal > 1.0 and equal > limit)
 
     def restart(self) -> None:
         """Drop the last readings, as after a restart of the plant; the limit stays."""
         if self._learning:
-            self._end_run()
-        self._last, self._repeats, self._learning = None, 0, False
-        self._steps.clear()
+            self._end_learning()
+        p = self.numbers[0]
+        p["last"], p["repeats"], p["step_count"] = nan, 0, 0
 
     def _take(self, value: float) -> bool:
         """Count a reading; returns True if it differs from the one before."""
-        last, self._last = self._last, value
-        if last is None:
-            return False
-        if value == last:
-            self._repeats += 1
-            return False
-        if self._learning:
-            self._end_run()
-        self._steps.extend([0.0] * min(self._repeats, MOVEMENT_STEPS))
-        self._steps.append(abs(value - last))
-        self._repeats = 0
-        return True
+        repeats = int(self.numbers["repeats"][0]) if self._learning else 0
+        differs: bool = _TAKE.call(self.numbers, value)
+        if differs and self._learning:
+            self._count_run(repeats)
+        return differs
 
-    def _end_run(self) -> None:
-        self._limit = self._single = None
-        self._runs[self._repeats] = self._runs.get(self._repeats, 0) + 1
+    def _resume(self, runs: dict[int, int], *, learning: bool) -> None:
+        self._runs, self._learning = dict(runs), learning
+        self.numbers["limit"] = longest_normal_run(self._runs, self._arl0)
 
-    def _movement(self) -> float:
-        return sum(self._steps) / MOVEMENT_STEPS
+    def _end_learning(self) -> None:
+        """Count the last run of the training, and compute the limit."""
+        self._count_run(int(self.numbers["repeats"][0]))
+        self._resume(self._runs, learning=False)
+
+    def _count_run(self, repeats: int) -> None:
+        self._runs[repeats] = self._runs.get(repeats, 0) + 1
 
 
 def longest_normal_run(runs: dict[int, int], arl0: float) -> float:
@@ -283,6 +381,7 @@ class StuckCheck(SignalCheck):
         self._alarms = [
             board.declare(self.name, name, without_on_delay=True, names_cause=True) for name in self.outputs
         ]
+        self.numbers = np.zeros(len(self.outputs), STUCK)
         self._stuck: list[Stuck] = []
         self._note_alarms()
 
@@ -293,12 +392,12 @@ class StuckCheck(SignalCheck):
 
     def restore(self, state: list[StuckState]) -> None:
         """See `SignalCheck`."""
-        self._stuck = [Stuck.from_state(item) for item in state]
+        self._stuck = [Stuck.from_state(item, self.numbers[i : i + 1]) for i, item in enumerate(state)]
         self._note_alarms()
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """See `SignalCheck`."""
-        self._stuck = [Stuck(arl0) for _ in values]
+        self._stuck = [Stuck(arl0, self.numbers[i : i + 1]) for i in range(len(values))]
         self._note_alarms()
         for stuck, readings in zip(self._stuck, values, strict=True):
             for reading in readings:
@@ -323,6 +422,16 @@ class StuckCheck(SignalCheck):
     def invalid(self) -> list[bool]:
         """See `SignalCheck`."""
         return self._invalid
+
+    @property
+    def is_normal(self) -> bool:
+        """See `SignalCheck`."""
+        return all(stuck.is_ready for stuck in self._stuck)
+
+    @property
+    def trainings(self) -> list[tuple[dict[int, int], float]]:
+        """See `Stuck.training`, of each output."""
+        return [stuck.training for stuck in self._stuck]
 
     def on_restart(self) -> None:
         """See `SignalCheck`. After a gap equal readings are counted on: it makes them no likelier."""

@@ -41,15 +41,17 @@ True
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
-import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.sampling import Spacing
+from monitor_node.ingest.sampling import SPACING, Spacing, learn_spacing
 from monitor_node.signal_checks.base import PLANT, SignalCheck
+from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Judgement, positive
@@ -92,6 +94,115 @@ NO_CHANGE = Change(None, None)
 """Returned, the object itself, if nothing changes."""
 
 
+Numbers: TypeAlias = NDArray[np.void]
+
+NO_TIME_NS = -(2**63)
+"""Stands for no time."""
+
+LONGEST_NS = 2**62 - 1
+"""Longest allowed time: its sum with a time fits into 64 bits."""
+
+TIMEOUT = np.dtype([("spacing", SPACING), ("last_ns", "i8"), ("is_active", "i8")], align=True)
+"""Numbers of a timeout in sample time: spacing, time of the last sample or `NO_TIME_NS`, 1 if it is active."""
+
+RECEIPTS = np.dtype([("spacing", SPACING), ("received_ns", "i8"), ("counted_ns", "i8")], align=True)
+"""Numbers of a timeout in receive time: spacing, time of the last sample, and of the one from which the next spacing
+counts; `NO_TIME_NS` before them."""
+
+
+@jit
+def usual_ns(s: Any) -> float:
+    """Usual spacing; -1 before it is known."""
+    return -1.0 if s.count < LEARN_FROM else float(s.mean_ns + DEVIATIONS * s.deviation_ns)
+
+
+@jit
+def allowed_ns(s: Any, limit: float) -> int:
+    """`limit` times the usual spacing; -1 before it is known."""
+    usual = usual_ns(s)
+    return -1 if usual < 0.0 else int(min(limit * usual, float(LONGEST_NS)))
+
+
+@jit
+def update_timeout(p: Any, time_ns: int, present: bool, limit: float, fallback_ns: int) -> tuple[int, int, int]:
+    """Update with a row, see `DataTimeout.update`.
+
+    Args:
+        p: numbers of the timeout.
+        time_ns: time of the row.
+        present: True if the signal has a value in it.
+        limit: allowed time, in usual spacings.
+        fallback_ns: allowed time while the usual spacing is unknown; -1: unlimited.
+
+    Returns:
+        1 if the timeout was raised plus 2 if it was cleared; time at which the allowed time was over; time of the
+        sample that cleared it.
+    """
+    last_ns = p.last_ns
+    if last_ns == NO_TIME_NS or time_ns <= last_ns:
+        p.last_ns = time_ns
+        if not (present and p.is_active):
+            return 0, 0, 0
+        p.is_active = 0
+        return 2, 0, time_ns
+    spacing_ns, allowed = time_ns - last_ns, allowed_ns(p.spacing, limit)
+    if allowed < 0 and fallback_ns >= 0:
+        allowed = max(fallback_ns, int(min(limit * p.spacing.mean_ns, float(LONGEST_NS))))
+    change, raised_ns = 0, 0
+    if 0 <= allowed < spacing_ns and not p.is_active:
+        p.is_active, change, raised_ns = 1, 1, last_ns + allowed
+    if not present:
+        return change, raised_ns, 0
+    learn_spacing(p.spacing, float(spacing_ns if allowed < 0 else min(spacing_ns, allowed)), MEMORY)
+    p.last_ns = time_ns
+    if not p.is_active:
+        return change, raised_ns, 0
+    p.is_active = 0
+    return change + 2, raised_ns, max(time_ns, last_ns + max(allowed, 0))
+
+
+@jit
+def timeout_ns(r: Any, limit: float, least_ns: int) -> int:
+    """Allowed receive time without a sample; -1 before it is known."""
+    allowed = allowed_ns(r.spacing, limit)
+    return allowed if allowed < 0 else max(allowed, least_ns)
+
+
+@jit
+def receive(r: Any, now_ns: int, limit: float, least_ns: int) -> None:
+    """Note a received sample. A step back of the clock is no spacing, nor is one in a burst."""
+    before_ns, r.received_ns = r.counted_ns, now_ns
+    if before_ns == NO_TIME_NS or now_ns < before_ns:
+        r.counted_ns = now_ns
+    elif r.spacing.count < MEMORY or float(now_ns - before_ns) >= BURST * r.spacing.mean_ns:
+        r.counted_ns = now_ns
+        spacing_ns, allowed = now_ns - before_ns, timeout_ns(r, limit, least_ns)
+        learn_spacing(r.spacing, float(min(spacing_ns, allowed) if allowed >= 0 else spacing_ns), MEMORY)
+
+
+@jit
+def _update(numbers: Any, time_ns: int, present: bool, limit: float, fallback_ns: int) -> tuple[int, int, int]:
+    return update_timeout(numbers[0], time_ns, present, limit, fallback_ns)
+
+
+@jit
+def _allowed_ns(numbers: Any, limit: float) -> int:
+    return allowed_ns(numbers[0].spacing, limit)
+
+
+@jit
+def _timeout(receipts: Any, limit: float, least_ns: int) -> int:
+    return timeout_ns(receipts[0], limit, least_ns)
+
+
+@jit
+def _receive(receipts: Any, now_ns: int, limit: float, least_ns: int) -> None:
+    receive(receipts[0], now_ns, limit, least_ns)
+
+
+_UPDATE, _ALLOWED, _TIMEOUT, _RECEIVE = Entry(_update), Entry(_allowed_ns), Entry(_timeout), Entry(_receive)
+
+
 class DataTimeoutState(StoredState, frozen=True):
     """State of a timeout, without the last receive time: a monitor that was down received nothing.
 
@@ -118,9 +229,8 @@ class DataTimeout:
     Args:
         limit: allowed time without a sample, in usual spacings.
         least_s: least allowed receive time without a sample, in seconds.
-
-    Attributes:
-        standing: True if the timeout is active.
+        numbers: numbers in sample time, shape (1,), as a view of those of a plant; None: its own.
+        receipts: numbers in receive time, shape (1,); None: its own.
 
     Raises:
         InputError: limit is not a number above 1, or least_s not a positive one.
@@ -128,37 +238,54 @@ class DataTimeout:
 
     name = "silence"
 
-    def __init__(self, limit: float = 5.0, least_s: float = 5.0) -> None:
+    def __init__(
+        self, limit: float = 5.0, least_s: float = 5.0, numbers: Numbers | None = None, receipts: Numbers | None = None
+    ) -> None:
         if not 1.0 < limit < float("inf"):
             raise InputError(f"limit must be a number of periods above 1, got {limit}")
         self._limit, self._least_s = float(limit), positive("least_s", least_s)
-        self._rows, self._receipts = Spacing(), Spacing()
-        self._last_ns: int | None = None
-        self._received_ns: int | None = None
-        self._counted_ns: int | None = None  # receive time from which the next spacing counts
-        self._steady_ns: float | None = None
-        self.standing = False
+        self._least_ns = int(self._least_s * 1e9)
+        self.numbers = no_timeouts(1) if numbers is None else numbers
+        self.receipts = no_receipts() if receipts is None else receipts
 
     @classmethod
-    def from_state(cls, state: DataTimeoutState) -> "DataTimeout":
+    def from_state(cls, state: DataTimeoutState, numbers: Numbers | None = None) -> "DataTimeout":
         """Resume from a state."""
-        timeout = cls(state.limit, state.least_s)
-        timeout._rows, timeout._receipts = msgspec.structs.replace(state.rows), msgspec.structs.replace(state.receipts)
-        timeout._last_ns, timeout.standing = state.last_ns, state.standing
-        timeout._note_steady()
+        timeout = cls(state.limit, state.least_s, numbers)
+        timeout.numbers[0] = (
+            state.rows.numbers,
+            NO_TIME_NS if state.last_ns is None else state.last_ns,
+            state.standing,
+        )
+        timeout.receipts["spacing"] = state.receipts.numbers
         return timeout
 
     @property
     def state(self) -> DataTimeoutState:
         """A copy of the state."""
-        rows, receipts = msgspec.structs.replace(self._rows), msgspec.structs.replace(self._receipts)
+        rows, receipts = Spacing.of_numbers(self.numbers["spacing"][0]), Spacing.of_numbers(self.receipts["spacing"][0])
         return DataTimeoutState(self._limit, self._least_s, rows, receipts, self._last_ns, self.standing)
+
+    @property
+    def standing(self) -> bool:
+        """True if the timeout is active."""
+        return bool(self.numbers["is_active"][0])
+
+    @standing.setter
+    def standing(self, standing: bool) -> None:
+        self.numbers["is_active"] = standing
+
+    @property
+    def _last_ns(self) -> int | None:
+        """Time of the last sample with a value; None before the first."""
+        return _time(self.numbers["last_ns"])
 
     # --- sample time -----------------------------------------------------------------------------------------
 
     def fallback_allowed_ns(self) -> int | None:
         """Allowed time of a signal whose own spacing is unknown, by this plant's rows; None if that is unknown."""
-        return _allowed_ns(self._rows, max(UNKNOWN_ROWS, self._limit))
+        allowed: int = _ALLOWED.call(self.numbers, max(UNKNOWN_ROWS, self._limit))
+        return None if allowed < 0 else allowed
 
     def update(self, time_ns: int, *, present: bool, fallback_allowed_ns: int | None = None) -> Change:
         """Update with a row.
@@ -171,62 +298,45 @@ class DataTimeout:
             present: True if the signal has a value in it.
             fallback_allowed_ns: allowed time while the signal's own spacing is unknown; None: unlimited.
         """
-        last_ns = self._last_ns
-        if last_ns is None or time_ns <= last_ns:
-            self._last_ns = time_ns
-            return self._change(None, time_ns) if present else NO_CHANGE
-        rows, spacing_ns = self._rows, time_ns - last_ns
-        if present and spacing_ns == self._steady_ns and not self.standing:
-            self._last_ns = time_ns  # there is nothing to learn
+        fallback_ns = -1 if fallback_allowed_ns is None else fallback_allowed_ns
+        change, raised_ns, cleared_ns = _UPDATE.call(self.numbers, time_ns, present, self._limit, fallback_ns)
+        if not change:
             return NO_CHANGE
-        allowed_ns = _allowed_ns(rows, self._limit)
-        if allowed_ns is None and fallback_allowed_ns is not None:
-            allowed_ns = max(fallback_allowed_ns, int(self._limit * rows.mean_ns))
-        raised_ns = None
-        if allowed_ns is not None and spacing_ns > allowed_ns and not self.standing:
-            self.standing, raised_ns = True, last_ns + allowed_ns
-        if not present:
-            return NO_CHANGE if raised_ns is None else Change(raised_ns, None)
-        rows.learn(spacing_ns if allowed_ns is None else min(spacing_ns, allowed_ns), MEMORY)
-        self._note_steady()
-        self._last_ns = time_ns
-        return self._change(raised_ns, max(time_ns, last_ns + (allowed_ns or 0)))
+        return Change(raised_ns if change & 1 else None, cleared_ns if change & 2 else None)
 
     def suppress_until(self, time_ns: int) -> None:
         """Restart the timer: until now all signals had no data, not only this one."""
         if not self.standing:
-            self._last_ns = time_ns
+            self.numbers["last_ns"] = time_ns
 
     # --- receive time ----------------------------------------------------------------------------------------
 
     def arm(self, now_ns: int) -> None:
         """Restart the timer after a stop; the time to the next sample is no spacing."""
-        self._received_ns, self._counted_ns = now_ns, None
+        self.receipts_ns = now_ns, None
 
     @property
     def receipts_ns(self) -> tuple[int | None, int | None]:
         """Receive time of the last sample, and of the one from which the next spacing counts; None before the first."""
-        return self._received_ns, self._counted_ns
+        return _time(self.receipts["received_ns"]), _time(self.receipts["counted_ns"])
 
     @receipts_ns.setter
     def receipts_ns(self, receipts_ns: tuple[int | None, int | None]) -> None:
-        self._received_ns, self._counted_ns = receipts_ns
+        received_ns, counted_ns = receipts_ns
+        self.receipts["received_ns"] = NO_TIME_NS if received_ns is None else received_ns
+        self.receipts["counted_ns"] = NO_TIME_NS if counted_ns is None else counted_ns
 
     def on_receipt(self, now_ns: int) -> None:
-        """Restart the timer: a sample was received. A step back of the clock is no spacing, nor is one in a burst."""
-        before_ns, self._received_ns = self._counted_ns, now_ns
-        if before_ns is None or now_ns < before_ns:
-            self._counted_ns = now_ns
-        elif self._receipts.count < MEMORY or now_ns - before_ns >= BURST * self._receipts.mean_ns:
-            self._counted_ns = now_ns
-            self._receipts.learn(min(now_ns - before_ns, self._timeout_ns() or now_ns - before_ns), MEMORY)
+        """Restart the timer: a sample was received."""
+        _RECEIVE.call(self.receipts, now_ns, self._limit, self._least_ns)
 
     def due_ns(self) -> int | None:
         """Time to `check`, unless a sample arrives before; None: no timeout is set."""
-        timeout_ns = self._timeout_ns()
-        if self._received_ns is None or timeout_ns is None or self.standing or self.deadline_ns() is None:
+        timeout: int = _TIMEOUT.call(self.receipts, self._limit, self._least_ns)
+        received_ns = _time(self.receipts["received_ns"])
+        if received_ns is None or timeout < 0 or self.standing or self.deadline_ns() is None:
             return None
-        return self._received_ns + timeout_ns
+        return received_ns + timeout
 
     def check(self, now_ns: int) -> Change:
         """Check the timeout in receive time.
@@ -254,31 +364,27 @@ class DataTimeout:
 
     def deadline_ns(self) -> int | None:
         """Deadline of the next row in sample time; None before the spacing is known."""
-        allowed_ns = _allowed_ns(self._rows, self._limit)
-        return None if self._last_ns is None or allowed_ns is None else self._last_ns + allowed_ns
-
-    def _timeout_ns(self) -> int | None:
-        allowed_ns = _allowed_ns(self._receipts, self._limit)
-        return None if allowed_ns is None else max(allowed_ns, int(self._least_s * 1e9))
-
-    def _note_steady(self) -> None:
-        """Note the spacing of the rows if all were equal: then the next equal one teaches nothing."""
-        rows = self._rows
-        self._steady_ns = rows.mean_ns if rows.count == MEMORY and rows.deviation_ns == 0.0 else None
-
-    def _change(self, raised_ns: int | None, heard_ns: int) -> Change:
-        """Change due to a sample."""
-        if not self.standing:
-            return NO_CHANGE
-        self.standing = False
-        return Change(raised_ns, heard_ns)
+        last_ns, allowed = self._last_ns, _ALLOWED.call(self.numbers, self._limit)
+        return None if last_ns is None or allowed < 0 else last_ns + allowed
 
 
-def _allowed_ns(spacing: Spacing, limit: float) -> int | None:
-    """`limit` times the usual spacing; None before it is known."""
-    if spacing.count < LEARN_FROM:
-        return None
-    return int(limit * (spacing.mean_ns + DEVIATIONS * spacing.deviation_ns))
+def no_timeouts(count: int) -> Numbers:
+    """Numbers of timeouts before the first sample, shape (count,)."""
+    numbers = np.zeros(count, TIMEOUT)
+    numbers["last_ns"] = NO_TIME_NS
+    return numbers
+
+
+def no_receipts() -> Numbers:
+    """Numbers of a timeout in receive time before the first sample, shape (1,)."""
+    receipts = np.zeros(1, RECEIPTS)
+    receipts["received_ns"] = receipts["counted_ns"] = NO_TIME_NS
+    return receipts
+
+
+def _time(field: NDArray[np.int64]) -> int | None:
+    time_ns = int(field[0])
+    return None if time_ns == NO_TIME_NS else time_ns
 
 
 class SilenceCheck(SignalCheck):
@@ -289,7 +395,10 @@ class SilenceCheck(SignalCheck):
     def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
         super().__init__(config, board, ranges)
         self._names = (PLANT, config.input, *config.outputs)
-        self._silences = [DataTimeout(config.silence_periods) for _ in self._names]
+        self.numbers = no_timeouts(len(self._names))
+        self._silences = [
+            DataTimeout(config.silence_periods, numbers=self.numbers[i : i + 1]) for i in range(len(self._names))
+        ]
         self._alarms = [
             board.declare(
                 self.name, name, without_on_delay=True, without_off_delay=True, priority="high", names_cause=True
@@ -314,7 +423,20 @@ class SilenceCheck(SignalCheck):
 
     def restore(self, state: list[DataTimeoutState]) -> None:
         """See `SignalCheck`."""
-        self._silences = [DataTimeout.from_state(item) for item in state]
+        self._silences = [DataTimeout.from_state(item, self.numbers[i : i + 1]) for i, item in enumerate(state)]
+
+    @property
+    def is_normal(self) -> bool:
+        """See `SignalCheck`: the newest row has all signals, and no timeout is active."""
+        times_ns = self.numbers["last_ns"]
+        return not self.numbers["is_active"].any() and bool((times_ns == times_ns[0]).all())
+
+    def use(self, numbers: Numbers) -> None:
+        """Keep the numbers in an array of the plant from now on."""
+        numbers[:] = self.numbers
+        self.numbers = numbers
+        for i, silence in enumerate(self._silences):
+            silence.numbers = numbers[i : i + 1]
 
     def arm(self, now_ns: int) -> None:
         """Wait, after a stop, for the plant's next sample."""

@@ -30,6 +30,37 @@ def jit(kernel: Kernel) -> Kernel:
         return cast(Kernel, numba.njit(cache=False, fastmath=False, error_model="numpy")(kernel))
 
 
+def python_function(kernel: Kernel) -> Kernel:
+    """Python function of a kernel of `jit`, for objects: the same operations, bit for bit."""
+    return cast(Kernel, cast(Any, kernel).py_func)
+
+
+_KINDS = {int: types.int64, float: types.float64, bool: types.boolean}
+
+
+class Entry:
+    """Kernel that is always called with arguments of the same types, from Python, for one plant.
+
+    Numba finds the machine code for the types of the arguments at each call; for arrays of records that takes a
+    microsecond, four times as long as a step. So the code for the arrays of the first call is kept.
+
+    Args:
+        kernel: a kernel of `jit`. Its arguments are C-contiguous arrays, and numbers annotated as int, float or bool.
+    """
+
+    def __init__(self, kernel: Callable[..., Any]) -> None:
+        self._kernel: Any = kernel
+        self.call: Callable[..., Any] = self._compile
+
+    def _compile(self, *arguments: Any) -> Any:
+        typeof: Callable[[Any], Any] = numba.typeof
+        declared = list(self._kernel.py_func.__annotations__.values())[: len(arguments)]
+        kinds = tuple(_KINDS.get(kind) or typeof(argument) for kind, argument in zip(declared, arguments, strict=True))
+        self._kernel.compile(kinds)
+        self.call = self._kernel.overloads[kinds].entry_point
+        return self.call(*arguments)
+
+
 def _call_at(_typing: Any, address: Any, numbers: Any) -> Any:
     """Numba intrinsic: the type of the call, and the function that generates its IR."""
 

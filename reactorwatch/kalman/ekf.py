@@ -188,6 +188,22 @@ class Filter:
         self._learned = state.learned or state.time_min is not None
         self._belief[:] = [*state.x, *state.P]
 
+    @property
+    def belief(self) -> Array:
+        """Filtered state and its covariance, shape (n_x + n_x^2,): the filter's own numbers, for kernels."""
+        belief: Array = self._belief
+        return belief
+
+    @property
+    def variances(self) -> Array:
+        """Variances of the sensors and of the process per minute, shape (n_y + n_x,): the filter's own numbers."""
+        noise: Array = self._constants[len(self.model.parameters) :]
+        return noise
+
+    def accept_row(self, time_min: float, inputs: Sequence[float]) -> None:
+        """Note a row that a kernel has filtered in `belief`."""
+        self._set_row(time_min, inputs)
+
     def update(
         self,
         time_min: float,

@@ -8,12 +8,14 @@ as selections, so that the compiler can turn the loop into vector instructions.)
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
+from functools import cache
 from struct import Struct
 from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reactorwatch.codegen.numba_kernel import Entry
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, SignalChart, finite
 
@@ -145,10 +147,15 @@ class Bank(Generic[Kind]):
 
     def _hold(self, columns: Array) -> None:
         self._columns = np.ascontiguousarray(columns)
-        plants = columns.shape[1]
+        plants, self._kernel = columns.shape[1], _entry(self._kind)
         self._numbers = self._columns.reshape(-1).data  # all of them, one row after the other
         self._come, self._out = Struct(f"{2 * plants}d").pack_into, Struct(f"{plants}d").unpack_from
         self._out_offset = OUT * plants * self._columns.itemsize
+
+    @property
+    def numbers(self) -> Array:
+        """Settings and memory of the charts, shape (numbers of one chart, plants): a view, contiguous."""
+        return self._columns[SETTINGS:]
 
     @property
     def state(self) -> SignalState:
@@ -197,7 +204,7 @@ class Bank(Generic[Kind]):
             Judgement of each chart, None where it has no value; None in place of all if no chart is out.
         """
         self._come(self._numbers, 0, *values, *present)  # X and PRESENT are the first rows
-        self._kind.kernel(self._columns)
+        self._kernel.call(self._columns)
         out = self._out(self._numbers, self._out_offset)
         if not (always or (any(out) and any(here and much > 0.0 for here, much in zip(present, out, strict=True)))):
             return None
@@ -222,6 +229,11 @@ class Bank(Generic[Kind]):
         columns = self._columns[:, plant : plant + 1].copy()
         columns[PRESENT] = 1.0
         return self._kind._of(columns)
+
+
+@cache
+def _entry(kind: type[CompiledChart]) -> Entry:
+    return Entry(kind.kernel)
 
 
 def _restart(columns: Array, memories: int, plants: Any) -> None:

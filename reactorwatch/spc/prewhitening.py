@@ -15,13 +15,14 @@ sensitive to their errors; the size of these is stored beside them, and limits a
 `false_alarm_budget`).
 """
 
-from collections import deque
-from math import isfinite, nan
+from math import inf, nan
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.stored_state import StoredState
 
 Array = NDArray[np.float64]
@@ -163,6 +164,66 @@ def _sd_variance(error: Array, freedom: int) -> float:
     return max(independent, float(batches.var(ddof=1)) / (4.0 * mean**2 * BATCHES))
 
 
+WHITENER = np.dtype(
+    [
+        ("constant", "f8"),
+        ("coefficients", "f8", (LARGEST_ORDER,)),
+        ("sd", "f8"),
+        ("sd_variance", "f8"),
+        ("passed_variance", "f8"),
+        ("past", "f8", (LARGEST_ORDER,)),  # newest first
+        ("expected", "f8"),
+        ("rows", "i4"),
+        ("order", "i4"),
+        ("count", "i4"),  # number of past values
+    ],
+    align=True,
+)
+"""Numbers of a prewhitening filter: its autoregression and its past values."""
+
+
+@jit
+def expected_value(p: Any) -> float:
+    """Prediction of the next z; its mean while there are too few past values."""
+    value = p.constant
+    if p.count < p.order:
+        total = 0.0
+        for k in range(p.order):
+            total += p.coefficients[k]
+        return float(value / (1.0 - total))
+    for k in range(p.order):
+        value += p.coefficients[k] * p.past[k]
+    return float(value)
+
+
+@jit
+def innovation(p: Any, z: float) -> float:
+    """Innovation of the next value in units of sigma; NaN for NaN, which clears the past, and for too few values."""
+    if not abs(z) < inf:
+        p.count = 0
+        return nan
+    is_known = p.count >= p.order
+    p.expected = expected_value(p)
+    for k in range(LARGEST_ORDER - 1, 0, -1):
+        p.past[k] = p.past[k - 1]
+    p.past[0] = z
+    p.count = min(p.count + 1, max(p.order, 1))
+    return float((z - p.expected) / p.sd) if is_known else nan
+
+
+@jit
+def _expected_value(numbers: Any) -> float:
+    return expected_value(numbers[0])
+
+
+@jit
+def _innovation(numbers: Any, z: float) -> float:
+    return innovation(numbers[0], z)
+
+
+_EXPECTED_VALUE, _INNOVATION = Entry(_expected_value), Entry(_innovation)
+
+
 class PrewhitenerState(StoredState, frozen=True):
     """The autoregression, and the last values, newest first."""
 
@@ -174,36 +235,57 @@ class Prewhitener:
     """Computes the innovations of a residual, value by value.
 
     Args:
-        learned: the autoregression.
+        learned: the autoregression; None: the numbers have it.
+        numbers: numbers of the filter, shape (1,), as a view of those of a plant; None: its own.
     """
 
-    def __init__(self, learned: Prewhitening) -> None:
-        self.learned = learned
-        self.past: deque[float] = deque(maxlen=max(len(learned.coefficients), 1))
-        """The last values, newest first: the full state."""
-        self._expected = 0.0
-        self._order, self._mean = len(learned.coefficients), learned.constant / learned.shift_gain
+    def __init__(self, learned: Prewhitening | None, numbers: NDArray[np.void] | None = None) -> None:
+        self.numbers = np.zeros(1, WHITENER) if numbers is None else numbers
+        if learned is not None:
+            order = len(learned.coefficients)
+            past = np.zeros(LARGEST_ORDER)
+            coefficients = np.array([*learned.coefficients, *past[order:]])
+            self.numbers[0] = (
+                *(learned.constant, coefficients, learned.sd, learned.sd_variance, learned.passed_variance),
+                *(past, 0.0, learned.rows, order, 0),
+            )
 
     @classmethod
-    def from_state(cls, state: PrewhitenerState) -> "Prewhitener":
+    def from_state(cls, state: PrewhitenerState, numbers: NDArray[np.void] | None = None) -> "Prewhitener":
         """Resume, bit for bit, from a state."""
-        whitener = cls(state.learned)
-        whitener.past.extend(state.past)
+        whitener = cls(state.learned, numbers)
+        p = whitener.numbers[0]
+        p["past"][: len(state.past)], p["count"] = state.past, len(state.past)
         return whitener
+
+    @property
+    def autoregression(self) -> Prewhitening:
+        """The autoregression."""
+        p = self.numbers[0]
+        return Prewhitening(
+            float(p["constant"]),
+            tuple(p["coefficients"][: p["order"]].tolist()),
+            float(p["sd"]),
+            int(p["rows"]),
+            float(p["sd_variance"]),
+            float(p["passed_variance"]),
+        )
 
     @property
     def state(self) -> PrewhitenerState:
         """A copy of the full state."""
-        return PrewhitenerState(self.learned, list(self.past))
+        p = self.numbers[0]
+        return PrewhitenerState(self.autoregression, p["past"][: p["count"]].tolist())
+
+    @property
+    def is_ready(self) -> bool:
+        """True if there are enough past values for an innovation of the next one."""
+        p = self.numbers[0]
+        return bool(p["count"] == max(p["order"], 1))
 
     def expected_value(self) -> float:
         """Prediction of the next z; its mean while there are too few past values."""
-        learned = self.learned
-        if len(self.past) < self._order:
-            return self._mean
-        value = learned.constant
-        for coefficient, z in zip(learned.coefficients, self.past, strict=False):
-            value += coefficient * z
+        value: float = _EXPECTED_VALUE.call(self.numbers)
         return value
 
     def update(self, z: float) -> float:
@@ -214,18 +296,14 @@ class Prewhitener:
         Args:
             z: the next value; NaN if it is missing.
         """
-        if not isfinite(z):
-            self.past.clear()
-            return nan
-        known = len(self.past) >= self._order
-        self._expected = expected = self.expected_value()
-        self.past.appendleft(z)
-        return (z - expected) / self.learned.sd if known else nan
+        value: float = _INNOVATION.call(self.numbers, z)
+        return value
 
     def reject_last(self) -> None:
         """Treat the last value as an outlier: replace it by its prediction."""
-        self.past[0] = self._expected
+        p = self.numbers[0]
+        p["past"][0] = p["expected"]
 
     def restart(self) -> None:
         """Forget the values seen."""
-        self.past.clear()
+        self.numbers["count"] = 0

@@ -50,7 +50,7 @@ def sources() -> list[Path]:
 
 @cache
 def files() -> frozenset[str]:
-    """Paths, and their ends: `monitor_node/quiet/rows.py`, `quiet/rows.py` and `rows.py`."""
+    """Paths, and their ends: `monitor_node/fleet/packed/rows.py`, `packed/rows.py` and `rows.py`."""
     paths = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*")]
     parts = [path.relative_to(ROOT).parts for path in (*ROOT.iterdir(), *paths)]
     return frozenset("/".join(part[start:]) for part in parts for start in range(len(part)))
@@ -96,7 +96,7 @@ def test_names_in_docstrings_comments_and_docs_exist() -> None:
     ("text", "missing"),
     [
         ("what is done is in `output_watch.py`", ["output_watch.py"]),
-        ("see quiet/rows.py", []),
+        ("see packed/rows.py", []),
         ("see charts/rows.py", ["charts/rows.py"]),
         ("[x](../monitor_node/ingest/alignment.py)", []),
     ],
@@ -106,4 +106,4 @@ def test_a_file_that_does_not_exist_is_found(text: str, missing: list[str]) -> N
 
 
 def test_a_name_that_does_not_exist_is_found() -> None:
-    assert missing_names("see `quiet_plants`, `quiet.rows` and `MonitorConfig`") == ["quiet_plants"]
+    assert missing_names("see `quiet_plants`, `packed.rows` and `MonitorConfig`") == ["quiet_plants"]

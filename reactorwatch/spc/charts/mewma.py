@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reactorwatch.codegen.numba_kernel import jit
+from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.errors import InputError
 from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Setting, positive, vector
@@ -22,19 +22,29 @@ from reactorwatch.spc.joint_chart import JointChart, correlation, joint_limit
 
 
 @jit
-def _move(average: Array, x: Array, mean: Array, matrix: Array, weight: float) -> float:
-    """Take x into the average, in white coordinates; returns its squared length, -1 if x cannot be taken."""
+def move(numbers: Array, x: Array, weight: float) -> float:
+    """Take x into the average, in white coordinates; returns the statistic, -1 if x cannot be taken.
+
+    Args:
+        numbers: numbers of the chart, see `Mewma.numbers`.
+        x: shape (p,).
+        weight: lambda.
+    """
     for value in x:
         if not abs(value) < LARGEST_VALUE:
             return -1.0
-    squares = 0.0
-    for i in range(average.size):
+    p, squares = x.size, 0.0
+    for i in range(p):
         white = 0.0
         for j in range(i + 1):  # the matrix is lower triangular
-            white += matrix[i, j] * (x[j] - mean[j])
-        average[i] = (1.0 - weight) * average[i] + weight * white
-        squares += average[i] * average[i]
-    return squares
+            white += numbers[1 + 2 * p + i * p + j] * (x[j] - numbers[1 + j])
+        average = (1.0 - weight) * numbers[1 + p + i] + weight * white
+        numbers[1 + p + i] = average
+        squares += average * average
+    return squares * (2.0 - weight) / weight
+
+
+_MOVE = Entry(move)
 
 
 class MewmaState(ChartState, frozen=True):
@@ -71,10 +81,15 @@ class Mewma(JointChart):
     def __init__(self, mean: ArrayLike, covariance: ArrayLike, weight: float, limit: float) -> None:
         if not 0.0 < weight <= 1.0:
             raise InputError(f"weight (lambda) must be in (0, 1], got {weight}")
-        self.whitening = Whitening(mean, covariance)
+        whitening = self.whitening = Whitening(mean, covariance)
         self.weight = float(weight)
         self.limit = positive("limit", limit)
-        self._average: Array = np.zeros(self.whitening.mean.size)
+        p = whitening.mean.size
+        self.numbers: Array = np.concatenate(
+            [[self.limit], whitening.mean, np.zeros(p), whitening.matrix.ravel(), whitening.covariance.ravel()]
+        )
+        """Limit, mean, average and whitening matrix, as `move` takes them, and the covariance."""
+        self._average = self.numbers[1 + p : 1 + 2 * p]
 
     @classmethod
     def design(cls, baseline: Baseline) -> Self:
@@ -94,25 +109,30 @@ class Mewma(JointChart):
         average = np.array(state.average, dtype=np.float64)
         if average.shape != chart._average.shape or not np.all(np.isfinite(average)):
             raise ValueError(f"average must be {chart._average.size} finite numbers, got {state.average}")
-        chart._average = average
+        chart._average[:] = average
         return chart
+
+    @staticmethod
+    def state_of_numbers(numbers: Array, weight: float) -> MewmaState:
+        """State of a chart with given numbers."""
+        p = signals_of(numbers)
+        mean, average = numbers[1 : 1 + p].tolist(), numbers[1 + p : 1 + 2 * p].tolist()
+        covariance = numbers[1 + 2 * p + p * p :].reshape(p, p).tolist()
+        return MewmaState(mean, covariance, weight, float(numbers[0]), average)
 
     @property
     def state(self) -> MewmaState:
         """A copy of the full state."""
-        mean, covariance = self.whitening.mean.tolist(), self.whitening.covariance.tolist()
-        return MewmaState(mean, covariance, self.weight, self.limit, self._average.tolist())
+        return self.state_of_numbers(self.numbers, self.weight)
 
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (p,)."""
-        values = np.asarray(x, dtype=np.float64)
+        values = np.ascontiguousarray(x, dtype=np.float64)
         if values.shape != self._average.shape:
             raise ValueError(f"a sample must have shape {self._average.shape}, got {values.shape}")
-        whitening = self.whitening
-        squares = _move(self._average, values, whitening.mean, whitening.matrix, self.weight)
-        if squares < 0.0:
+        statistic = _MOVE.call(self.numbers, values, self.weight)
+        if statistic < 0.0:
             vector(x, self._average.size)  # says which value it is
-        statistic = squares * (2.0 - self.weight) / self.weight
         return Judgement(statistic, float(self._average.size), 0.0, self.limit, statistic > self.limit)
 
     def contributions(self, x: ArrayLike | None = None) -> Array:
@@ -126,4 +146,14 @@ class Mewma(JointChart):
 
     def restart(self) -> None:
         """Forget the vectors seen."""
-        self._average = np.zeros(self._average.size)
+        self._average[:] = 0.0
+
+
+def count_numbers(signals: int) -> int:
+    """Count of a chart's numbers."""
+    return 1 + 2 * signals + 2 * signals * signals
+
+
+def signals_of(numbers: Array) -> int:
+    """Number of signals of a chart with given numbers."""
+    return next(p for p in range(numbers.size) if count_numbers(p) == numbers.size)

@@ -42,9 +42,16 @@ def fleet(config: MonitorConfig = QUICK, shard: Shard = WHOLE, name: str = "a", 
     return FleetMonitor(config, 0, ShardGroup(PLANTS, shard, name), Callbacks(**callbacks))
 
 
+def stage_by_stage(config: MonitorConfig, plant: str = "x", *, points: bool = False) -> Monitor:
+    """Monitor whose rows all pass the stages one by one, as events do."""
+    monitor = Monitor(msgspec.structs.replace(config, plant=plant), 0, points=points)
+    monitor.pipeline._find_normal = lambda time_ns: False  # type: ignore[method-assign]
+    return monitor
+
+
 def alone(plant: str, messages: Iterable[Encoded], config: MonitorConfig = QUICK) -> list[Publication]:
-    """What the plant's own monitor says."""
-    monitor = Monitor(msgspec.structs.replace(config, plant=plant), 0, points=False)
+    """What the plant's own monitor says, stage by stage."""
+    monitor = stage_by_stage(config, plant)
     return [said for message in messages for said in monitor.on_message(message, 0)]
 
 

@@ -93,6 +93,6 @@ def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_
     assert change == changes(warm.published)[0]
     assert warm.finding.verdict == NAMED
     assert not node._worker.is_busy
-    reference = node._pipeline._reference
+    reference = node.pipeline._reference
     assert isinstance(reference, ProcessReference)
     assert reference.model is node.equations is read_equations(change.model)  # the one that was prepared

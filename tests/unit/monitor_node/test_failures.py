@@ -10,13 +10,13 @@ from monitor_node.chart_stage import ChartWatch
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.failures import Failures
+from monitor_node.fleet.packed.conversion import Conversion
 from monitor_node.isolation.candidate import scan_candidates
 from monitor_node.isolation.causes import CAUSES
 from monitor_node.isolation.glr_scan import Scan
 from monitor_node.isolation.isolation import Isolation
 from monitor_node.isolation.window import Window
 from monitor_node.pipeline import PlantPipeline
-from monitor_node.quiet.form import QuietForm
 from monitor_node.signal_checks.timeout import SilenceCheck
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Health
@@ -58,8 +58,8 @@ def health_message(said: list[Publication], plant: str) -> Health:
         (SilenceCheck, "on_row", "row"),
         (Annunciator, "end_row", "row"),
         (PlantPipeline, "snapshots", "models"),
-        (QuietForm, "written", "demotion"),
-        (QuietForm, "read", "promotion"),
+        (Conversion, "demote", "demotion"),
+        (Conversion, "promote", "promotion"),
     ],
 )
 def test_an_error_in_one_plant_of_a_fleet_changes_nothing_for_the_others(
@@ -71,17 +71,17 @@ def test_an_error_in_one_plant_of_a_fleet_changes_nothing_for_the_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Whatever the stage: the others are judged as alone, value for value; the error is counted and reported once."""
-    if owner is QuietForm:
-        method = getattr(QuietForm, name)
-        place = 0 if name == "read" else 1  # the arguments that name the plant
+    if owner is Conversion:
+        method = getattr(Conversion, name)
+        place = 0 if name == "promote" else 1  # the arguments that name the plant
 
-        def failing(self: QuietForm, *arguments: Any) -> Any:
+        def failing(self: Conversion, *arguments: Any) -> Any:
             plant = arguments[0] if place == 0 else arguments[0].config.plant
             if plant == BROKEN:
                 raise ZeroDivisionError("a number that was never zero before")
             return method(self, *arguments)
 
-        monkeypatch.setattr(QuietForm, name, failing)
+        monkeypatch.setattr(Conversion, name, failing)
     else:
         fail_from(monkeypatch, owner, name)
     monitors = fleet()

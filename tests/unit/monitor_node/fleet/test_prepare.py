@@ -7,17 +7,17 @@ from typing import Any
 import numba
 import pytest
 
+from monitor_node.fleet.packed import plants
 from monitor_node.fleet.watched_plants import WatchedPlants
-from monitor_node.quiet import plants
 from reactorwatch.contract import sample_bytes
 from reactorwatch.identification import information
 
 from ..fleets import QUICK, SECOND_NS, fleet, row_by_row, run_of
 
 LONG_COMPILED: tuple[tuple[ModuleType, str], ...] = (
-    (plants, "judge"),
+    (plants, "step_rows"),
     (plants, "take_samples"),
-    (plants, "silent_from"),
+    (plants, "find_deadlines"),
     (information, "learn_one"),
     (sample_bytes, "_read"),
 )

@@ -1,4 +1,4 @@
-"""The arrays of the quiet plants: a slot for each, which the next one gets when it goes."""
+"""Arrays of the packed plants: one slot a plant; a free slot is used again."""
 
 from math import prod
 from mmap import MAP_ANONYMOUS, MAP_PRIVATE, mmap
@@ -7,46 +7,50 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.quiet.form import QuietForm, Rest
-from monitor_node.quiet.layout import Records
-from monitor_node.quiet.ring import Kept, NewestRows, newest_rows, row_bytes
+from monitor_node.fleet.packed.conversion import Conversion, Rest
+from monitor_node.fleet.packed.record import Records
+from monitor_node.fleet.packed.ring import Kept, NewestRows, newest_rows, row_bytes
+from monitor_node.row_step import FilterNumbers
 from reactorwatch.contract import keys
+from reactorwatch.records.record import NEVER_NS
 
 FIRST_ROOM = 16
-"""Plants that there is room for at first; it doubles."""
-
-NEVER_NS = 2**63 - 1
+"""Number of slots at first; it doubles."""
 
 
-class Slots:
-    """Where each plant is.
+class PlantArray:
+    """Slots of plants, and their arrays.
 
     Args:
-        form: of their records.
-        signals: of each plant, the input first.
+        form: conversion to and from monitors.
+        signals: names of each plant's signals, the input first.
 
     Attributes:
-        of: by plant, its slot.
-        names: by slot; empty where there is no plant.
-        rests: by slot.
-        codes: by key of a sample, the slot times the signals plus the signal.
+        of: slot by plant.
+        names: plant by slot; empty for a free slot.
+        rests: state beside the numbers, by slot.
+        codes: slot times the number of signals plus the index of the signal, by key of a sample.
         plants: records.
-        times: rings of spacings, shape (slots, rows kept). It takes no memory where all are zero: whoever writes there
-            leaves out what is there already.
+        numbers: numbers of the stages.
+        kalman: numbers of the filters.
+        times: rings of spacings, shape (slots, rows kept). They take no memory where all are zero: unchanged values are
+            not written.
         ring: rings of values, shape (slots, rows kept, bytes).
-        others: rings of inputs at no level, shape (slots, rows kept); it takes no memory either where there are none.
-        health_due_ns: by slot; never for one without a plant.
+        others: rings of inputs at no level, shape (slots, rows kept); they take no memory where there are none.
+        health_due_ns: time of the next health message, by slot; never for a free slot.
     """
 
-    def __init__(self, form: QuietForm, signals: tuple[str, ...]) -> None:
+    def __init__(self, form: Conversion, signals: tuple[str, ...]) -> None:
         self._form, self._signals = form, signals
         self.of: dict[str, int] = {}
         self.names: list[str] = []
         self.rests: list[Rest | None] = []
         self._free: list[int] = []
         self.codes: dict[str, int] = {}
-        self._used: NDArray[np.int64] | None = None
+        self._occupied: NDArray[np.int64] | None = None
         self.plants: Records
+        self.numbers: Records
+        self.kalman: FilterNumbers
         self.times: NDArray[np.int32]
         self.ring: NDArray[np.uint8]
         self.others: NDArray[np.int64]
@@ -54,7 +58,7 @@ class Slots:
         self._room(FIRST_ROOM)
 
     def take(self, plant: str) -> int:
-        """A slot for a plant that comes."""
+        """Take a slot for a plant."""
         if self._free:
             slot = self._free.pop()
             self.names[slot] = plant
@@ -64,14 +68,14 @@ class Slots:
                 self._room(2 * slot)
             self.names.append(plant)
             self.rests.append(None)
-        self.of[plant], self._used = slot, None
+        self.of[plant], self._occupied = slot, None
         for place, signal in enumerate(self._signals):
             self.codes[keys.key(plant, keys.SAMPLE, signal)] = slot * len(self._signals) + place
         return slot
 
     def leave(self, plant: str) -> None:
-        """A plant goes, and its slot is free."""
-        slot, self._used = self.of.pop(plant), None
+        """Free the slot of a plant."""
+        slot, self._occupied = self.of.pop(plant), None
         self.health_due_ns[slot] = NEVER_NS
         for signal in self._signals:
             del self.codes[keys.key(plant, keys.SAMPLE, signal)]
@@ -80,14 +84,14 @@ class Slots:
         self._free.append(slot)
 
     @property
-    def used(self) -> NDArray[np.int64]:
-        """The slots that have a plant."""
-        if self._used is None:
-            self._used = np.array(sorted(self.of.values()), dtype=np.int64)
-        return self._used
+    def occupied_slots(self) -> NDArray[np.int64]:
+        """Slots that have a plant."""
+        if self._occupied is None:
+            self._occupied = np.array(sorted(self.of.values()), dtype=np.int64)
+        return self._occupied
 
     def keep(self, slot: int, spacings: NDArray[np.int32], kept: Kept) -> None:
-        """Fill the beginning of the rings of a plant that comes, and what its record says of them."""
+        """Fill the rings of a new plant, and the fields of its record that describe them."""
         p, count = self.plants[slot], spacings.size
         p["kept"], p["head"] = count, count % self._form.keeps
         p["levels"], p["level_rows"] = kept.levels, kept.level_rows
@@ -97,47 +101,55 @@ class Slots:
         _write(self.others[slot, : kept.others.size], kept.others)
 
     def copy(self, of: int, slot: int) -> None:
-        """Fill record and rings of a plant with those of another."""
+        """Fill the arrays of a slot with those of another."""
         self.plants[slot], self.ring[slot] = self.plants[of], self.ring[of]
+        self.numbers[slot] = self.numbers[of]
+        self.kalman.belief[slot], self.kalman.variances[slot] = self.kalman.belief[of], self.kalman.variances[of]
         self.health_due_ns[slot] = self.health_due_ns[of]
         _write(self.times[slot], self.times[of])
         _write(self.others[slot], self.others[of])
 
     def rest(self, slot: int) -> Rest:
-        """What is kept beside the record of a plant."""
+        """State of a plant beside its numbers."""
         rest = self.rests[slot]
         assert rest is not None
         return rest
 
     def newest(self, slot: int) -> NewestRows:
-        """The newest rows of a plant."""
-        return newest_rows(self.plants[slot], self.times[slot], self.ring[slot], self.others[slot])
+        """Newest rows of a plant."""
+        last_ns = int(self.numbers["last_ns"][slot])
+        return newest_rows(self.plants[slot], last_ns, self.times[slot], self.ring[slot], self.others[slot])
 
     def _room(self, plants: int) -> None:
-        """Make room for so many."""
+        """Make slots for a number of plants."""
         form, before = self._form, len(self.names)
         records, times = _zeros((plants,), form.record), _zeros((plants, form.keeps), np.dtype(np.int32))
         ring = _zeros((plants, form.keeps, row_bytes(form.columns)), np.dtype(np.uint8))
         others = _zeros((plants, form.keeps if form.columns else 0), np.dtype(np.int64))
+        numbers, f8 = _zeros((plants,), form.step.numbers_type), np.dtype(np.float64)
+        belief, variances = (_zeros((plants, size), f8) for size in form.step.filter_sizes)
         if before:
             records[:before], ring[:before] = self.plants, self.ring
+            numbers[:before], belief[:before] = self.numbers, self.kalman.belief
+            variances[:before] = self.kalman.variances
             for now, then in ((times, self.times), (others, self.others)):
                 written = np.flatnonzero(then.any(axis=1))
                 now[written] = then[written]
         self.plants, self.times, self.ring, self.others = records, times, ring, others
+        self.numbers, self.kalman = numbers, FilterNumbers(belief, variances)
         due_ns = np.full(plants, NEVER_NS)
         due_ns[:before] = self.health_due_ns[:before]
         self.health_due_ns = due_ns
 
 
 def _write(into: NDArray[Any], values: NDArray[Any]) -> None:
-    """Write what is not there already: what was never written takes no memory."""
+    """Write values that differ: pages that were never written take no memory."""
     place = np.flatnonzero(into != values)
     into[place] = values[place]
 
 
 def _zeros(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
-    """An array of zeros, straight from the system: it keeps no memory of what was never written, nor of what was."""
+    """Make an array of zeros in memory of the system: pages take memory when they are first written."""
     count = prod(shape)
     memory = mmap(-1, max(count, 1) * kind.itemsize, flags=MAP_PRIVATE | MAP_ANONYMOUS)  # if shared, to read takes some
     return np.frombuffer(memory, kind, count).reshape(shape)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from monitor_node.quiet.layout import LEVELS
-from monitor_node.quiet.ring import kept_values, values_of
+from monitor_node.fleet.packed.record import LEVELS
+from monitor_node.fleet.packed.ring import kept_values, values_of
 
 TYPICAL = np.array([100.0, 0.1, 440.0])
 

@@ -1,7 +1,6 @@
-"""The newest rows of a plant, as its ring keeps them.
+"""Newest rows of a plant, compressed in a ring without loss.
 
-What a search for causes wants of 600 rows is most of what a plant takes, so they are kept as small as they go without
-the loss of a bit.
+The 600 rows for isolation are most of the memory of a plant.
 
 The ring holds when each row came, as the spacing before it: in a unit in which all are whole, and less the usual one,
 in 32 bits. If that does not fit, as when a plant whose times are in nanoseconds was away for more than two seconds, it
@@ -21,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from monitor_node.quiet.layout import LEVELS, Array, Bytes, Ints, Places
+from monitor_node.fleet.packed.record import LEVELS, Array, Bytes, Ints, Places
 from reactorwatch.records.record import MINUTE_NS
 
 UNITS_NS = (1_000_000, 1_000, 1)
@@ -33,11 +32,11 @@ ZERO = -(2 ** (8 * VALUE_BYTES - 1))
 
 
 class NewestRows(NamedTuple):
-    """The newest rows of a plant, oldest first.
+    """Newest rows of a plant, oldest first.
 
     Attributes:
-        times_ns: of each.
-        values: of each, input first, shape (rows, signals); without columns if they are not kept.
+        times_ns: time of each row.
+        values: values of each row, the input first, shape (rows, signals); without columns if they are not kept.
     """
 
     times_ns: list[int]
@@ -45,11 +44,11 @@ class NewestRows(NamedTuple):
 
 
 def kept_spacings(times_ns: list[int], usual_ns: int) -> tuple[int, Places] | None:
-    """The spacings of rows as the ring keeps them, and the unit that they are in; None if they do not fit.
+    """Spacings of rows as the ring keeps them, and their unit; None if they do not fit.
 
     Args:
-        times_ns: of the rows; of the first no spacing is known, which is kept as the usual one.
-        usual_ns: the usual spacing.
+        times_ns: times of the rows; before the first the spacing is unknown, and kept as the usual one.
+        usual_ns: usual spacing.
     """
     over = np.diff(times_ns, prepend=times_ns[0] - usual_ns) - usual_ns
     unit_ns = next(unit for unit in UNITS_NS if not np.any(over % unit))
@@ -76,10 +75,10 @@ class Kept(NamedTuple):
 
 
 def row_bytes(columns: int) -> int:
-    """What a row takes.
+    """Size of a row in bytes.
 
     Args:
-        columns: how many values it has; none if they are not kept.
+        columns: number of its values; 0 if they are not kept.
     """
     return 1 + VALUE_BYTES * (columns - 1) if columns else 0
 
@@ -126,11 +125,12 @@ def values_of(kept: Kept) -> Array:
     return np.ascontiguousarray(np.column_stack([inputs, measured])).view(np.float64)
 
 
-def newest_rows(p: np.void, times: Places, ring: Bytes, others: Ints) -> NewestRows:
+def newest_rows(p: np.void, last_ns: int, times: Places, ring: Bytes, others: Ints) -> NewestRows:
     """The rows that a ring keeps.
 
     Args:
         p: record of the plant.
+        last_ns: time of the newest row.
         times: spacings, shape (rows kept,).
         ring: values, shape (rows kept, bytes).
         others: inputs at no level, shape (rows kept,).
@@ -141,7 +141,7 @@ def newest_rows(p: np.void, times: Places, ring: Bytes, others: Ints) -> NewestR
     at_no_level = others[order] if others.size else others
     kept = Kept(ring[order], p["reference"], p["levels"], p["level_rows"], at_no_level)
     since = np.concatenate([[0], np.cumsum(over[:0:-1])])  # from each row to the newest, newest first
-    return NewestRows((p["last_ns"] - since)[::-1].tolist(), values_of(kept))
+    return NewestRows((last_ns - since)[::-1].tolist(), values_of(kept))
 
 
 def times_ns_of(times_min: Array) -> list[int]:

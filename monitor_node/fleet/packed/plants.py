@@ -1,4 +1,4 @@
-"""The quiet plants as a fleet sees them: they come and go, samples come in, and what is to be said goes out."""
+"""Packed plants, as a fleet uses them: plants are added and removed, samples are processed, publications returned."""
 
 from dataclasses import fields
 from typing import Any, NamedTuple
@@ -7,46 +7,42 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.baseline.references import GATE, ProcessReference
-from monitor_node.baseline.signal_range import signal_ranges
+from monitor_node.baseline.references import ProcessReference
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from monitor_node.fleet.packed.array import PlantArray
+from monitor_node.fleet.packed.conversion import Conversion
+from monitor_node.fleet.packed.ring import kept_spacings, kept_values
+from monitor_node.fleet.packed.rows import NEW_MINUTE, step_rows
+from monitor_node.fleet.packed.samples import find_deadlines, take_samples
 from monitor_node.health import NODE, Processed, health_message
 from monitor_node.ingest.alignment import Counts, Row
 from monitor_node.ingest.receive_stats import STALL_NS, ReceiveStats
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE, USABLE
-from monitor_node.quiet.form import QuietForm
-from monitor_node.quiet.ring import kept_spacings, kept_values
-from monitor_node.quiet.rows import NEW_MINUTE, judge
-from monitor_node.quiet.samples import silent_from, take_samples
-from monitor_node.quiet.slots import NEVER_NS, Slots
 from monitor_node.state.monitor_state import learning_settings, seal_state
-from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Sample
 from reactorwatch.contract.sample_bytes import SampleColumns, parse_samples
-from reactorwatch.kalman.ekf_step import row_function
-from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.records.record import MINUTE_NS, NEVER_NS
 
 MOST_HEALTHS = 20
-"""Plants whose health is told at a time, so that samples need not wait for thousands."""
+"""Health messages at a time, so that samples need not wait for thousands."""
 
 LOOK_AGAIN_NS = 250_000_000
-"""By then it is seen again which plants are overdue; samples that came meanwhile may have made it earlier."""
+"""Longest time between two searches for plants without data; samples since may have made deadlines earlier."""
 
 _SAMPLE = encoding_of(Sample)
 
 
 class Taken(NamedTuple):
-    """What became of messages.
+    """Result for some messages.
 
     Attributes:
-        publications: what is to be published because of them.
-        others: those that were not taken, in their order: of no plant here, or for a monitor that was given back.
-        given: the monitors of plants that are quiet no longer; they have judged their rows up to the first of `others`.
+        publications: publications because of them.
+        others: messages that were not processed, in order: of other plants, or of plants that were unpacked.
+        given: monitors of the plants that were unpacked; they have processed rows up to the first of `others`.
     """
 
     publications: list[Publication]
@@ -54,23 +50,20 @@ class Taken(NamedTuple):
     given: dict[str, Monitor]
 
 
-class QuietPlants:
-    """Watches plants as long as nothing happens in them.
+class PackedPlants:
+    """Monitors plants in their normal state.
 
     Args:
-        form: of their records.
-        config: of their monitors.
-        model: that their rows are expected by.
+        form: conversion to and from monitors.
+        config: settings of the plants' monitors.
+        model: process model of the plants.
     """
 
-    def __init__(self, form: QuietForm, config: MonitorConfig, model: ProcessModel) -> None:
+    def __init__(self, form: Conversion, config: MonitorConfig, model: ProcessModel) -> None:
         self._form, self._config, self._model = form, config, model
         self._settings = learning_settings(config, model, points=False)
         self._signals = (config.input, *config.outputs)
-        self._slots = Slots(form, self._signals)
-        self._rows = CompiledFunction(row_function(model))
-        self._parameters = model.values()
-        self._ranges = np.array([[item.lower, item.upper] for item in signal_ranges(model, self._signals)])
+        self._slots = PlantArray(form, self._signals)
         self._scratch = np.zeros(1, form.record)
         self._shared: dict[Any, Any] = {}  # parts of `Rest`, which are equal for many plants, are kept once
         self._overdue_ns, self._looked_ns = NEVER_NS, 0  # when the first was overdue, and when that was seen
@@ -83,36 +76,39 @@ class QuietPlants:
 
     @property
     def plants(self) -> list[str]:
-        """Those that are here."""
+        """Names of the packed plants."""
         return list(self._slots.of)
 
     def prepare(self) -> None:
-        """Compile the machine code ahead of its first use: on a new machine that takes seconds."""
+        """Compile the machine code of the first use: on a new machine that takes seconds."""
         nobody, now = np.array([-1], np.int32), np.zeros(1, np.int64)
-        rows, _ = self._lined_up(nobody, parse_samples([b""]), now, 0)
-        self._judged(rows, [])
+        rows, _ = self._align(nobody, parse_samples([b""]), now, 0)
+        self._step_rows(rows, [])
         self._silent_from_ns()
 
     # --- coming and going ------------------------------------------------------------------------------------
 
     def take(self, plant: str, monitor: Monitor) -> bool:
-        """Take a plant over from its monitor, if it is quiet; returns whether it is.
+        """Pack a plant, if it is in its normal state; returns True if it is.
 
         Args:
             plant: name of the plant.
-            monitor: its; of no use afterwards if the plant was taken.
+            monitor: monitor of the plant; not to be used afterwards if the plant was packed.
         """
-        found = self._form.written(monitor, self._scratch)
+        found = self._form.demote(monitor, self._scratch)
         if found is None:
             return False
         rest, rows = found
-        usual_ns = round(float(self._scratch[0]["period_ns"]))
+        usual_ns = round(float(monitor.pipeline.numbers[0]["period_ns"][0]))
         spacings = kept_spacings(rows.times_ns, usual_ns)
         values = kept_values(rows.values)
         if spacings is None or values is None:
             return False
         slot = self._slots.take(plant)
         self._slots.plants[slot] = self._scratch[0]
+        numbers, kalman = monitor.pipeline.numbers
+        self._slots.numbers[slot] = numbers[0]
+        self._slots.kalman.belief[slot], self._slots.kalman.variances[slot] = kalman.belief[0], kalman.variances[0]
         self._slots.health_due_ns[slot] = self._scratch[0]["health_due_ns"]
         p = self._slots.plants[slot]
         p["unit_ns"], p["usual_ns"] = spacings[0], usual_ns
@@ -126,30 +122,31 @@ class QuietPlants:
         return True
 
     def state_of(self, plant: str) -> bytes:
-        """What a monitor of a plant's own would store of it."""
+        """Serialised state of a plant, as its monitor would store it."""
         slot = self._slots.of[plant]
         rest, rows = self._slots.rest(slot), self._slots.newest(slot)
-        state = self._form.read(plant, self._slots.plants[slot], rest, rows, [])
+        p, numbers, belief = self._slots.plants[slot], self._slots.numbers[slot], self._slots.kalman.belief[slot]
+        state = self._form.promote(plant, p, numbers, belief, rest, rows, [])
         return seal_state(msgspec.structs.replace(state, settings=self._settings | {"plant": plant}))
 
     def received_count(self, plant: str) -> int:
         """Number of messages of a plant."""
         return int(self._slots.plants["received"][self._slots.of[plant]])
 
-    def not_stored(self, plant: str) -> None:
-        """Count that what is remembered of a plant could not be stored."""
+    def count_not_stored(self, plant: str) -> None:
+        """Count a failure to store the state of a plant."""
         self._slots.plants["not_stored"][self._slots.of[plant]] += 1
 
     def give(self, plant: str) -> Monitor:
-        """Give a plant to a monitor of its own."""
+        """Unpack a plant; returns its monitor."""
         return self._give(plant, [])
 
-    def copied(self, plant: str, name: str) -> None:
-        """Begin to watch another plant that is, so far, like one that is here: for trials with many plants.
+    def copy(self, plant: str, name: str) -> None:
+        """Add a copy of a plant, for trials with many plants.
 
         Args:
-            plant: the one that is here; no alarm of it ever came up.
-            name: of the other.
+            plant: a packed plant that never had an alarm.
+            name: name of the copy.
         """
         of, slot = self._slots.of[plant], self._slots.take(name)
         slots = self._slots
@@ -163,19 +160,22 @@ class QuietPlants:
         monitor = Monitor(msgspec.structs.replace(self._config, plant=plant), 0, points=False, model=self._model)
         monitor.failures.passes = ()
         try:
-            monitor.restore(self._form.read(plant, p, self._slots.rest(slot), rows, [row.time_ns for row in waiting]))
+            numbers, belief, rest = self._slots.numbers[slot], self._slots.kalman.belief[slot], self._slots.rest(slot)
+            times_ns = [row.time_ns for row in waiting]
+            monitor.restore(self._form.promote(plant, p, numbers, belief, rest, rows, times_ns))
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
             monitor.failures.add("promotion", error, "the plant is learned again")
         monitor.on_history_end()
         p["health_due_ns"] = self._slots.health_due_ns[slot]
-        monitor.stats, monitor.receipts_ns = _receive_stats(p), (int(p["received_ns"]), int(p["counted_ns"]))
+        received_ns, counted_ns = p["receipts"]["received_ns"], p["receipts"]["counted_ns"]
+        monitor.stats, monitor.receipts_ns = _receive_stats(p), (int(received_ns), int(counted_ns))
         self._slots.leave(plant)
         return monitor
 
     # --- samples ---------------------------------------------------------------------------------------------
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> Taken:
-        """Take in samples of the plants that are here, and leave the others."""
+        """Process samples of packed plants."""
         code_of = self._slots.codes.get
         codes = np.array(
             [code_of(key, -1) if encoding == _SAMPLE else -1 for key, _, encoding, _ in messages], dtype=np.int32
@@ -184,9 +184,9 @@ class QuietPlants:
             return Taken([], messages, {})
         samples = parse_samples([payload if len(payload) <= LARGEST_SAMPLE else b"" for _, payload, _, _ in messages])
         received_ns = np.fromiter([came_ns for _, _, _, came_ns in messages], np.int64, len(messages))
-        rows, others = self._lined_up(codes, samples, received_ns, now_ns)
+        rows, others = self._align(codes, samples, received_ns, now_ns)
         publications: list[Publication] = []
-        waiting = self._judged(rows, publications)
+        waiting = self._step_rows(rows, publications)
         given: dict[str, Monitor] = {}
         for code in codes[others].tolist():
             if code >= 0:
@@ -197,10 +197,10 @@ class QuietPlants:
             publications += monitor.on_rows(left)
         return Taken(publications, [messages[place] for place in others.tolist()], given)
 
-    def _lined_up(
+    def _align(
         self, codes: NDArray[np.int32], samples: SampleColumns, received_ns: NDArray[np.int64], now_ns: int
     ) -> tuple["_Rows", NDArray[np.int32]]:
-        """The rows that are complete, and the samples that are not taken."""
+        """Align samples; returns complete rows, and the samples that were not processed."""
         most = codes.size // len(self._signals) + min(codes.size, len(self._slots.names))
         rows = _Rows(
             np.empty(most, np.int32),
@@ -227,31 +227,28 @@ class QuietPlants:
         )
         return rows.first(count), others[:left_over]
 
-    def _judged(self, rows: "_Rows", publications: list[Publication]) -> dict[int, list[Row]]:
-        """Judge rows; returns, by slot, those that are out of the ordinary, and all after them."""
+    def _step_rows(self, rows: "_Rows", publications: list[Publication]) -> dict[int, list[Row]]:
+        """Take rows through the step; returns, by slot, the first that is an event and all after it."""
         waiting: dict[int, list[Row]] = {}
         found = np.empty(rows.slots.size, np.int32)
-        judge(
-            self._slots.plants,
-            self._scratch,
-            self._slots.times,
-            self._slots.ring,
-            self._slots.others,
+        slots, step = self._slots, self._form.step
+        step_rows(
+            slots.plants,
+            slots.numbers,
+            step.scratch,
+            step.work,
+            step.settings,
+            *slots.kalman,
+            step.parameters,
+            step.after,
+            slots.times,
+            slots.ring,
+            slots.others,
             rows.slots,
             rows.times_ns,
-            np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns.tolist()]),
             rows.values,
+            np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns.tolist()]),
             rows.values.view(np.int64),
-            self._rows.address,
-            self._parameters,
-            self._ranges,
-            LONGEST_ROW_MIN,
-            GATE,
-            self._config.silence_periods,
-            self._form.places,
-            self._form.rules,
-            1.0 - self._config.dead_band,
-            self._config.chart_settings["mewma_weight"],
             found,
         )
         for place in np.flatnonzero(found).tolist():
@@ -263,7 +260,7 @@ class QuietPlants:
         return waiting
 
     def _figures(self, slot: int, time_ns: int) -> list[Publication]:
-        """Tell the figures of a plant's alarms."""
+        """Publish the KPIs of a plant's alarms."""
         rest = self._slots.rest(slot)
         if rest.board is not None:
             publications = rest.board.end_row(time_ns)
@@ -278,7 +275,7 @@ class QuietPlants:
     # --- the clock -------------------------------------------------------------------------------------------
 
     def overdue(self, now_ns: int) -> list[str]:
-        """Plants of which nothing came for longer than is allowed."""
+        """Plants whose data timeout has expired."""
         if now_ns < self._overdue_ns and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
             return []
         due_ns = self._silent_from_ns()
@@ -286,7 +283,7 @@ class QuietPlants:
         return [self._slots.names[slot] for slot in np.flatnonzero(due_ns <= now_ns).tolist()]
 
     def healths(self, now_ns: int) -> list[Publication]:
-        """The health of plants' monitors where it is due; of so many at a time."""
+        """Health messages that are due, of at most `MOST_HEALTHS` plants."""
         period_ns = int(self._config.health_period_s * 1e9)
         due = np.flatnonzero(self._slots.health_due_ns <= now_ns)[:MOST_HEALTHS]
         p = self._slots.plants
@@ -296,18 +293,18 @@ class QuietPlants:
         return [self._health(slot, now_ns, "watching") for slot in due.tolist()]
 
     def next_due_ns(self) -> int:
-        """Time of the next overdue plant or health message, as far as is known now."""
+        """Earliest deadline of a health message or a data timeout, as far as known."""
         return min(int(self._slots.health_due_ns.min()), self._overdue_ns, self._looked_ns + LOOK_AGAIN_NS)
 
     def last_healths(self, now_ns: int) -> list[Publication]:
-        """The health of all, when the monitor is stopped."""
-        return [self._health(slot, now_ns, "stopped") for slot in self._slots.used.tolist()]
+        """Health messages of all plants when the monitor is stopped."""
+        return [self._health(slot, now_ns, "stopped") for slot in self._slots.occupied_slots.tolist()]
 
     def _silent_from_ns(self) -> NDArray[np.int64]:
-        """By slot, when it is too long since something came; never for a slot without a plant."""
-        return silent_from(
-            self._slots.plants[: len(self._slots.names)], self._config.silence_periods, int(self._form.least_s * 1e9)
-        )
+        """Time by slot at which the data timeout expires; never for a free slot."""
+        count = len(self._slots.names)
+        plants, numbers = self._slots.plants[:count], self._slots.numbers[:count]
+        return find_deadlines(plants, numbers, self._config.silence_periods, int(self._form.least_s * 1e9))
 
     def _health(self, slot: int, now_ns: int, phase: str) -> Publication:
         p, rest, plant = self._slots.plants[slot], self._slots.rest(slot), self._slots.names[slot]
@@ -334,9 +331,9 @@ class _Rows(NamedTuple):
     """Rows of several plants.
 
     Attributes:
-        slots: of their plants.
-        times_ns: their times.
-        values: input first, shape (rows, signals).
+        slots: slots of the plants, shape (rows,).
+        times_ns: times of the rows, shape (rows,).
+        values: values of the rows, the input first, shape (rows, signals).
     """
 
     slots: NDArray[np.int32]
@@ -344,7 +341,7 @@ class _Rows(NamedTuple):
     values: NDArray[np.float64]
 
     def first(self, count: int) -> "_Rows":
-        """So many of them."""
+        """The first rows."""
         return _Rows(self.slots[:count], self.times_ns[:count], self.values[:count])
 
 

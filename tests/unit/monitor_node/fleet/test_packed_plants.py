@@ -14,7 +14,7 @@ from monitor_node.state.monitor_state import MonitorState
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Health, Quality, Sample
 
-from .fleets import alone, fleet, of, row_by_row, run_of
+from ..fleets import alone, fleet, of, row_by_row, run_of, stage_by_stage
 
 ALL = MonitorConfig(training_min=20.0, isolation=False, charts=("shewhart", "ewma", "cusum", "mewma"))
 LOOKING = MonitorConfig(training_min=20.0)
@@ -190,7 +190,7 @@ def test_whatever_happens_the_same_is_said_as_by_a_monitor_of_its_own(upset: obj
     assert callable(upset)
     generator = np.random.default_rng(7)
     run = upset(run_of("x", 11, leak_min=90.0, span_min=100.0), generator)
-    monitor, own = fleet(ALL), Monitor(msgspec.structs.replace(ALL, plant="x"), 0, points=False)
+    monitor, own = fleet(ALL), stage_by_stage(ALL)
     quiet, said, expected = list[bool](), list[Publication](), list[Publication]()
     for begin in range(0, len(run), together):
         now_ns = 10**9 * begin
@@ -201,6 +201,22 @@ def test_whatever_happens_the_same_is_said_as_by_a_monitor_of_its_own(upset: obj
     assert of("x", said) == expected
     assert any(isinstance(item.message, Alarm) for item in said)
     assert comparable(monitor.monitor("x").state).to_bytes() == comparable(own.state).to_bytes()
+
+
+@pytest.mark.parametrize("points", [True, False])
+@pytest.mark.parametrize("upset", UPSETS)
+def test_a_row_in_one_compiled_step_gives_what_it_gives_stage_by_stage(upset: object, points: bool) -> None:
+    """Publications and state of a monitor of one plant are the same, value for value."""
+    assert callable(upset)
+    run = upset(run_of("x", 11, leak_min=90.0, span_min=100.0), np.random.default_rng(7))
+    config = msgspec.structs.replace(ALL, isolation=points)
+    stepped = Monitor(msgspec.structs.replace(config, plant="x"), 0, points=points)
+    staged, steps = stage_by_stage(config, points=points), 0
+    for message in run:
+        steps += stepped.pipeline.is_normal
+        assert stepped.on_message(message, 0) == staged.on_message(message, 0)
+    assert steps > 300
+    assert stepped.to_bytes() == staged.to_bytes()
 
 
 STRANGE: dict[str, dict[str, Any]] = {
@@ -235,7 +251,7 @@ def test_a_plant_with_a_sample_that_is_refused_is_quiet_no_longer_and_counts_it(
 @pytest.mark.parametrize("config", [ALL, LOOKING])
 def test_what_is_remembered_of_a_quiet_plant_is_what_its_own_monitor_remembers(config: MonitorConfig) -> None:
     run = run_of("x", 12, span_min=100.0)[:-2]  # the last row is not complete
-    monitor, own = fleet(config), Monitor(msgspec.structs.replace(config, plant="x"), 0, points=False)
+    monitor, own = fleet(config), stage_by_stage(config)
     for begin in range(0, len(run), 100):
         now_ns = 10**9 * begin
         monitor.on_messages(run[begin : begin + 100], now_ns)
@@ -258,7 +274,7 @@ def test_an_input_is_remembered_to_the_bit_however_many_values_it_has(rows: int)
     run = run_of("x", 12, span_min=180.0)[: 3 * rows]
     for place in range(950, min(rows, 1100)):
         run[3 * place] = changed(run[3 * place], value=Sample.FromString(run[3 * place].payload).value + 1e-9 * place)
-    monitor, own = fleet(LOOKING), Monitor(msgspec.structs.replace(LOOKING, plant="x"), 0, points=False)
+    monitor, own = fleet(LOOKING), stage_by_stage(LOOKING)
     for begin in range(0, len(run), 30):
         now_ns = 10**9 * begin
         monitor.on_messages(run[begin : begin + 30], now_ns)
@@ -308,7 +324,7 @@ def test_plants_that_come_and_go_do_not_disturb_each_other() -> None:
 
 def test_a_quiet_plant_that_falls_silent_is_told_of_when_its_own_monitor_would() -> None:
     run = run_of("x", 14, span_min=60.0)
-    monitor, own = fleet(ALL), Monitor(msgspec.structs.replace(ALL, plant="x"), 0, points=False)
+    monitor, own = fleet(ALL), stage_by_stage(ALL)
     for number, message in enumerate(run):
         monitor.on_message(message, 10**9 * number)
         own.on_message(message, 10**9 * number)
@@ -324,7 +340,7 @@ def test_a_quiet_plant_that_falls_silent_is_told_of_when_its_own_monitor_would()
 
 def test_the_health_of_a_quiet_plant_counts_what_its_own_monitor_counts() -> None:
     run = run_of("x", 15, span_min=60.0)
-    monitor, own = fleet(ALL), Monitor(msgspec.structs.replace(ALL, plant="x"), 0, points=False)
+    monitor, own = fleet(ALL), stage_by_stage(ALL)
     monitor.on_messages(run[:1], 0)
     own.on_message(run[0], 0)
     for begin in range(1, len(run), 100):

@@ -1,4 +1,4 @@
-"""Between a record and what is remembered of samples on their way into rows."""
+"""Conversion of the state of sequence checks and alignment to and from a record."""
 
 from dataclasses import astuple
 
@@ -12,7 +12,7 @@ from reactorwatch.runtime.delivery.gap_tracker import GapTracker
 
 
 def is_in_order(alignment: AlignmentState) -> bool:
-    """Whether no sample is missing, and at most one row waits, the newest."""
+    """True if no sample is missing, and at most one row is pending, the newest."""
     left_ns, newest = alignment.newest_left_ns, alignment.newest_numbers
     if alignment.restarted or left_ns is None or len(alignment.pending) > 1:
         return False
@@ -29,8 +29,8 @@ def is_in_order(alignment: AlignmentState) -> bool:
     return True
 
 
-def run_on(runs: list[SequenceCheck], alignment: AlignmentState) -> bool:
-    """Whether no sample is held, the usual spacings are known, and the runs have come as far as the rows."""
+def are_runs_complete(runs: list[SequenceCheck], alignment: AlignmentState) -> bool:
+    """True if no sample is held, the usual spacings are known, and the runs are as far as the rows."""
     return all(
         not run.held
         and run.spacing.count == FULL_RUN
@@ -41,23 +41,22 @@ def run_on(runs: list[SequenceCheck], alignment: AlignmentState) -> bool:
 
 
 def write_runs(p: np.void, runs: list[SequenceCheck]) -> None:
-    """Note the runs of the signals' samples, which have come as far as the rows."""
-    p["run_spacing_ns"] = [run.spacing.mean_ns for run in runs]
-    p["run_deviation_ns"] = [run.spacing.deviation_ns for run in runs]
+    """Write the sequence checks, which are as far as the rows, to a record."""
+    p["runs"] = [run.spacing.numbers for run in runs]
 
 
 def runs_of(p: np.void) -> list[SequenceCheck]:
-    """The runs of the signals' samples."""
+    """Sequence checks of the signals."""
     runs: list[SequenceCheck] = []
     for place in range(len(p["expected"])):
         newest_ns = int(p["pending_ns"] if p["have"] >> place & 1 else p["left_ns"])
-        spacing = Spacing(FULL_RUN, float(p["run_spacing_ns"][place]), float(p["run_deviation_ns"][place]))
+        spacing = Spacing.of_numbers(p["runs"][place])
         runs.append(SequenceCheck(int(p["expected"][place]), newest_ns, spacing=spacing))
     return runs
 
 
 def write_alignment(p: np.void, alignment: AlignmentState) -> None:
-    """Note samples on their way into rows."""
+    """Write the state of the alignment to a record."""
     p["expected"] = [numbering.expected or 0 for numbering in alignment.sequences]
     p["left"], p["left_ns"] = len(alignment.left), alignment.newest_left_ns or 0
     p["counts"] = astuple(alignment.counts)
@@ -67,11 +66,11 @@ def write_alignment(p: np.void, alignment: AlignmentState) -> None:
 
 
 def alignment_of(p: np.void, times_ns: list[int]) -> AlignmentState:
-    """Samples on their way into rows.
+    """State of the alignment.
 
     Args:
         p: record of the plant.
-        times_ns: of its rows that left, the newest last.
+        times_ns: times of its emitted rows, the newest last.
     """
     signals = range(len(p["expected"]))
     have = [bool(p["have"] >> signal & 1) for signal in signals]

@@ -1,0 +1,145 @@
+"""Rows of many plants in their normal state: each goes through the compiled step and into the ring of newest rows."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monitor_node.fleet.packed.record import LEVELS, Array, Bytes, Ints, Places, Records
+from monitor_node.fleet.packed.ring import VALUE_BYTES, ZERO
+from monitor_node.row_step import EVENT, step
+from reactorwatch.codegen.numba_kernel import jit
+from reactorwatch.records.record import MINUTE_NS
+
+ORDINARY, NEW_MINUTE, ODD = 0, 1, 2
+"""Kinds of a row: nothing happened; the same, and alarm KPIs are due; it is for the plant's own monitor."""
+
+_MINUTE_NS = int(MINUTE_NS)
+
+
+@jit
+def _level(p: Any, bits: int) -> int:
+    """Index of the level that the input is at, perhaps one that was unused; `LEVELS` if there is none."""
+    free = LEVELS
+    for level in range(LEVELS):
+        if p.level_rows[level] == 0:
+            free = min(free, level)
+        elif p.levels[level] == bits:
+            return level
+    if free < LEVELS:
+        p.levels[free] = bits
+    return free
+
+
+@jit
+def _keep(p: Any, row: Bytes, others: Ints, bits: Ints) -> None:
+    """Put a row into the ring, see `ring.Kept`."""
+    if p.kept == others.size and row[0] < LEVELS:
+        p.level_rows[row[0]] -= 1  # of the row that goes
+    level = _level(p, bits[0])
+    row[0] = level
+    if level < LEVELS:
+        p.level_rows[level] += 1
+    else:
+        others[p.head] = bits[0]
+    for place in range(bits.size - 1):
+        code = bits[1 + place] - p.reference[place] if bits[1 + place] else ZERO
+        for byte in range(VALUE_BYTES):
+            row[1 + VALUE_BYTES * place + byte] = code >> 8 * byte & 0xFF
+
+
+@jit
+def _fits(p: Any, spacing_ns: int, bits: NDArray[np.int64], is_kept: bool) -> bool:
+    """True if the ring can keep a row."""
+    over_ns = spacing_ns - p.usual_ns
+    fits = over_ns % p.unit_ns == 0 and abs(over_ns // p.unit_ns) < 2**31
+    for i in range(p.reference.size if is_kept else 0):
+        off = bits[1 + i] - p.reference[i]
+        fits = fits and (bits[1 + i] == 0 or ZERO < off < -ZERO)
+    return bool(fits)
+
+
+@jit
+def step_rows(
+    plants: Records,
+    numbers: Records,
+    scratch: Records,
+    works: Records,
+    settings: Records,
+    beliefs: Array,
+    variances: Array,
+    parameters: Array,
+    after: Array,
+    times: Places,
+    ring: Bytes,
+    others: Ints,
+    row_slots: Places,
+    row_time_ns: Ints,
+    row_values: Array,
+    row_time_min: Array,
+    row_bits: Ints,
+    kinds: Places,
+) -> None:
+    """Take rows through all stages, those of a plant one after the other.
+
+    Args:
+        plants: records.
+        numbers: numbers of the stages, see `row_step.row_type`.
+        scratch: numbers of one plant, to work in.
+        works: see `row_step.work_type`.
+        settings: see `row_step.settings_type`.
+        beliefs: beliefs of the filters, see `FilterNumbers`.
+        variances: variances of the filters, see `FilterNumbers`.
+        parameters: see `row_step.step`.
+        after: see `row_step.step`.
+        times: spacing before each of the newest rows, shape (plants, rows kept).
+        ring: values of these rows, see `ring.Kept`, shape (plants, rows kept, bytes); without columns if there is no
+            isolation.
+        others: inputs at no level, shape (plants, rows kept).
+        row_slots: slot of each row.
+        row_time_ns: time of each row.
+        row_values: values of each row, the input first, shape (rows, signals).
+        row_time_min: time of each row in minutes.
+        row_bits: values of each row as bits.
+        kinds: filled with the kind of each row; after a row that is odd, all of its plant are.
+    """
+    keeps, is_kept = times.shape[1], ring.shape[2] > 0
+    for k in range(row_slots.size):
+        slot, time_ns = row_slots[k], row_time_ns[k]
+        p = plants[slot]
+        spacing_ns = time_ns - numbers[slot].last_ns
+        is_odd = p.odd or not _fits(p, spacing_ns, row_bits[k], is_kept)
+        if not is_odd:
+            is_odd = (
+                step(
+                    numbers,
+                    scratch,
+                    works,
+                    settings,
+                    beliefs,
+                    variances,
+                    parameters,
+                    after,
+                    slot,
+                    time_ns,
+                    row_time_min[k],
+                    row_values[k],
+                )
+                == EVENT
+            )
+        if is_odd:
+            kinds[k] = ODD
+            p.odd = 1
+            continue
+        p.spacing_ns = spacing_ns
+        p.rows_watched += 1
+        over = (spacing_ns - p.usual_ns) // p.unit_ns
+        if times[slot, p.head] != over:  # or a page of zeros would take memory
+            times[slot, p.head] = over
+        if is_kept:
+            _keep(p, ring[slot, p.head], others[slot], row_bits[k])
+        p.head = p.head + 1 if p.head + 1 < keeps else 0
+        p.kept = min(p.kept + 1, keeps)
+        minute = time_ns // _MINUTE_NS
+        kinds[k] = ORDINARY if minute == p.kpi_minute else NEW_MINUTE
+        p.kpi_minute = minute

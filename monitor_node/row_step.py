@@ -1,0 +1,376 @@
+"""A row through all stages of a monitor in one compiled step, for one plant as for ten thousand.
+
+Most rows of most plants are alike: every signal has a value, the filter predicts it, no alarm changes. All that the
+stages then update are numbers: one record a plant, whose type is composed of the stages' own (`row_type`). A monitor of
+one plant steps over an array of one record, a fleet over one with a record for each plant; the steps themselves are in
+the stages' modules.
+
+Any other row is an event, and changes nothing here: the stages process it one by one (`pipeline`), with the same
+numbers. Events are: a row after a gap or a missing row; one by which the filter restarts; a value out of the signal's
+range; a timeout; more equal readings than a sound sensor has; a residual that may be a spike; and a row that raises an
+alarm. A point beyond a limit that raises no alarm is no event.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monitor_node.alarms.on_off_delay import DELAY, add_point, is_normal, raises
+from monitor_node.baseline.references import GATE
+from monitor_node.baseline.signal_range import SignalRange, signal_ranges
+from monitor_node.chart_stage import alarm_names
+from monitor_node.config import MonitorConfig
+from monitor_node.ingest.sampling import WHOLE
+from monitor_node.signal_checks.catalogue import CHECKS
+from monitor_node.signal_checks.stuck import STUCK, is_stuck, take_reading
+from monitor_node.signal_checks.timeout import TIMEOUT, update_timeout
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import CompiledFunction
+from reactorwatch.codegen.numba_kernel import Entry, call_at, jit
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, row_function
+from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.spc.charts.base import LARGEST_VALUE
+from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.cusum import _judge as judge_cusum
+from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.ewma import _judge as judge_ewma
+from reactorwatch.spc.charts.mewma import Mewma, count_numbers
+from reactorwatch.spc.charts.mewma import move as move_mewma
+from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.charts.shewhart import _judge as judge_shewhart
+from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, STATISTIC, X
+from reactorwatch.spc.prewhitening import WHITENER, expected_value, innovation
+
+ORDINARY, VIOLATING, EVENT = 0, 1, 2
+"""Verdict on a row: nothing happened; points beyond limits are remembered; nothing was changed."""
+
+CHARTS = (Shewhart.name, Ewma.name, Cusum.name, Mewma.name)
+"""Charts that the step has, in its order."""
+
+CHECKED = {"silence", "stuck", "spike", "range"}
+"""Signal checks that the step has."""
+
+MOST_PERIODS = 1.99 - WHOLE
+"""Between rows that are further apart one may be missing."""
+
+POINT = 5
+"""Numbers of a chart's point: those of a `Judgement`."""
+
+Records: TypeAlias = NDArray[np.void]
+
+
+def row_type(outputs: int, alarms: int) -> np.dtype[Any]:
+    """Type of the numbers of a plant's stages, composed of the stages' own; the filter has its belief elsewhere.
+
+    Args:
+        outputs: number of monitored outputs.
+        alarms: number of alarms that the charts can raise.
+    """
+    return np.dtype(
+        [
+            ("last_ns", "i8"),  # time of the newest row
+            ("period_ns", "f8"),  # sampling period
+            ("time_min", "f8"),  # time of the filter's newest row
+            ("input", "f8"),  # input of that row
+            ("timeouts", TIMEOUT, (2 + outputs,)),  # of the plant, the input and each output
+            ("whiteners", WHITENER, (outputs,)),
+            ("stuck", STUCK, (outputs,)),
+            ("spike_limits", "f8", (outputs,)),
+            ("shewhart", "f8", (Shewhart.numbers, outputs)),
+            ("ewma", "f8", (Ewma.numbers, outputs)),
+            ("cusum", "f8", (Cusum.numbers, outputs)),
+            ("mewma", "f8", (count_numbers(outputs),)),
+            ("delays", DELAY, (max(alarms, 1),)),
+        ],
+        align=True,
+    )
+
+
+def work_type(outputs: int, alarms: int) -> np.dtype[Any]:
+    """Type of the results of a step.
+
+    Args:
+        outputs: number of monitored outputs.
+        alarms: number of alarms that the charts can raise.
+    """
+    rows = SETTINGS + max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
+    return np.dtype(
+        [
+            ("new", "f8", (5 + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
+            ("outputs", "f8", (5 * outputs + 1,)),  # its results
+            ("expected", "f8", (outputs,)),  # expected values of the prewhitening filters
+            ("e", "f8", (outputs,)),  # prewhitened residuals
+            ("columns", "f8", (rows, outputs)),  # columns of a bank of charts, see `compiled_chart`
+            ("points", "f8", (max(alarms, 1), POINT)),  # points of the charts, one row an alarm
+        ],
+        align=True,
+    )
+
+
+def settings_type(outputs: int, alarms: int) -> np.dtype[Any]:
+    """Type of the constants of a step.
+
+    Args:
+        outputs: number of monitored outputs.
+        alarms: number of alarms that the charts can raise.
+    """
+    return np.dtype(
+        [
+            ("filter_address", "i8"),  # address of the filter's machine code
+            ("ranges", "f8", (1 + outputs, 2)),  # smallest and largest value of each signal
+            ("silence_limit", "f8"),  # see `DataTimeout`
+            ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
+            ("rules", "i8", (max(alarms, 1), 2)),  # violating points that raise each alarm, mask of its window
+            ("reach", "f8"),  # see `is_normal`
+            ("weight", "f8"),  # weight of the MEWMA chart
+        ],
+        align=True,
+    )
+
+
+class FilterNumbers(NamedTuple):
+    """Numbers of the filters of some plants.
+
+    Attributes:
+        belief: state and covariance, shape (plants, states + states^2).
+        variances: variances of the sensors and of the process, shape (plants, outputs + states).
+    """
+
+    belief: Array
+    variances: Array
+
+
+@jit
+def _predict(
+    p: Any,
+    belief: Array,
+    variances: Array,
+    parameters: Array,
+    after: Array,
+    work: Any,
+    filter_address: int,
+    time_min: float,
+    values: Array,
+) -> bool:
+    """Filter a row that is at most two integration steps after the one before; returns True if all went well."""
+    count, new = values.size - 1, work.new
+    step = 0.5 * (time_min - p.time_min)
+    if not (step > 0.0 and 2.0 * step <= LONGEST_ROW_MIN):
+        return False
+    new[0], new[1], new[2], new[3], new[4] = p.input, values[0], time_min, step, step
+    for i in range(count):
+        new[5 + i], new[5 + count + i] = values[1 + i], GATE
+    first = parameters.size - variances.size
+    for i in range(variances.size):
+        parameters[first + i] = variances[i]
+    before, given, constants = belief.ctypes.data, new.ctypes.data, parameters.ctypes.data
+    call_at(filter_address, (1, before, given, constants, after.ctypes.data, work.outputs.ctypes.data))
+    return bool(work.outputs[work.outputs.size - 1] != 0.0)
+
+
+@jit
+def _add_point(p: Any, point: Array, settings: Any, alarm: int) -> int:
+    """Update the delay of an alarm that is not active with the point of its chart; returns the verdict."""
+    is_out = point[4] > 0.0
+    if not (is_out or p.recent):
+        return ORDINARY
+    normal = not is_out and is_normal(point[0], point[1], point[2], point[3], p.above != 0, settings.reach)
+    p.recent, p.in_a_row = add_point(p.recent, p.in_a_row, settings.rules[alarm, 1], is_out, normal)
+    return EVENT if raises(p.recent, settings.rules[alarm, 0], is_out) else VIOLATING
+
+
+@jit
+def _lay_out(columns: Array, numbers: Array, e: Array) -> None:
+    """Fill the columns of a bank: a new value for each chart."""
+    for i in range(e.size):
+        columns[X, i], columns[PRESENT, i] = e[i], 1.0
+        for row in range(numbers.shape[0]):
+            columns[SETTINGS + row, i] = numbers[row, i]
+
+
+@jit
+def _take_points(p: Any, work: Any, numbers: Array, settings: Any, first: int) -> int:
+    """Take over what a bank of charts has computed; returns the verdict."""
+    columns, points, verdict = work.columns, work.points, ORDINARY
+    for i in range(numbers.shape[1]):
+        for row in range(numbers.shape[0]):
+            numbers[row, i] = columns[SETTINGS + row, i]
+        for k in range(POINT):
+            points[first + i, k] = columns[STATISTIC + k, i]
+        verdict = max(verdict, _add_point(p.delays[first + i], points[first + i], settings, first + i))
+    return verdict
+
+
+@jit
+def _update_charts(p: Any, work: Any, settings: Any) -> int:
+    """Update the charts with the prewhitened residuals; returns the verdict."""
+    charts, columns, e, verdict = settings.charts, work.columns, work.e, ORDINARY
+    if charts[0] >= 0:
+        _lay_out(columns, p.shewhart, e)
+        judge_shewhart(columns)
+        verdict = max(verdict, _take_points(p, work, p.shewhart, settings, charts[0]))
+    if charts[1] >= 0:
+        _lay_out(columns, p.ewma, e)
+        judge_ewma(columns)
+        verdict = max(verdict, _take_points(p, work, p.ewma, settings, charts[1]))
+    if charts[2] >= 0:
+        _lay_out(columns, p.cusum, e)
+        judge_cusum(columns)
+        verdict = max(verdict, _take_points(p, work, p.cusum, settings, charts[2]))
+    if charts[3] >= 0:
+        statistic, limit, point = move_mewma(p.mewma, e, settings.weight), p.mewma[0], work.points[charts[3]]
+        if statistic < 0.0:
+            return EVENT
+        point[0], point[1], point[2], point[3] = statistic, float(e.size), 0.0, limit
+        point[4] = 1.0 if statistic > limit else 0.0
+        verdict = max(verdict, _add_point(p.delays[charts[3]], point, settings, charts[3]))
+    return verdict
+
+
+@jit
+def step(
+    numbers: Records,
+    scratch: Records,
+    works: Records,
+    constants: Records,
+    beliefs: Array,
+    variances: Array,
+    parameters: Array,
+    after: Array,
+    plant: int,
+    time_ns: int,
+    time_min: float,
+    values: Array,
+) -> int:
+    """Take a row through all stages; returns the verdict.
+
+    Args:
+        numbers: numbers of the plants, shape (plants,), see `row_type`.
+        scratch: numbers of one plant, to work in, shape (1,).
+        works: filled, shape (1,), see `work_type`.
+        constants: constants of the step, shape (1,), see `settings_type`.
+        beliefs: beliefs of the filters, see `FilterNumbers`.
+        variances: variances of the filters, see `FilterNumbers`.
+        parameters: parameters of the model, and room for the variances, shape (parameters + outputs + states,).
+        after: belief of a filter, to work in.
+        plant: index of the plant.
+        time_ns: time of the row.
+        time_min: the same in minutes.
+        values: values of the row, the input first.
+    """
+    scratch[0] = numbers[plant]
+    p, work, settings = scratch[0], works[0], constants[0]
+    spacing_ns = time_ns - p.last_ns
+    if spacing_ns <= 0 or float(spacing_ns) > MOST_PERIODS * p.period_ns:
+        return EVENT
+    for i in range(values.size):
+        if not settings.ranges[i, 0] <= values[i] <= settings.ranges[i, 1]:
+            return EVENT
+    belief, address = beliefs[plant], settings.filter_address
+    if not _predict(p, belief, variances[plant], parameters, after, work, address, time_min, values):
+        return EVENT
+    for i in range(p.timeouts.size):
+        if update_timeout(p.timeouts[i], time_ns, True, settings.silence_limit, -1)[0]:
+            return EVENT
+    outputs = values.size - 1
+    for i in range(outputs):
+        value, whitener = values[1 + i], p.whiteners[i]
+        take_reading(p.stuck[i], value)
+        if is_stuck(p.stuck[i]):
+            return EVENT
+        work.expected[i] = expected_value(whitener)
+        work.e[i] = innovation(whitener, (value - work.outputs[i]) / work.outputs[2 * outputs + i])
+        if not (abs(work.e[i]) <= p.spike_limits[i] and abs(work.e[i]) < LARGEST_VALUE):
+            return EVENT
+    verdict = _update_charts(p, work, settings)
+    if verdict == EVENT:
+        return EVENT
+    p.last_ns, p.time_min, p.input = time_ns, time_min, values[0]
+    for i in range(belief.size):
+        belief[i] = after[i]
+    numbers[plant] = scratch[0]
+    return verdict
+
+
+@lru_cache
+def step_entry(outputs: int, alarms: int) -> Entry:
+    """Machine code of the step for the types of these numbers of outputs and alarms."""
+    return Entry(step)
+
+
+class RowStep:
+    """The step for plants with certain settings.
+
+    Args:
+        config: settings of the plants' monitors.
+        model: model by which the plants are judged.
+        ranges: ranges of the input and of each output.
+
+    Attributes:
+        numbers_type: type of the numbers of a plant's stages.
+        filter_sizes: sizes of belief and variances of a filter.
+        settings: constants of the step, shape (1,).
+        parameters: parameters of the model, and room for the variances of a filter.
+        work: results of the newest step, shape (1,).
+        scratch: numbers of one plant, to work in, shape (1,).
+        after: belief of a filter, to work in.
+    """
+
+    def __init__(self, config: MonitorConfig, model: ProcessModel, ranges: Sequence[SignalRange]) -> None:
+        outputs, states = len(config.outputs), len(model.states)
+        kinds = [chart for chart, _ in alarm_names(config)]
+        self._filter, self._step = compiled_filter(model), step_entry(outputs, len(kinds))
+        self.numbers_type = numbers_type(config)
+        self.filter_sizes = states + states**2, outputs + states
+        self.settings = np.zeros(1, settings_type(outputs, len(kinds)))
+        p = self.settings[0]
+        p["filter_address"], p["silence_limit"] = self._filter.address, config.silence_periods
+        p["ranges"] = [[item.lower, item.upper] for item in ranges]
+        p["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
+        for i, kind in enumerate(kinds):
+            p["rules"][i] = (1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1)
+        p["reach"], p["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
+        self.work = np.zeros(1, work_type(outputs, len(kinds)))
+        self.scratch = np.zeros(1, self.numbers_type)
+        self.after: Array = np.empty(self.filter_sizes[0])
+        self.parameters: Array = np.concatenate([model.values(), np.empty(outputs + states)])
+
+    @staticmethod
+    def of(
+        config: MonitorConfig, model: ProcessModel | None, ranges: Sequence[SignalRange] | None = None
+    ) -> "RowStep | None":
+        """The step for plants with these settings; None if their rows are not such that it could take them.
+
+        Args:
+            config: settings of the plants' monitors.
+            model: model by which the plants are judged; None: there is none.
+            ranges: ranges of the input and of each output; None: those of the model.
+        """
+        if model is None or model.breakpoints or len(model.input_names) != 1 or model.output_names != config.outputs:
+            return None
+        if {check.name for check in CHECKS} != CHECKED or not set(config.charts) <= set(CHARTS):
+            return None
+        if len(config.outputs) < 2 and Mewma.name in config.charts:
+            return None
+        return RowStep(config, model, ranges or signal_ranges(model, (config.input, *config.outputs)))
+
+    def update(self, numbers: Records, kalman: FilterNumbers, time_ns: int, time_min: float, values: Array) -> int:
+        """Take a row of one plant through all stages; returns the verdict."""
+        own = (self.scratch, self.work, self.settings, *kalman, self.parameters, self.after)
+        verdict: int = self._step.call(numbers, *own, 0, time_ns, time_min, values)
+        return verdict
+
+
+def numbers_type(config: MonitorConfig) -> np.dtype[Any]:
+    """Type of the numbers of the stages of a plant with these settings."""
+    return row_type(len(config.outputs), len(alarm_names(config)))
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def compiled_filter(model: ProcessModel) -> CompiledFunction:
+    """Machine code of the filter of a model, row by row."""
+    return CompiledFunction(row_function(model))
