@@ -21,7 +21,7 @@ from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import UNITS, Record
 from reactorwatch.runtime.model_file import write_extended_model
 from reactorwatch.spc.charts.base import format_quantity
-from recorder.columns.process_annotations import find_process, signal_title
+from recorder.columns.process_annotations import find_model, signal_title
 from recorder.columns.run_reader import read_run
 from recorder.panels.overview import draw
 from recorder.tools.convert import import_csv
@@ -90,8 +90,8 @@ def test_units_go_into_recordings_and_drawings_and_back(rig: Path, tmp_path: Pat
     drawn = read_run(read_messages(tmp_path / "rig.mcap"))
     assert drawn.units == {"C": "degC"}
     assert {(view.title, view.unit) for view in draw(drawn)[:3]} == {("C", "degC"), ("T", ""), ("qc", "")}  # type: ignore[union-attr]
-    assert find_process(drawn.units) is None
-    assert find_process(UNITS) is not None
+    assert find_model(drawn.units) is None
+    assert find_model(UNITS) is not None
     assert signal_title("T", "K") != "T" == signal_title("T", "degC")
 
 
