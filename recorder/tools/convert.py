@@ -54,7 +54,7 @@ def import_csv(
         InputError: the record is malformed, or has times that a recording cannot hold; or the plant's name is invalid.
     """
     process = choice.load()
-    plant = check_name(plant, process)
+    plant = plant_name(plant, process)
     files = [csv] if isinstance(csv, Path) else list(csv)
     refuse_source(mcap, files)
     record = join_files([read_signals(file, choice, columns, stated) for file in files])
@@ -117,7 +117,7 @@ def export_csv(
     return record
 
 
-def check_name(plant: str | None, process: Process) -> str:
+def plant_name(plant: str | None, process: Process) -> str:
     """Name of a record's plant: the given one, else that of its process.
 
     Raises:

@@ -107,14 +107,23 @@ def plants_in(path: Path) -> tuple[str, ...]:
     Raises:
         InputError: as `read_messages`.
     """
-    found: set[str] = set()
+    return tuple(sorted({topic.plant for topic in sample_topics_in(path)}))
+
+
+def sample_topics_in(path: Path) -> set[keys.Topic]:
+    """Topics of the samples in the recording.
+
+    Raises:
+        InputError: as `read_messages`.
+    """
+    found: set[keys.Topic] = set()
     for file in _files(path):
         topics = {channel.topic for channel in file.summary.channels.values()}
         if not topics:  # nothing was recorded, or the file's index does not say what
             topics = {entry.key for entry in sorted_messages(file.path, file.summary)}
         parsed = map(keys.parse, topics)
-        found.update(topic.plant for topic in parsed if topic is not None and topic.kind == keys.SAMPLE)
-    return tuple(sorted(found))
+        found.update(topic for topic in parsed if topic is not None and topic.kind == keys.SAMPLE)
+    return found
 
 
 def one_plant_in(path: Path, plant: str | None = None) -> str:

@@ -19,10 +19,12 @@ from reactorwatch.description.process import ROLES, Process, Signal
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write_table import write_table
+from recorder.config import ReplayConfig
 from recorder.tools.convert import export_csv, import_csv
 from recorder.tools.cut import cut, merge, receipt_window
 from recorder.tools.inspect import inspect
 from recorder.tools.mcap_file import read_messages, read_record, recorded_process
+from recorder.tools.replay import open_tape
 from tests.unit.records.test_csv_file import assert_same
 
 UNITS = ("", "degC", "bar", "l/min", "%", "m3/h", "cm3/s")
@@ -216,3 +218,33 @@ def test_a_signal_with_the_name_of_another_column_is_not_written_over(tmp_path: 
         ):
             write_table(tmp_path / "out.csv", record)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".mcap"])
+def test_a_replay_publishes_the_samples_of_any_process_under_its_signals(tanks: Path, suffix: str) -> None:
+    record, file = three_tanks_record(), str(tanks.with_suffix(suffix))
+    for config, signals in (
+        (ReplayConfig(file, process="three_tanks"), list(record.columns)),
+        (ReplayConfig(file, inputs=("Q1",), outputs=("h2",), plant="three_tanks"), ["Q1", "h2"]),
+    ):
+        (plant,), tape = open_tape(config)
+        assert plant == "three_tanks"
+        played: dict[str, list[float]] = {}
+        for publication in tape():
+            played.setdefault(publication.key, []).append(publication.message.value)  # type: ignore[union-attr]
+        measured = {f"reactor/three_tanks/sample/{name}": record.columns[name] for name in signals}
+        assert played == {key: values[np.isfinite(values)].tolist() for key, values in measured.items()}
+
+
+@pytest.mark.parametrize("name", ["P*", "$x", "a#1", "ready?", "@T"])
+@pytest.mark.parametrize("suffix", [".csv", ".mcap"])
+def test_a_signal_that_the_bus_cannot_name_is_recorded_and_not_replayed_with_the_cure(
+    tmp_path: Path, name: str, suffix: str
+) -> None:
+    choice, csv = described(tmp_path, Process("rig", (Signal(name), Signal("y")))), tmp_path / "rig.csv"
+    write_table(csv, Record(np.arange(3.0), {name: np.arange(3.0), "y": np.arange(3.0)}, "rig.csv"))
+    import_csv(csv, tmp_path / "rig.mcap", choice=choice)
+    assert list(read_record(tmp_path / "rig.mcap").columns) == [name, "y"]
+    with pytest.raises(InputError, match=r"must not hold .*; import it with a process that gives the signal another"):
+        open_tape(ReplayConfig(str(tmp_path / f"rig{suffix}"), process=choice.process))
+    assert open_tape(ReplayConfig(str(tmp_path / "rig.mcap"), outputs=("y",)))[0] == ("rig",)
