@@ -72,7 +72,7 @@ def dashboard(
     if drawn is not None and not drawn.is_file():
         raise InputError(f"--diagnosis {diagnosis}: holds no {DRAWING}; it must be the folder that diagnose -o wrote")
     if png is not None:
-        check_output_folder(png, picture_names(), (file,), option="--png", force=force)
+        check_output_folder(png, picture_names(), (file, choice.file), option="--png", force=force)
     with task(f"drawing {file.name}"):
         recording = open_messages(check_recording(file), plant, stated=stated, choice=choice)
         run = read_segments(recording.messages, given_zero_ns=recording.zero_ns, process=recording.process)
