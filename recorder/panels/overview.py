@@ -46,7 +46,7 @@ def draw(run: RunColumns) -> tuple[View, ...]:
 def _match_setpoints(roles: Mapping[str, str], units: Mapping[str, str]) -> dict[str, str | None]:
     """Output of each set point: the only one of its unit that has its name, or its number, in common with it.
 
-    The name of the output is part of that of the set point (`h1_sp`), or the numbers in both are equal (`SP1`), or
+    The name of the output is part of that of the set point (`T1.sp`), or the numbers in both are equal (`SP1`), or
     there is no other output of this unit. None: there is no such output, or there are several.
 
     Args:

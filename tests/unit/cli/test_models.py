@@ -11,8 +11,8 @@ from plant_node.record import simulate_record
 from reactorwatch.cli import identification
 from reactorwatch.cli.linear_models import describe
 from reactorwatch.errors import InputError
-from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import Record
+from tests.tables import read_csv
 
 
 @pytest.fixture(scope="module")

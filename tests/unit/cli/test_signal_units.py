@@ -16,9 +16,7 @@ from reactorwatch.cli import identification
 from reactorwatch.cli.backtest_jobs import _units
 from reactorwatch.cli.read_record import open_messages
 from reactorwatch.process import MODELS
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.records.csv_file import read_csv
-from reactorwatch.records.record import UNITS, Record
+from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
 from reactorwatch.spc.charts.base import format_quantity
 from recorder.columns.process_annotations import find_model, signal_title
@@ -27,6 +25,7 @@ from recorder.panels.overview import draw
 from recorder.tools.convert import import_csv
 from recorder.tools.mcap_file import read_messages, read_record
 from recorder.tools.player import samples_of
+from tests.tables import UNITS, read_csv
 
 HEADER = "ts,flow,TI-1 [degC],TI-2"
 COLUMNS = {"time_min": "ts", "qc": "flow", "C": "TI-1 [degC]", "T": "TI-2"}
@@ -48,10 +47,6 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def watched(path: Path, **options: object) -> Backtest:
     config = MonitorConfig(training_min=20.0, isolation=False, **options)  # type: ignore[arg-type]
     return run(open_messages(path, "cstr", COLUMNS, _units(config)).messages, config)
-
-
-def test_the_units_of_the_reactor_are_those_of_its_equations() -> None:
-    assert cstr().units == UNITS
 
 
 @pytest.mark.parametrize("reference", ["auto", "arx"])
