@@ -22,7 +22,7 @@ from monitor_node.baseline.signal_range import signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation, Suspect
-from monitor_node.isolation.stage import preparation
+from monitor_node.isolation.stage import FEW_ROWS, LOOKS, ROWS_BEFORE, preparation
 from monitor_node.isolation.window import Row
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
@@ -74,16 +74,18 @@ class TimedIsolation:
         Isolation.suspects = self._suspects  # type: ignore[method-assign]
 
 
-def look_at_faults(period_min: float = 0.1) -> None:
-    """Look at faults of the catalogue, 10, 30, 100 and 300 rows after their onset."""
+def look_at_faults(period_min: float = 0.1, looks: Sequence[int] = LOOKS) -> None:
+    """Look at faults of the catalogue some rows after their onset, without the progress of an earlier look."""
     for fault in FAULTS:
         onset_min = 600 * period_min
-        record = simulate_record(PlantConfig(seed=4, period_min=period_min, faults=(f"{fault}@{onset_min}min",)), 901)
+        record = simulate_record(
+            PlantConfig(seed=4, period_min=period_min, faults=(f"{fault}@{onset_min}min",)), 601 + looks[-1]
+        )
         columns = (record.time_min, record.columns["qc"], record.columns["C"], record.columns["T"])
         rows = [(t, u, (c, T)) for t, u, c, T in zip(*(column.tolist() for column in columns), strict=True)]
-        for after in (10, 30, 100, 300):
+        for after in looks:
             isolation = Isolation(cstr(), NoiseLevels((0.002, 0.3), (0.0, 0.0)))
-            isolation.suspects(rows[after : 600 + after], since_rows=after)
+            isolation.suspects(rows[600 - max(600 - after, ROWS_BEFORE) : 600 + after], since_rows=min(after, FEW_ROWS))
 
 
 def watch_bad_values(runs: int, looks: list[Look], seed: int = 1) -> list[float]:
@@ -145,7 +147,7 @@ def main(runs: int) -> bool:
         first, peer = timed.looks[:1], timed.looks[1:]
         timed.looks.clear()
         for period_min in PERIODS_MIN:
-            look_at_faults(period_min)
+            look_at_faults(period_min, [since for since in LOOKS if since <= FEW_ROWS])
         sparse = timed.looks.copy()
         timed.looks.clear()
         rows = watch_bad_values(runs, timed.looks)

@@ -17,7 +17,7 @@ import msgspec
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.keys import check_plant
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Sample
-from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.records.record import MINUTE_NS, NEVER_NS
 from reactorwatch.runtime.setting_rules import check_bounds
 
 HIDDEN_STATES = (
@@ -35,8 +35,6 @@ MAX_SAMPLES = 300_000
 
 TIMEOUT_NS = 60 * 10**9
 """Time without a sample after which the plant is considered stopped."""
-
-NEVER_NS = 2**62
 
 
 class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -215,7 +215,7 @@ def run(
         InputError: the settings are inconsistent, or a file of the settings is unusable.
     """
     node = MonitorNode(config, time.time_ns())
-    node.preparation = stage.preparation(config, node.model)
+    node.preparation = stage.preparation(config, node.equations)
     with serve_metrics(metrics_config, Metrics(config.plant, NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:

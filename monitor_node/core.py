@@ -365,6 +365,11 @@ class Monitor:
         return self._pipeline.model
 
     @property
+    def equations(self) -> ProcessModel | None:
+        """Process model in force: `model`, or as the change of the baseline has it."""
+        return self._pipeline.equations
+
+    @property
     def reference(self) -> str:
         """Kind of the reference: `equations` or `arx`; empty before there is one."""
         return self._pipeline.reference

@@ -7,7 +7,7 @@ from queue import Empty, SimpleQueue
 from typing import NamedTuple, TypeVar
 
 from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, Finding, diagnose_training
-from reactorwatch.runtime.parallel.jobs import Executor, Failed, run_job
+from reactorwatch.runtime.parallel.jobs import Executor, Failed, one_line, run_job
 from reactorwatch.runtime.parallel.process_pool import ProcessExecutor
 
 NICENESS = 10
@@ -77,10 +77,6 @@ class DiagnosisWorker:
         """True while findings are to be expected."""
         return bool(self._submitted)
 
-    def is_queued(self, plant: str) -> bool:
-        """True while a finding about a plant is to be expected."""
-        return plant in self._submitted
-
     def pop_findings(self) -> list[PlantFinding]:
         """Findings since the last call."""
         found = list(_drain(self._findings))
@@ -101,10 +97,18 @@ class DiagnosisWorker:
             self._run(batch)
 
     def _run(self, batch: Sequence[PlantJob]) -> None:
-        for index, outcome in self._executor.map_unordered(diagnose_beside, [item.job for item in batch]):
-            self._findings.put(PlantFinding(batch[index].plant, _finding(batch[index].job, outcome)))
-            if self._is_closed:
-                return
+        pending = dict(enumerate(batch))
+        try:
+            for index, outcome in self._executor.map_unordered(diagnose_beside, [item.job for item in batch]):
+                self._add_finding(pending.pop(index), outcome)
+                if self._is_closed:
+                    return
+        except OSError as error:  # no process can be started
+            for item in pending.values():
+                self._add_finding(item, Failed(f"no process can be started: {one_line(error)}"))
+
+    def _add_finding(self, of: PlantJob, outcome: Finding | Failed) -> None:
+        self._findings.put(PlantFinding(of.plant, _finding(of.job, outcome)))
 
 
 def _drain(queue: "SimpleQueue[Item]") -> Iterator[Item]:

@@ -198,10 +198,14 @@ class PlantPipeline:
     def _restore_reference(self, state: ProcessReferenceState | ArxReferenceState) -> Reference:
         if isinstance(state, ArxReferenceState):
             return ArxReference.from_state(state)
-        if self.model is None:
+        if self.equations is None:
             raise ValueError("the state must be of a plant without a process model")
-        model = self.model if self.baseline is None else read_equations(self.baseline.model)
-        return ProcessReference.from_state(state, model, self._config.outputs)
+        return ProcessReference.from_state(state, self.equations, self._config.outputs)
+
+    @property
+    def equations(self) -> ProcessModel | None:
+        """Process model in force: as given, or as the change of the baseline has it; None: there is none."""
+        return self.model if self.baseline is None else read_equations(self.baseline.model)
 
     @property
     def awaits_diagnosis(self) -> bool:

@@ -22,7 +22,7 @@ _NORMAL_VOLUME = re.compile(r"\bNm(?=3|³|\^3)")
 _NAME = re.compile(r"°?[^\W\d]+")
 
 _POWER = re.compile(r"(?<=[A-Za-z])(-?\d+)(?![A-Za-z\d])")
-"""The power in `cm3`, `m2` or `s-1`."""
+"""The power in "cm3", "m2" or "s-1"."""
 
 _FORM = re.compile(r"(1\s*(?=/))?([^\W\d]+|[%°*/·(). ]|(\^|\*\*)-?\d{1,2}(\.\d{1,2})?(?!\s*(\^|\*\*|\d)))*")
 """Names, products, quotients and powers of up to two digits: Pint would compute any number that it is given."""

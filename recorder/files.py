@@ -215,15 +215,20 @@ class RecordingFiles:
         log.info("recorded", file=str(self._writer.path))
         self._writer = None
 
-    def abandon(self) -> None:
-        """Leave the file as last flushed; it is recovered after the next one is started."""
+    def abandon(self) -> int:
+        """Leave the file as it is; it is recovered after the next one is started.
+
+        Returns:
+            Count of the messages since the last flush that the recovery will find.
+        """
         if self._writer is None:
-            return
-        self._writer.abandon()
+            return 0
+        saved = self._writer.abandon()
         part = part_of(self._writer.path)
         if part.exists():
             self._abandoned.append(part)
         self._writer = None
+        return saved
 
     def free_bytes(self) -> int:
         """Free space on the disk of the folder, which may have been deleted."""

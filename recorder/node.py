@@ -174,9 +174,8 @@ class RecorderNode:
 
     def _stop(self, error: InputError, now_ns: int) -> list[Publication]:
         """Abandon a file that cannot be written; it is recovered after the next one is started."""
-        self._core.count_unrecorded(self._rotation.unflushed)
+        self._core.count_unrecorded(self._rotation.unflushed - self._files.abandon())
         self._rotation.start_file(now_ns)
-        self._files.abandon()
         self._next_retry_ns = now_ns + RETRY_NS
         return self._core.stop_recording(error.reason if isinstance(error, WriteError) else str(error), now_ns)
 

@@ -44,6 +44,15 @@ def daisy_csv() -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def given_data() -> Path:
+    """Folder of measured records of other rigs and benchmarks, which are not part of this repository."""
+    folder = Path(os.environ.get("REACTORWATCH_SHARED", ROOT.parent / "shared")) / "data"
+    if not (folder / "tep").is_dir():
+        pytest.skip(f"the given sets are not in {folder}; name its parent in REACTORWATCH_SHARED")
+    return folder
+
+
 @pytest.fixture
 def called(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
     """Run `reactorwatch` with arguments to its end within this process: to start another one takes a second."""

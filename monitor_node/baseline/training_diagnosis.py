@@ -7,6 +7,7 @@ them.
 """
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import msgspec
@@ -14,9 +15,12 @@ import numpy as np
 
 from monitor_node.baseline.training import TrainingState
 from reactorwatch.contract.messages_pb2 import Baseline
-from reactorwatch.diagnosis.result import AMBIGUOUS, NAMED, NOMINAL, Cause, Diagnosis
+from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
+from reactorwatch.errors import InputError
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import FREE_NAME
 from reactorwatch.records.record import MINUTE_NS, Record
 from reactorwatch.stored_state import unpack_numbers, unpack_times
 
@@ -70,7 +74,8 @@ class Finding(NamedTuple):
 def diagnose_training(job: DiagnosisJob) -> Finding:
     """Diagnose a training.
 
-    Where the rows cannot rank the explanations, the best of them is taken.
+    Where the rows cannot rank the explanations, the best of them is taken. Of its causes those are taken that last: a
+    curve (profile `free`), such as a disturbance, predicts no other rows.
 
     Raises:
         InputError: the rows cannot be diagnosed: too few, or without movement of the input.
@@ -87,17 +92,27 @@ def diagnose_training(job: DiagnosisJob) -> Finding:
     given = parse_extended_model(job.equations)
     given = replace(given, effects=tuple(item.shift(-job.first_ns / MINUTE_NS) for item in given.effects))
     found = diagnose(record, given.build())
-    extends = found.verdict in (NAMED, AMBIGUOUS)
-    return Finding(job.first_ns, found.verdict, _reason(found), _json(found.extended_model) if extends else "")
+    if all(cause.profile == FREE_NAME for cause in found.causes):
+        return Finding(job.first_ns, found.verdict, _reason(found))
+    extended = parse_extended_model(_json(found.extended_model))
+    added = (item for item in extended.effects[len(given.effects) :] if item.profile.name != FREE_NAME)
+    lasting = replace(extended, effects=(*extended.effects[: len(given.effects)], *added))
+    return Finding(job.first_ns, found.verdict, _reason(found), _json(lasting.to_object()))
 
 
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
 def read_equations(text: str) -> ProcessModel:
     """The model in `Baseline.model`, its clock that of samples on the bus: minutes since 1970-01-01 UTC.
+
+    It is the same object for the same text: what is prepared for one is prepared for all.
 
     Raises:
         InputError: it is no model of this software.
     """
-    return parse_extended_model(text).rebase(0).build()
+    try:
+        return parse_extended_model(text).rebase(0).build()
+    except InputError as error:
+        raise InputError(f"the model of the baseline {error}") from error
 
 
 def _reason(found: Diagnosis) -> str:
@@ -112,6 +127,8 @@ def _reason(found: Diagnosis) -> str:
 
 def _text(cause: Cause) -> str:
     size = cause.parameters["size"]
+    if cause.profile == FREE_NAME:
+        return f"{cause.label} ({cause.cause}) in the course of a curve, which predicts no other rows"
     unit = "" if size.unit == "1" else f" {size.unit}"
     return f"{cause.label} ({cause.cause}, {cause.profile}) of {size.value:+.3g}{unit}"
 

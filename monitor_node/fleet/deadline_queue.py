@@ -6,7 +6,7 @@ A postponed deadline is noticed when it comes up, so that a sample that postpone
 from collections.abc import Iterator
 from heapq import heappop, heappush
 
-NEVER_NS = 2**63 - 1
+from reactorwatch.records.record import NEVER_NS
 
 
 class DeadlineQueue:

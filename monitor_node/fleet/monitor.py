@@ -20,12 +20,12 @@ Nothing here reads a clock or does I/O.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
 
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.admission import PROVEN_MESSAGES, PROVEN_ROWS, UnverifiedPlants
-from monitor_node.fleet.deadline_queue import NEVER_NS
 from monitor_node.fleet.handed_over_alarms import HandedOverAlarms, alarm_of
 from monitor_node.fleet.recently_adopted import RecentlyAdopted
 from monitor_node.fleet.sharding import ShardGroup
@@ -37,6 +37,7 @@ from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decod
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import NEVER_NS
 
 PRESUME_GONE_NS = 10_000_000_000
 """Time after the start, when a shard without a monitor is presumed gone."""
@@ -47,15 +48,10 @@ MOST_HELD = 500_000
 """Messages buffered in a pause; with more they are evaluated, as late alarms are worse than alarms twice."""
 
 
-class FleetMonitor:
-    """Monitors of many plants.
+class Callbacks(NamedTuple):
+    """Functions through which a fleet's monitor reaches the world; by default none does anything.
 
-    Args:
-        config: settings of each plant's monitor; its plant name is ignored.
-        start_ns: present time.
-        shards: monitors that share the fleet.
-        model: see `Monitor`.
-        points: see `Monitor`.
+    Attributes:
         request_history: called with a plant to adopt, and True if another owned it until now; returns True if its
             history will be passed to `on_history`. If not, the plant is adopted at once.
         store: called with a released plant and its state.
@@ -63,8 +59,32 @@ class FleetMonitor:
         put_back: called with a plant without a usable state, and its new monitor; returns True if the monitor was
             restored from a state that had been kept aside.
         claimed_elsewhere: returns True if another monitor has claimed a plant since it was adopted here.
-        diagnose: called with an own plant and the diagnosis of its training, which is passed to `on_finding`.
         on_ownership: called with True when a plant is adopted, and with False when it is released.
+        diagnose: called with an own plant and the diagnosis of its training, which is passed to `on_finding`.
+    """
+
+    request_history: Callable[[str, bool], bool] = lambda _plant, _taken_over: False
+    store: Callable[[str, State], None] = lambda _plant, _state: None
+    unusable: Callable[[str, InputError], str] = lambda _plant, _why: ""
+    put_back: Callable[[str, Monitor], bool] = lambda _plant, _monitor: False
+    claimed_elsewhere: Callable[[str], bool] = lambda _plant: False
+    on_ownership: Callable[[str, bool], None] = lambda _plant, _ours: None
+    diagnose: Callable[[str, DiagnosisJob], None] = lambda _plant, _job: None
+
+
+NO_CALLBACKS = Callbacks()
+
+
+class FleetMonitor:
+    """Monitors of many plants.
+
+    Args:
+        config: settings of each plant's monitor; its plant name is ignored.
+        start_ns: present time.
+        shards: monitors that share the fleet.
+        callbacks: functions of the node.
+        model: see `Monitor`.
+        points: see `Monitor`.
 
     Raises:
         InputError: the settings are inconsistent.
@@ -75,21 +95,13 @@ class FleetMonitor:
         config: MonitorConfig,
         start_ns: int,
         shards: ShardGroup,
+        callbacks: Callbacks = NO_CALLBACKS,
         *,
         model: ProcessModel | None = None,
         points: bool = False,
-        request_history: Callable[[str, bool], bool] = lambda _plant, _taken_over: False,
-        store: Callable[[str, State], None] = lambda _plant, _state: None,
-        unusable: Callable[[str, InputError], str] = lambda _plant, _why: "",
-        put_back: Callable[[str, Monitor], bool] = lambda _plant, _monitor: False,
-        claimed_elsewhere: Callable[[str], bool] = lambda _plant: False,
-        on_ownership: Callable[[str, bool], None] = lambda _plant, _ours: None,
-        diagnose: Callable[[str, DiagnosisJob], None] = lambda _plant, _job: None,
     ) -> None:
-        self._shards, self._on_ownership = shards, on_ownership
-        self._request_history, self._store, self._unusable = request_history, store, unusable
-        self._restore_kept_aside, self._is_claimed_elsewhere = put_back, claimed_elsewhere
-        self._watched = WatchedPlants(config, start_ns, model, points=points, diagnose=diagnose)
+        self._shards, self._callbacks = shards, callbacks
+        self._watched = WatchedPlants(config, start_ns, model, points=points, diagnose=callbacks.diagnose)
         self._pending = PendingPlants()
         self._presume_gone_ns: int | None = start_ns + PRESUME_GONE_NS
         self._registered: dict[str, None] = {}  # all plants, with any owner
@@ -166,18 +178,18 @@ class FleetMonitor:
             try:
                 monitor.from_bytes(state)
             except InputError as error:
-                kept = self._unusable(plant, error)
+                kept = self._callbacks.unusable(plant, error)
                 unusable, state = f"the state that was stored {error}", None
-        if state is None and not self._restore_kept_aside(plant, monitor):
+        if state is None and not self._callbacks.put_back(plant, monitor):
             monitor.resume_from_alarms(alarm for alarm in self._handed_over.of(plant) if alarm.alarm != TIMEOUT_ALARM)
             if unusable:
                 monitor.notes.append(f"{unusable}; the plant is learned again{kept}")
-                self._store(plant, monitor.to_bytes())  # or the folder would not list the plant
+                self._callbacks.store(plant, monitor.to_bytes())  # or the folder would not list the plant
         elif unusable:
             monitor.notes.append(f"{unusable}{kept}")
         self._watched.add(plant, monitor)
         self._registered[plant] = None
-        self._on_ownership(plant, True)
+        self._callbacks.on_ownership(plant, True)
 
     def _timeouts_after(self, plant: str, monitor: Monitor) -> list[Alarm]:
         """An active data timeout of a plant that its monitor does not know."""
@@ -188,7 +200,7 @@ class FleetMonitor:
         monitor = self._watched.remove(plant)
         if monitor is None:
             return None
-        self._on_ownership(plant, False)
+        self._callbacks.on_ownership(plant, False)
         return monitor.to_bytes()
 
     def rejoin(self, plant: str, now_ns: int, withheld_ns: int | None = None) -> None:
@@ -203,7 +215,7 @@ class FleetMonitor:
         if monitor is None:
             return
         self._handed_over.publish_ours(plant, monitor.alarms.all_alarms(), monitor.last_ns, withheld_ns)
-        self._on_ownership(plant, False)
+        self._callbacks.on_ownership(plant, False)
         if self._shards.is_ours(plant):
             self._start_adoption(plant, now_ns, taken_over=True)
 
@@ -237,7 +249,7 @@ class FleetMonitor:
             if isinstance(item.message, Alarm):
                 plant, time_ns = _plant_of_key(item.key), item.message.time_ns
                 withheld_ns[plant] = min(withheld_ns.get(plant, time_ns), time_ns)
-        lost = [plant for plant in withheld_ns if self._is_claimed_elsewhere(plant)]
+        lost = [plant for plant in withheld_ns if self._callbacks.claimed_elsewhere(plant)]
         for plant in lost:
             self.rejoin(plant, now_ns, withheld_ns[plant])
         return [item for item in publications if _plant_of_key(item.key) not in lost] if lost else publications
@@ -338,7 +350,7 @@ class FleetMonitor:
         if plant in self._pending:
             self._pending.end(plant)
         if self._watched.remove(plant) is not None:
-            self._on_ownership(plant, False)
+            self._callbacks.on_ownership(plant, False)
         self._handed_over.remove(plant)
         self._remove_keys(plant)
 
@@ -358,10 +370,10 @@ class FleetMonitor:
             elif watched and not ours:
                 is_known = self.is_worth_storing(plant)
                 if (state := self.release(plant)) is not None and is_known:
-                    self._store(plant, state)
+                    self._callbacks.store(plant, state)
 
     def _start_adoption(self, plant: str, now_ns: int, *, taken_over: bool) -> None:
-        if self._request_history(plant, taken_over):
+        if self._callbacks.request_history(plant, taken_over):
             self._pending.start(plant)
         else:
             self.adopt(plant, None, now_ns)
@@ -431,7 +443,7 @@ class FleetMonitor:
         """Execute an operator's command; None as reply: another monitor owns the plant."""
         plant = _plant_of_key(question.key)
         monitor = self._watched.detach(plant) if not self.paused else None
-        if monitor is not None and self._is_claimed_elsewhere(plant):
+        if monitor is not None and self._callbacks.claimed_elsewhere(plant):
             self.rejoin(plant, now_ns)
             return None, []
         return (None, []) if monitor is None else monitor.on_command(question, now_ns)
@@ -468,7 +480,7 @@ class FleetMonitor:
         """Adopt a copy of a quiet plant, for trials with many plants."""
         self._watched.copy(plant, name)
         self._registered[name] = None
-        self._on_ownership(name, True)
+        self._callbacks.on_ownership(name, True)
 
     def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
         """Notes to log: plant and line."""

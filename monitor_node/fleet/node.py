@@ -14,7 +14,7 @@ from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker
 from monitor_node.fleet import sharding
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.monitor import FleetMonitor
+from monitor_node.fleet.monitor import Callbacks, FleetMonitor
 from monitor_node.fleet.partition import LeaseMonitor
 from monitor_node.fleet.sharding import ShardGroup
 from monitor_node.fleet.watched_plants import WatchedPlants
@@ -115,15 +115,17 @@ class FleetNode(FleetMonitor):
             config,
             start_ns,
             self.shards,
+            Callbacks(
+                request_history=self._request_recovery,
+                store=self._store_state,
+                unusable=self._keep_aside,
+                put_back=self._restore_kept_aside,
+                claimed_elsewhere=self._is_claimed_elsewhere,
+                on_ownership=self._set_ownership,
+                diagnose=self._worker.submit,
+            ),
             model=model,
             points=fleet.points,
-            request_history=self._request_recovery,
-            store=self._store_state,
-            unusable=self._keep_aside,
-            put_back=self._restore_kept_aside,
-            claimed_elsewhere=self._is_claimed_elsewhere,
-            on_ownership=self._set_ownership,
-            diagnose=self._worker.submit,
         )
         for plant in sorted({*states.plants, *states.plants_aside}) if states is not None else []:
             if keys.matches(self.expression, f"{keys.ROOT}/{plant}"):

@@ -1,7 +1,7 @@
 """Candidates: causes with their profiles, sizes and onsets, as a scan or a fit finds them."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, log, nan, pi, sqrt
 
 import numpy as np
@@ -31,6 +31,7 @@ ALL_PROFILES: tuple[type[FittedProfile], ...] = (*PROFILES, EndedRamp)
 """Profiles that are fitted."""
 
 _FIRST_ROWS = 6
+_ENDS = (0.4, 0.6, 0.8, 0.95)  # shares of the time since the onset after which a ramp may have ended
 _WELL_INSIDE = 0.6  # fraction of a bound at which a fit starts if the linear size is beyond the bound
 
 
@@ -73,14 +74,26 @@ class Candidate:
         w = self.w[max(since, 0) :]
         return w, np.isfinite(window.measured[window.time_min.size - len(w) :])
 
-    def extrapolate(self, before_min: float, after_min: float) -> Array:
-        """Parameters for rows that end at another time: a ramp keeps its slope if its size stays possible."""
+    def extrapolate(self, before_min: float, after_min: float) -> "Candidate":
+        """Extend a ramp to rows that end at another time, with the same slope if its size stays possible."""
         if self.profile is not Ramp:
-            return self.parameters
-        slope = self.parameters[0] / max(before_min - self.onset_min, 1e-9)
-        size = slope * (after_min - self.onset_min)
-        is_possible = self.effect.lower < size < self.effect.upper  # beyond, the filter may diverge again and again
-        return np.array([size, self.onset_min]) if is_possible else self.parameters
+            return self
+        size = self.parameters[0] * (after_min - self.onset_min) / max(before_min - self.onset_min, 1e-9)
+        is_possible = self.effect.lower < size < self.effect.upper  # beyond, the filter may diverge
+        return replace(self, parameters=np.array([size, self.onset_min])) if is_possible else self
+
+    def end_trials(self, last_min: float) -> list["Candidate"]:
+        """Ramps with the same slope that end elsewhere, and one that goes on until the last row."""
+        if self.profile is Step:
+            return []
+        end_min = last_min if self.profile is Ramp else float(self.parameters[-1])
+        slope, span = self.parameters[0] / max(end_min - self.onset_min, 1e-9), last_min - self.onset_min
+        trials = [
+            replace(self, profile=EndedRamp, parameters=np.array([slope * age, self.onset_min, self.onset_min + age]))
+            for age in (share * span for share in _ENDS)
+        ]
+        going_on = replace(self, profile=Ramp, parameters=np.array([slope * span, self.onset_min]))
+        return trials if self.profile is Ramp else [*trials, going_on]
 
 
 class CandidateState(StoredState, frozen=True):

@@ -11,7 +11,7 @@ even the first rows do not gain what the scan predicts, smaller sizes are tried.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 
@@ -51,7 +51,6 @@ _MARGIN_ROWS = 8
 _STEPS, _LAST_STEPS = 3, 8
 _SHRINKS = (0.5, 0.2, 0.08)
 _HOLDS, _NOISE, _KEPT = 0.05, 5.0, 0.5
-_ENDS = (0.4, 0.6, 0.8)  # fractions of the time since the onset after which a ramp may have ended
 
 
 class Fitter:
@@ -139,8 +138,10 @@ class Fitter:
             self.progress = progress = Progress(progress.onset_min, end_min, progress.rounds + 1, candidates)
             end = progress.next_end(times)
         segment, candidates = self._extend(progress, window, times.size, without_fault)
-        if any(item.profile is Ramp and segment.has_left(item, progress.end_min) for item in candidates[:2]):
-            candidates = [segment.start_end(item) for item in candidates]
+        if len(candidates) > MOST:
+            candidates = sorted(candidates, key=lambda item: segment.evaluate(item, item.parameters).loss)[:MOST]
+        if any(item.profile is not Step and segment.has_left(item, progress.end_min) for item in candidates[:2]):
+            candidates = [segment.choose_end(item) for item in candidates]
         first = progress.rounds == 0
         candidates = best_first(segment.fit(item, first=first, steps=_LAST_STEPS) for item in candidates)
         candidates = drop_needless_ends(candidates)
@@ -156,9 +157,8 @@ class Fitter:
         times, candidates = window.time_min, progress.candidates
         earliest = int(np.searchsorted(times, min(item.onset_min for item in candidates)))
         begin = max(earliest - max(_MARGIN_ROWS, (end - earliest) // 4), 0)
-        parameters = [item.extrapolate(progress.end_min, float(times[end - 1])) for item in candidates]
-        segment = _Segment(self, window, begin, end, without_fault)
-        return segment, [replace(item, parameters=by) for item, by in zip(candidates, parameters, strict=True)]
+        candidates = [item.extrapolate(progress.end_min, float(times[end - 1])) for item in candidates]
+        return _Segment(self, window, begin, end, without_fault), candidates
 
     def hypothesis(self, effect: Effect, profile: FittedProfile) -> Hypothesis:
         """Hypothesis of a cause with a profile over some rows."""
@@ -212,9 +212,16 @@ class _Segment:
         """Run the filter of a cause with this size and onset."""
         return self._hypothesis(candidate).evaluate(self._run, (parameters,), self._like)
 
+    def _centre_onset(self, candidate: Candidate) -> Array:
+        """Parameters with the onset of a sensor's step in the middle of its interval, away from both jumps."""
+        size, onset_min = candidate.parameters[:2].tolist()
+        if not (candidate.profile is Step and isinstance(candidate.effect, SensorEffect)):
+            return candidate.parameters
+        return np.array([size, interval_middle(self._run.time_min, onset_min)])
+
     def fit(self, candidate: Candidate, *, first: bool, steps: int) -> Candidate:
         """Fit a cause, starting from its parameters; in a first fit also from smaller sizes."""
-        start = candidate.parameters
+        start = self._centre_onset(candidate)
         if first:
             at_start = self.evaluate(candidate, start)
             if self.loss_without_fault - at_start.loss < _KEPT * candidate.gain:
@@ -230,19 +237,12 @@ class _Segment:
         w = self.evaluate(candidate, candidate.parameters).w[later]
         return log_evidence_of_residual(np.nan_to_num(w), np.isfinite(self._run.measured[later])) > 0.0
 
-    def start_end(self, candidate: Candidate) -> Candidate:
-        """Let a ramp end before the last row, with the same slope, if that explains the rows better as it is."""
-        if candidate.profile is not Ramp:
-            return candidate
-        (size, onset_min), end_min = candidate.parameters.tolist(), float(self._run.time_min[-1])
-        ended, span = replace(candidate, profile=EndedRamp), end_min - onset_min
-        trials = [
-            self.evaluate(ended, np.array([share * size, onset_min, onset_min + share * span])) for share in _ENDS
-        ]
-        best = min(trials, key=lambda item: item.loss)
-        if best.loss > self.evaluate(candidate, candidate.parameters).loss - LEAST_GAIN:
-            return candidate
-        return replace(ended, parameters=best.parameters[0])
+    def choose_end(self, candidate: Candidate) -> Candidate:
+        """Let a ramp end elsewhere, with the same slope, if that explains the rows better as it is."""
+        trials = candidate.end_trials(float(self._run.time_min[-1]))
+        losses = [self.evaluate(item, item.parameters).loss for item in trials]
+        own = self.evaluate(candidate, candidate.parameters).loss if trials else inf
+        return trials[int(np.argmin(losses))] if min(losses, default=inf) < own - LEAST_GAIN else candidate
 
     def fit_end(self, candidate: Candidate) -> Candidate:
         """Fit the end of a ramp; return the candidate as it is if it does not gain by that."""
@@ -259,12 +259,10 @@ class _Segment:
         assert candidate.fit is not None
         covariance = self._hypothesis(candidate).covariance(self._run, candidate.fit, first_sd_min)
         size_sd, onset_sd_min, *end_sds_min = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
-        parameters, times = candidate.parameters, self._run.time_min
+        parameters, times = self._centre_onset(candidate), self._run.time_min
         end_log_volume = sum(log_share(sd, float(times[-1]) - float(parameters[1])) for sd in end_sds_min)
         # Within an interval only the interval's mean depends on the onset; for a sensor nothing does.
         within = float(np.interp(parameters[1], times[1:], np.diff(times))) / sqrt(12.0)
-        if candidate.profile is Step and isinstance(candidate.effect, SensorEffect):
-            parameters = np.array([parameters[0], interval_middle(times, parameters[1])])
         onset_sd_min = max(onset_sd_min, first_sd_min, within)
         sds = {"size_sd": size_sd, "onset_sd_min": onset_sd_min}
         return replace(candidate, parameters=parameters, end_log_volume=end_log_volume, **sds)

@@ -24,9 +24,6 @@ from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
-PROFILES = ("step", "ramp")
-"""Profiles of the deviation. The size of a ramp is its slope in a minute."""
-
 STANDS_OUT = 60.0
 """Twice a logarithm of a likelihood ratio."""
 

@@ -57,13 +57,13 @@ class JobKind(Generic[Job]):
     Attributes:
         doing: name of the work, for the progress display.
         work: runs a job.
-        failed: makes the row of a file that could not be used, from the file and the reason.
+        columns: names of a row's results, between `file` and `error`; null for a file that could not be used.
         summary: formats rows as a table.
     """
 
     doing: str
     work: Callable[[Job], JobResult]
-    failed: Callable[[Path, str], Row]
+    columns: tuple[str, ...]
     summary: Callable[[Sequence[Row]], str]
 
 
@@ -133,7 +133,7 @@ def run_jobs(
         if isinstance(outcome, Failed):
             reason = _strip_name(outcome.reason, file)
             print_lines(f"reactorwatch: {file}: {reason}", err=True)
-            rows.append(kind.failed(file, reason))
+            rows.append({"file": str(file), **dict.fromkeys(kind.columns), "error": reason})
         else:
             print_text(outcome.text)
             write_remark(file, outcome.remark)

@@ -142,10 +142,6 @@ def _row(file: Path, diagnosis: Diagnosis, seconds: float) -> Row:
     return {"file": str(file), **{name: report[name] for name in _COLUMNS}, "error": None}
 
 
-def _error_row(file: Path, reason: str) -> Row:
-    return {"file": str(file), **dict.fromkeys(_COLUMNS), "error": reason}
-
-
 def _fault_text(cause: Cause) -> str:
     """Format a cause as a fault: `coolant_flow:step:-0.0497@312min`."""
     size, onset = cause.parameters["size"], cause.parameters.get("onset")
@@ -187,4 +183,4 @@ def _summary(rows: Sequence[Row]) -> str:
     return f"{as_table(lines)}\n\n{len(rows)} files: {counts}"
 
 
-DIAGNOSIS = JobKind("diagnosing", run_job, _error_row, _summary)
+DIAGNOSIS = JobKind("diagnosing", run_job, _COLUMNS, _summary)

@@ -243,7 +243,7 @@ def replay(
     from recorder.tools.replay import ReplayConfig, run_replay
 
     if column and not is_table(file):
-        raise InputError(f"--column is for the columns of a table, such as a .csv file, got {file}")
+        raise InputError(f"--column is for the columns of a .csv file or another table, got {file}")
     choice = choose_process(process, inputs, outputs)
     tables, bus = _settings(config, endpoint)
     flags = {

@@ -23,7 +23,7 @@ from reactorwatch.cli.options import (
     parse_limits,
     parse_tolerances,
 )
-from reactorwatch.cli.printing import print_lines
+from reactorwatch.cli.printing import print_text
 from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS, FileFormat
@@ -70,9 +70,9 @@ def simulate(
         try:
             write_table(out, simulated)
         except InputError:
-            print_lines(report(measured, simulated, model, None, as_json=as_json))
+            print_text(report(measured, simulated, model, None, as_json=as_json))
             raise
-    print_lines(report(measured, simulated, model, out, as_json=as_json))
+    print_text(report(measured, simulated, model, out, as_json=as_json))
 
 
 def backtest(

@@ -50,7 +50,7 @@ def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS,
         content = path.read_bytes()
     try:
         if kind == ".toml":
-            return parse_process(content, Catalogue())
+            return parse_process(content, lambda name: _find_equations(name, path.parent, zero_ns))
         if kind == ".py":
             return check_process(_call_function(path), f"{FUNCTION}()")
         extended = parse_extended_model(content)
@@ -58,6 +58,20 @@ def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS,
         return describe_model(model, effects_of(model))
     except InputError as error:
         raise InputError(f"process file {path}: {error}") from error
+
+
+def _find_equations(name: str, folder: Path, zero_ns: int) -> Process:
+    """Process of the catalogue, or the extended model in a file; a relative path counts from a folder.
+
+    Raises:
+        InputError: there is none.
+    """
+    if Path(name).suffix.lower() == ".json":
+        return find_process(folder / name, zero_ns)
+    catalogue = Catalogue()
+    if name not in catalogue:
+        raise InputError(describe_unknown("equations", name, catalogue) + ", or the path of an extended.json")
+    return catalogue[name]()
 
 
 def _call_function(path: Path) -> object:

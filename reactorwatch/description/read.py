@@ -79,7 +79,7 @@ def read_signals(
         if not choice.is_default:
             raise
         cure = "name its process with --process, or its columns with --input and --output"
-        raise InputError(f"{error}, and it is no record of the reactor; {cure}") from error
+        raise InputError(f"{error}; if it is no record of the reactor, {cure}") from error
 
 
 def convert_to_process(record: Record, process: Process) -> Record:

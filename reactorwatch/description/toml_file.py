@@ -77,12 +77,12 @@ _STRUCTS: Mapping[str, type[msgspec.Struct]] = {
 }
 
 
-def parse_process(content: bytes, catalogue: Mapping[str, Callable[[], Process]]) -> Process:
+def parse_process(content: bytes, find_equations: Callable[[str], Process]) -> Process:
     """Parse the description of a process.
 
     Args:
         content: the TOML document.
-        catalogue: processes whose equations and effects it may name.
+        find_equations: returns the process whose equations, effects and controllers a name stands for.
 
     Raises:
         InputError: it is not TOML, or a part of it breaks a rule.
@@ -94,9 +94,7 @@ def parse_process(content: bytes, catalogue: Mapping[str, Callable[[], Process]]
         raise InputError(_describe_error(str(error), tables)) from error
     described: dict[str, Any] = {}
     if document.equations is not None:
-        if document.equations not in catalogue:
-            raise InputError(describe_unknown("equations", document.equations, catalogue))
-        named = catalogue[document.equations]()
+        named = find_equations(document.equations)
         described = {"equations": named.equations, "effects": named.effects, "controllers": named.controllers}
     return Process(
         document.name,

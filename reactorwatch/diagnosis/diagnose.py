@@ -254,6 +254,8 @@ def _gain(model: ProcessModel, delta_bic: float, noise_sd: Array, before: Errors
         output.name: HeldOut(
             float(before.simulation[index]),
             float(after.simulation[index]),
+            float(before.one_step[index]),
+            float(after.one_step[index]),
             float(noise_sd[index]),
             output.unit,
         )

@@ -20,6 +20,7 @@ from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.parameter_priors import offset_changes
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
+from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.simulate import Simulator
 
@@ -39,10 +40,12 @@ class Errors(NamedTuple):
 
     Attributes:
         simulation: error of the simulation, shape (n_y,); NaN where it diverged.
+        one_step: error of the one-step-ahead predictions, shape (n_y,).
         values: mask of the values that were evaluated, shape (rows, n_y).
     """
 
     simulation: Array
+    one_step: Array
     values: NDArray[np.bool_]
 
 
@@ -104,7 +107,12 @@ def simulate_outputs(run: Run, ekf: FaultFilter, signals: Sequence[Signal], offs
         signals: deviations in it.
         offsets: offsets of uncertain parameters, by name.
     """
-    result = ekf.evaluate(run, signals).innovations
+    return _simulate(run, ekf, signals, ekf.evaluate(run, signals).innovations, offsets)
+
+
+def _simulate(
+    run: Run, ekf: FaultFilter, signals: Sequence[Signal], result: FilterResult, offsets: Mapping[str, float]
+) -> Array:
     outputs = np.array(result.prediction)
     whole = ekf.full_model
     inputs = whole.inputs(run.time_min, run.inputs, signals)
@@ -127,10 +135,11 @@ def simulate_outputs(run: Run, ekf: FaultFilter, signals: Sequence[Signal], offs
 def _errors(
     run: Run, hidden: Array, ekf: FaultFilter, signals: Sequence[Signal], offsets: Mapping[str, float]
 ) -> Errors:
-    simulated = simulate_outputs(run, ekf, signals, offsets)
+    result = ekf.evaluate(run, signals).innovations
+    free = _simulate(run, ekf, signals, result, offsets)
     with np.errstate(invalid="ignore"):
         values = hidden[:, None] & np.isfinite(run.measured)
-        return Errors(_rms((run.measured - simulated)[hidden]), values)
+        return Errors(_rms((run.measured - free)[hidden]), _rms(result.residual[hidden]), values)
 
 
 def _rms(values: Array) -> Array:

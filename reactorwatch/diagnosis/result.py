@@ -95,12 +95,16 @@ class HeldOut:
     Attributes:
         rmse_before: error of the nominal model's simulation.
         rmse_after: error of the extended model's simulation.
+        one_step_before: error of the nominal model's one-step-ahead prediction.
+        one_step_after: error of the extended model's one-step-ahead prediction.
         noise_sd: standard deviation of the sensor's noise, below which no model comes.
         unit: unit of all of them.
     """
 
     rmse_before: float
     rmse_after: float
+    one_step_before: float
+    one_step_after: float
     noise_sd: float
     unit: str
 

@@ -8,8 +8,14 @@ other work counts as many units as it took rows' time when it was measured.
 STEPS_PER_RUN = 100
 """Steps for a run of a filter over a record of any length: its set-up and its results."""
 
+STEPS_PER_EVALUATION = 200
+"""Steps for an evaluation of a hypothesis besides the run of its filter, and one for ten rows: signals and layout."""
+
 STEPS_PER_LINEARISATION = 300
-"""Steps for a linearisation of a filter about its run, besides one for each row."""
+"""Steps for a linearisation of a filter about its run, besides three for two rows."""
+
+STEPS_PER_COVARIANCE = 350
+"""Steps for the covariance of a hypothesis's parameters."""
 
 STEPS_PER_ROW = 25
 """Steps for a row that is filtered by itself."""

@@ -8,8 +8,8 @@
       "zero_ns": 0
     }
 
-An effect is file as the text that injects it into the plant as a fault (`fault`), to full precision, so a model that
-is read equals the one that was file. `parameters` are those of the model that differ from its nominal values, in its
+An effect is stored as the text that injects it into the plant as a fault (`fault`), to full precision, so a model that
+is read equals the one that was written. `parameters` are those of the model that differ from its nominal values, in its
 units. Times are minutes of the record in which the deviations were found, counted from `zero_ns`, nanoseconds since
 1970-01-01 UTC; 0 where that is unknown, as for a .csv.
 """

@@ -62,6 +62,10 @@ class FileFormat:
             self.period_s  # noqa: B018 # checks it
         if self.zone is not None:
             _check_zone(self.zone)
+        if self.time_format is not None:
+            from reactorwatch.records.timestamps import stated_pattern
+
+            stated_pattern(self.time_format)
 
     def override(self, other: "FileFormat") -> "FileFormat":
         """Copy with the statements of another one in place of its own, where it has any."""

@@ -76,7 +76,7 @@ class HeaderSearch:
         if stated.header is False:
             heads, first = [], first - len(heads)
         elif stated.header and not heads:
-            heads, first = table[: first + 1][-1:], max(first, 1)
+            heads, first = [table[first]], first + 1
         elif not heads:
             heads = self._unequal_header(first) or self._commented_header(comments)
         return self._make(heads, first)

@@ -112,7 +112,7 @@ def _find_columns(layout: Layout, signals: Sequence[SignalColumn]) -> dict[str, 
     for signal in signals:
         name = signal.column or signal.name
         known = next((names for names in (layout.names, bare) if names.count(name) == 1), None)
-        number = int(name) - 1 if signal.column and name.isdigit() and int(name) <= len(bare) else None
+        number = int(name) - 1 if signal.column and name.isdecimal() and 1 <= int(name) <= len(bare) else None
         found[signal.name] = list(known).index(name) if known is not None else number
     return found
 
@@ -122,10 +122,10 @@ def _check_required(layout: Layout, signals: Sequence[SignalColumn], mapped: dic
         if signal.required and mapped[signal.name] is None:
             asked = repr(signal.column or signal.name)
             named = f" (for {signal.name})" if signal.column and signal.column != signal.name else ""
-            found = f"got {', '.join(map(repr, layout.names))}"
+            found = ", ".join(map(repr, layout.names))
             raise MissingColumnError(
-                f"{layout.path}, row {layout.header_row or layout.first_row}: "
-                f"expected a column {asked} in the header{named}, {found}"
+                f"{layout.path}, row {layout.header_row or layout.first_row}: expected a column {asked} in the header"
+                f"{named}, got {found}; --column {signal.name}=NAME names another"
             )
 
 

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 MINUTE_NS = 60_000_000_000
 
+NEVER_NS = 2**63 - 1
+"""A time that does not come; the negative one is before all others."""
+
 LARGEST_VALUE = 1e15
 """Values of at least this size are no measurements, and their squares would soon overflow."""
 

@@ -29,7 +29,6 @@ MAX_CELL_LINES = 4
 """Most lines of a quoted cell in the head."""
 
 _SEPARATORS = ";\t,| "
-_PAIR = re.compile(rb"([^,\n]*),([^,\n]*)(,?)")
 _BLANKS = re.compile(rb"[ \t]+")
 
 

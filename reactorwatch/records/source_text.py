@@ -18,6 +18,9 @@ PARQUET_SUFFIXES = (".parquet", ".pq")
 TABLE_SUFFIXES = (*TEXT_SUFFIXES, *WORKBOOK_SUFFIXES, *PARQUET_SUFFIXES)
 """Suffixes of files that hold a record as a table."""
 
+LARGEST_TEXT = 2_000_000_000
+"""Most bytes of a compressed text: a small file cannot exhaust memory."""
+
 _MAGIC = {b"\x1f\x8b": "gz", b"PK\x03\x04": "xlsx", b"PAR1": "parquet", b"\x89MCAP": "mcap"}
 _BYTE_ORDER_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 
@@ -47,9 +50,14 @@ def read_text(path: Path) -> tuple[bytes, list[str]]:
         raise InputError(f"{path}: expected a CSV file, got an MCAP recording; give it the ending .mcap")
     if kind == "gz":
         try:
-            data = gzip.decompress(data)
+            with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
+                data = packed.read(LARGEST_TEXT + 1)
         except (OSError, EOFError, zlib.error) as error:
             raise InputError(f"{path}: expected a complete gzip file, got {error}") from error
+        if len(data) > LARGEST_TEXT:
+            raise InputError(
+                f"{path}: expected at most {LARGEST_TEXT / 1e9:g} GB of text, got more; unpack or split it"
+            )
         notes.append("gzip")
         kind = _kind(data)
     if kind == "xlsx":

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.cells import find_sentinels, to_numbers
+from reactorwatch.records.cells import NUMBER, find_sentinels, kind_of, to_numbers
 from reactorwatch.records.layout import Layout, blank_comments, describe_separator
 
 BLOCK_BYTES = 1 << 22
+_MISSING_CURE = "--missing {} reads it as not measured"
 
 
 class TextTable:
@@ -78,11 +79,13 @@ class TextTable:
         if column not in self._known:
             cells = self._table.column(str(column))
             if str(cells.type) == "double":
-                values = np.asarray(cells.to_numpy())
+                values = np.array(cells.to_numpy())  # a copy: users may change it
             else:
-                cure = "--missing {} reads it as not measured" if rule.endswith("nothing") else ""
-                values, bad = to_numbers(cells.combine_chunks(), self.layout.decimal, self.layout.missing)
+                text = cells.combine_chunks()
+                values, bad = to_numbers(text, self.layout.decimal, self.layout.missing)
                 if bad is not None:
+                    is_number = kind_of(text[bad].as_py()) == NUMBER
+                    cure = "state --decimal if its sign is another" if is_number else _MISSING_CURE
                     self.refuse(bad, column, rule, cure)
             if self._sentinels:
                 values = np.where(np.isin(values, self._sentinels), np.nan, values)

@@ -80,8 +80,10 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
     if stated.time is not None:
         return _describe(layout, find_column(layout, stated.time, "--time"), stated)
     for name, unit in STANDARD.items():
-        if name in layout.names and layout.names.index(name) not in taken:
-            return TimeColumn((layout.names.index(name),), unit, is_standard=True)
+        if name in layout.names and (column := layout.names.index(name)) not in taken:
+            if stated.time_unit is not None or stated.time_format is not None:
+                return _describe(layout, column, stated)
+            return TimeColumn((column,), unit, is_standard=True)
     candidates = [_describe(layout, column, stated) for column in range(len(layout.names)) if column not in taken]
     stamps = [item for item in candidates if item.pattern is not None]
     if len(stamps) == 2 and {(item.pattern or CLOCK).has_date for item in stamps} == {True, False}:

@@ -49,7 +49,7 @@ def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Time
         InputError: a cell is no time, or local times are ambiguous.
     """
     if stated.period is not None:
-        minutes = np.arange(table.rows, dtype=np.float64) * ((stated.period_s or 0.0) / 60.0)
+        minutes = np.arange(table.rows, dtype=np.float64) * (stated.period_s or 0.0) / 60.0
         return Times(minutes, np.isfinite(minutes), is_clock=False, notes=[f"a row each {stated.period}"])
     name = " ".join(f"`{table.layout.names[number]}`" for number in column.columns)
     if column.pattern is not None:
@@ -66,7 +66,9 @@ def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Time
         return _to_clock(table, column, time_ns * digits_ns, valid, stated, note)
     unit = column.unit or "s"
     notes = [] if column.is_standard else [f"time {name} in {unit}"]
-    return Times(values / units_per_minute(unit), valid, is_clock=False, notes=notes)
+    seconds = SECONDS[unit]  # whole factors, so that decimal times stay exact
+    minutes = values * (seconds / 60.0) if seconds > 60.0 else values / units_per_minute(unit)
+    return Times(minutes, valid, is_clock=False, notes=notes)
 
 
 def find_written_zero_ns(layout: Layout, column: TimeColumn, taken: Collection[int]) -> int:

@@ -6,6 +6,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import fixed_offset_s
 
 HOUR_NS = 3_600_000_000_000
@@ -24,6 +25,9 @@ def to_utc(local_ns: NDArray[np.int64], zone: str, refuse: Callable[[int, str], 
 
     Returns:
         Nanoseconds since 1970 UTC, shape (rows,).
+
+    Raises:
+        InputError: the system does not know the zone.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -32,10 +36,15 @@ def to_utc(local_ns: NDArray[np.int64], zone: str, refuse: Callable[[int, str], 
     if offset_s is not None:
         return local_ns - offset_s * 1_000_000_000
     local = pa.array(local_ns).cast(pa.timestamp("ns"))
-    early, late = (
-        np.array(pc.assume_timezone(local, zone, ambiguous=side, nonexistent=side).cast(pa.int64()))
-        for side in ("earliest", "latest")
-    )
+    try:
+        early, late = (
+            np.array(pc.assume_timezone(local, zone, ambiguous=side, nonexistent=side).cast(pa.int64()))
+            for side in ("earliest", "latest")
+        )
+    except pa.ArrowInvalid as error:
+        raise InputError(
+            f"--zone {zone}: is not in this system's database of time zones; install tzdata, or state an offset"
+        ) from error
     skipped = np.flatnonzero(late - early == 1)  # 1 ns before the step, and just after it
     if skipped.size:
         refuse(

@@ -6,10 +6,11 @@ that loses its power loses what was not synced. The sync period trades safety ag
 
 from typing import Literal
 
+from reactorwatch.records.record import NEVER_NS
+
 Fsync = Literal["never", "chunk", "second"]
 
 SECOND_NS = 1_000_000_000
-NEVER_NS = 2**63 - 1
 
 
 class FlushAndRotation:

@@ -77,6 +77,7 @@ class McapStream:
         self._metadata: list[MetadataIndex] = []
         self._attachments: list[AttachmentIndex] = []
         self._counts: dict[int, int] = {}  # messages by channel, of the chunks that have ended
+        self._unflushed: list[tuple[int, int]] = []  # end and messages of each chunk since the last flush
         self._compressor = zstandard.ZstdCompressor()
 
     def start(self, library: str, profile: str = "") -> None:
@@ -144,6 +145,11 @@ class McapStream:
         """End the chunk, if it has a message, and flush the sink."""
         self._end_chunk()
         self._sink.flush()
+        self._unflushed.clear()
+
+    def count_complete(self, size_bytes: int) -> int:
+        """Count of the messages since the last flush whose chunks are within the first bytes of the file."""
+        return sum(messages for end, messages in self._unflushed if end <= size_bytes)
 
     def finish(self) -> None:
         """Write the summary section and the footer."""
@@ -211,6 +217,7 @@ class McapStream:
                 uncompressed_size=chunk.uncompressed_size,
             )
         )
+        self._unflushed.append((start + len(record), sum(len(index) // 2 for index in self._index.values())))
         self._chunk.clear()
         self._index.clear()
         self._sink.write(record)

@@ -192,9 +192,15 @@ class RecordingWriter:
         finally:
             self._stream.abandon()
 
-    def abandon(self) -> None:
-        """Leave the file as last flushed, to be recovered; after `close` it does nothing."""
+    def abandon(self) -> int:
+        """Leave the file as it is, to be recovered; after `close` it does nothing.
+
+        Returns:
+            Count of the messages since the last flush that a recovery will find, because their chunks were written
+            before the disk was full.
+        """
         self._stream.abandon()
+        return self._writer.count_complete(self._stream.flushed_bytes)
 
     def __enter__(self) -> Self:
         return self

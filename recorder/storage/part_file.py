@@ -53,6 +53,11 @@ class PartFile:
         """Number of bytes written, buffered ones included."""
         return self._flushed + len(self._pending)
 
+    @property
+    def flushed_bytes(self) -> int:
+        """Number of bytes handed to the operating system."""
+        return self._flushed
+
     def flush(self) -> None:
         """Hand the buffer to the operating system.
 

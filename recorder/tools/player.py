@@ -16,14 +16,12 @@ from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication,
 from reactorwatch.contract.commands import decode_command
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
-from reactorwatch.records.record import Record, to_time_ns
+from reactorwatch.records.record import NEVER_NS, Record, to_time_ns
 from recorder.columns.run_splitter import ContinuousTime
 from recorder.message import RecordedMessage
 
 BATCH = 256
 """Largest number of messages published in one tick, so that the loop notices a stop."""
-
-NEVER_NS = 2**62
 
 COMMANDS = dict.fromkeys(("pause", "resume", "step", "set_rate"), messages.ReplayCommand)
 """Message type by command."""

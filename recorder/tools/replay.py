@@ -11,7 +11,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.read import read_signals
 from reactorwatch.errors import InputError
-from reactorwatch.records.record import to_time_ns
+from reactorwatch.records.record import NEVER_NS, to_time_ns
 from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
@@ -24,7 +24,6 @@ from recorder.tools.mcap_file import read_messages, sample_topics_in
 from recorder.tools.player import (
     COMMANDS,
     EVERYTHING,
-    NEVER_NS,
     SAMPLES,
     Player,
     filter_playable,

@@ -13,6 +13,8 @@ from plant_node.record import simulate_record
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
 from reactorwatch.process.library.cascaded_tanks.model import tanks
+from reactorwatch.process.library.three_tanks.effects import THREE_TANKS_EFFECTS
+from reactorwatch.process.library.three_tanks.model import three_tanks
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
 from reactorwatch.records.write_table import write_table
@@ -69,6 +71,20 @@ def _tank_record(path: Path) -> None:
     write_table(path, Record(time_min, {"u": u, "x2": level + random.normal(0.0, 0.01, level.size)}, path.name))
 
 
+def _three_tanks_record(path: Path) -> None:
+    """Three tanks whose pipe from tank 1 to tank 3 clogs, as a logger in Germany writes it, in units of its own."""
+    random = np.random.default_rng(2)
+    time_min = np.arange(400) * 4 / 60
+    flows = np.array([21.37, 53.80]) + np.repeat(random.uniform(-8, 8, (20, 2)), 20, axis=0)
+    true = parse_fault("clog13:ramp:0.3@8min,end=26min", THREE_TANKS_EFFECTS).extend(three_tanks())
+    levels = Simulator(true).run(time_min, flows, np.array([41.0, 32.0, 36.6])).outputs
+    levels += random.normal(0.0, 0.1, levels.shape)
+    cells = np.column_stack([time_min * 60, flows * [3.6, 1.0], levels * [10.0, 1.0, 1.0]])
+    lines = ["time;P101;P102;L1;L2;L3"]
+    lines += [";".join(f"{value:.4f}".replace(".", ",") for value in row) for row in cells]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
 def _recording(path: Path) -> None:
     """An hour of a plant, recorded with all that its monitor published."""
     record_hour(path, black_box_min=0.0).stop()
@@ -88,6 +104,7 @@ GIVEN: dict[str, Callable[[Path], None]] = {
     "later.txt": _later_record,
     "narrow.csv": _narrow_record,
     "rig.csv": _tank_record,
+    "tanks.txt": _three_tanks_record,
     "run.mcap": _recording,
     "records": _records,
 }

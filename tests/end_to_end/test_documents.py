@@ -10,6 +10,7 @@ import pytest
 import typer.main
 
 from reactorwatch.cli.main import app
+from reactorwatch.description.find import find_process
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.runtime.config import SECTIONS, read_settings, section
 from tests.unit.runtime.test_setting_rules import TABLES
@@ -112,6 +113,9 @@ def test_the_page_works_as_it_is_written(
         match block.kind:
             case "commands":
                 run_commands(block, tmp_path, machine, called)
+            case "toml" if "[[signals]]" in block.text:
+                written.write_text(block.text, encoding="utf-8")
+                assert find_process(written).outputs
             case "toml":
                 check_settings(block, written)
             case "json":

@@ -57,7 +57,10 @@ def objects(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
     ]
 
 
-MALFORMED = "reactorwatch: run-2b.csv: row 3, column 'C': expected a finite number or nothing, got 'x'"
+MALFORMED = (
+    "reactorwatch: run-2b.csv: row 3, column 'C': expected a finite number or nothing, got 'x'; "
+    "--missing x reads it as not measured"
+)
 
 
 def test_a_diagnosis_is_the_same_in_one_process_in_two_and_on_a_cluster(

@@ -31,7 +31,7 @@ def said(*names: str, verdict: str = "named", others: tuple[str, ...] = (), loca
     parameters = {"size": Estimate(2.02, 0.02, "K"), "onset": Estimate(4.5, 0.1, "min")}
     causes = tuple(Cause(name, "step", "", location, parameters) for name in names)
     curve = np.where(TIME >= 4.5, 2.02, 0.0)
-    held_out = {"T": HeldOut(3.0, 0.33, 0.3, "K")}
+    held_out = {"T": HeldOut(3.0, 0.33, 3.0, 0.33, 0.3, "K")}
     return Diagnosis(
         samples=11,
         span_min=10.0,

@@ -48,13 +48,15 @@ class LiveRun:
         folder: for the recording, the state and what the nodes say.
         duration_min: of the plant.
         speed: of the plant.
-        faults: of the plant, beside the leak.
         monitor: settings of the monitor beside the usual.
+
+    Attributes:
+        faults: deviations of the plant beside the leak.
     """
 
-    def __init__(
-        self, folder: Path, duration_min: float, speed: float, faults: tuple[str, ...] = (), **monitor: Any
-    ) -> None:
+    faults: tuple[str, ...] = ()
+
+    def __init__(self, folder: Path, duration_min: float, speed: float, **monitor: Any) -> None:
         self.folder, self.recording = folder, folder / "run.mcap"
         self._last_min = duration_min - PERIOD_MIN  # of the plant's rows
         self.config = BusConfig(endpoint=free_endpoint())
@@ -64,10 +66,7 @@ class LiveRun:
             speed=speed,
             duration_min=duration_min,
             seed=4,
-            faults=(
-                *faults,
-                f"coolant_flow:step:-0.08@{0.6 * duration_min}min",
-            ),
+            faults=(*self.faults, f"coolant_flow:step:-0.08@{0.6 * duration_min}min"),
             wait_for=("monitor", "recorder"),
         )
         recorder = RecorderConfig(out=str(self.recording), linger_s=2.0, black_box_min=0.0)

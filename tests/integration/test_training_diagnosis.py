@@ -17,11 +17,17 @@ from .live_run import LiveRun
 ENDLESS_MIN = 100_000.0
 
 
+class WarmRun(LiveRun):
+    """A plant whose feed was 3 K warmer all along."""
+
+    faults = ("feed_temperature:constant:3",)
+
+
 def test_a_live_training_is_diagnosed_and_the_change_of_the_model_is_recorded_and_verified(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     changes: list[Encoded] = []
-    with LiveRun(tmp_path, ENDLESS_MIN, 600.0, ("feed_temperature:constant:3",), training_min=25.0) as live:
+    with WarmRun(tmp_path, ENDLESS_MIN, 600.0, training_min=25.0) as live:
         live.bus.subscribe(keys.key("cstr", keys.BASELINE, "monitor"), changes.append)
         _, plant = live.start_all()
         live.wait(lambda: bool(changes))
@@ -41,8 +47,7 @@ def test_a_live_training_is_diagnosed_and_the_change_of_the_model_is_recorded_an
 
 def test_a_monitor_that_was_stopped_before_the_diagnosis_was_done_makes_it_after_its_restart(tmp_path: Path) -> None:
     changes: list[Encoded] = []
-    settings = {"training_min": 25.0, "state_file": str(tmp_path / "monitor.state")}
-    with LiveRun(tmp_path, ENDLESS_MIN, 600.0, ("feed_temperature:constant:3",), **settings) as live:
+    with WarmRun(tmp_path, ENDLESS_MIN, 600.0, training_min=25.0, state_file=str(tmp_path / "monitor.state")) as live:
         live.bus.subscribe(keys.key("cstr", keys.BASELINE, "monitor"), changes.append)
         live.start_all()
         live.wait(lambda: live.health.phase == "watching")

@@ -29,7 +29,7 @@ from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.kalman.noise_estimation import estimate_noise_and_parameters
 from reactorwatch.kalman.resampling import ResampledRecord, count_pieces, insert_rows
-from reactorwatch.kalman.step_budget import STEPS_PER_LINEARISATION, StepBudget
+from reactorwatch.kalman.step_budget import STEPS_PER_EVALUATION, STEPS_PER_LINEARISATION, StepBudget
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
@@ -147,6 +147,11 @@ class FaultFilter:
         for item in self._filters:
             item.budget, item.stops_at_restart = budget, True
 
+    def spend(self, steps: int) -> None:
+        """Count steps against the budget, if there is one."""
+        if self.budget is not None:
+            self.budget.spend(steps)
+
     def prepare(self) -> None:
         """Compile now what the first run and the first linearisation would compile."""
         self._filters[0].prepare()
@@ -185,6 +190,7 @@ class FaultFilter:
             shared: for each set, a run with the same first rows or None; None: no such runs.
         """
         laid = [self._lay_out_rows(run, signals) for signals in several]
+        self.spend(sum(STEPS_PER_EVALUATION + rows.time_min.size // 10 for rows, _ in laid))
         # With a delayed output the filter's rows depend on the delay, so no prefix is shared.
         prefixes = [None] * len(laid) if shared is None or self.delay_index is not None else shared
         innovations = self._filter_rows([rows for rows, _ in laid], prefixes)
@@ -279,8 +285,7 @@ class FaultFilter:
 
     def error_dynamics(self, run: Run, signals: Sequence[Signal], innovations: FilterResult) -> ErrorDynamics:
         """Error equations about a filter run, from the second row on, the first one that is predicted."""
-        if self.budget is not None:  # to linearise a row takes about as long as to filter it
-            self.budget.spend(STEPS_PER_LINEARISATION + int(np.sum(count_pieces(run.time_min))))
+        self.spend(STEPS_PER_LINEARISATION + int(1.5 * np.sum(count_pieces(run.time_min))))
         return error_dynamics_between(self._errors, run, self.inputs(run, signals), innovations, self.used_values(run))
 
     def used_values(self, run: Run) -> NDArray[np.bool_]:

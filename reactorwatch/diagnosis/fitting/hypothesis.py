@@ -21,6 +21,7 @@ from reactorwatch.diagnosis.parameter_priors import last_finite_row, offsets
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.step_budget import STEPS_PER_COVARIANCE
 
 CONVERGED, WELL_CONVERGED = 0.05, 0.005
 """Thresholds in log likelihood: a rough fit stops after a step that gains less than the first, a full fit when the
@@ -180,6 +181,7 @@ class Hypothesis:
 
     def _covariance(self, g: Array) -> Array:
         """Covariance of the parameters from their Jacobian."""
+        self.filter.spend(STEPS_PER_COVARIANCE)
         information = g.T @ g + self._prior_information()
         scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
         inner = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)

@@ -110,3 +110,10 @@ def test_info_shows_how_any_table_is_read_and_what_is_in_it(tmp_path: Path) -> N
     found = json.loads(CliRunner().invoke(app, ["info", str(path), "--json", "--period", "1 s"]).stdout)
     assert (found["rows"], found["period_s"], found["gaps"], found["zero"]) == (28, pytest.approx(1.0), [], None)
     assert found["signals"]["flow"] == {"unit": "m3/h", "missing": 0, "lowest": 0.0, "highest": 14.5}
+
+
+def test_a_note_on_a_simulation_is_a_line_of_its_own(local: Path) -> None:
+    result = CliRunner().invoke(app, ["simulate", str(local), "--zone", "Europe/Berlin", "-o", "simulated.csv"])
+    first, second = result.stdout.splitlines()
+    assert first.startswith("wrote simulated.csv: 240 rows")
+    assert second == "note: read as: time `Zeit` yyyy-mm-dd hh:mm:ss in Europe/Berlin"

@@ -74,7 +74,7 @@ def state(folder: Path) -> dict[Path, bytes]:
         ("info none.mcap", "there is no such file"),
         ("info no_bytes.mcap", "got an empty file"),
         ("info text.mcap", "got another kind of file"),
-        ("info run.csv", "got another kind of file"),
+        ("info run.csv --zone Bonn", "--zone must be a time zone"),
         ("info folder", "holds no recording"),
         ("info --jso good.mcap", "No such option: --jso"),
         ("cut good.mcap", "Missing option '--out'"),

@@ -75,6 +75,18 @@ def test_a_file_names_equations_of_the_catalogue_and_their_constants(tmp_path: P
     assert [effect.name for effect in process.effects][:2] == ["pump1", "pump2"]
 
 
+def test_a_file_names_an_extended_model_beside_it_as_its_equations(tmp_path: Path) -> None:
+    (tmp_path / "report").mkdir()
+    text = {"format": "reactorwatch.model.v1", "model": "three_tanks", "effects": ["clog13:step:0.2@10min"]}
+    write(tmp_path / "report", json.dumps(text), "extended.json")
+    process = find_process(write(tmp_path, TANKS.replace('"three_tanks"', '"report/extended.json"')))
+    assert process.model is not None
+    assert process.model.parameter("clog13.size").value == 0.2
+    assert process.units["Q1"] == "l/min"
+    with pytest.raises(InputError, match=r"none\.json: there is no such file"):
+        find_process(write(tmp_path, TANKS.replace('"three_tanks"', '"none.json"')))
+
+
 def test_an_extended_model_is_a_process(tmp_path: Path) -> None:
     text = {"format": "reactorwatch.model.v1", "model": "cstr", "effects": ["coolant_flow:step:-0.05@10min"]}
     process = find_process(write(tmp_path, json.dumps(text), "extended.json"))

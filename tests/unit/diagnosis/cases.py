@@ -111,8 +111,8 @@ def diagnosis_of(
     """A diagnosis of 2,000 rows."""
     before = nan if ran_away else 3.2
     held_out = {
-        "C": HeldOut(0.0147, 0.00202, 0.00197, "mol/l"),
-        "T": HeldOut(before, 0.292, 0.303, "K"),
+        "C": HeldOut(0.0147, 0.00202, 0.0147, 0.00202, 0.00197, "mol/l"),
+        "T": HeldOut(before, 0.292, 3.2, 0.292, 0.303, "K"),
     }
     drawn = curves(causes)
     signals = {"qc": (drawn.inputs["qc"], "l/min"), "C": (drawn.simulated_before["C"], "mol/l")}

@@ -1,12 +1,13 @@
 """Fleets that a test makes: plants, monitors, and what each plant's own monitor would have said."""
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import msgspec
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.monitor import FleetMonitor
+from monitor_node.fleet.monitor import Callbacks, FleetMonitor
 from monitor_node.fleet.sharding import WHOLE, Shard, ShardGroup
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
@@ -36,9 +37,9 @@ def row_by_row(runs: Iterable[list[Encoded]]) -> list[Encoded]:
     return [message for each in rows for row in each for message in row]
 
 
-def fleet(config: MonitorConfig = QUICK, shard: Shard = WHOLE, name: str = "a", **others: object) -> FleetMonitor:
+def fleet(config: MonitorConfig = QUICK, shard: Shard = WHOLE, name: str = "a", **callbacks: Any) -> FleetMonitor:
     """A monitor of all plants, or of a shard."""
-    return FleetMonitor(config, 0, ShardGroup(PLANTS, shard, name), **others)  # type: ignore[arg-type]
+    return FleetMonitor(config, 0, ShardGroup(PLANTS, shard, name), Callbacks(**callbacks))
 
 
 def alone(plant: str, messages: Iterable[Encoded], config: MonitorConfig = QUICK) -> list[Publication]:

@@ -1,10 +1,14 @@
 """Trainings are diagnosed beside the watch, one after the other; a failure is a finding."""
 
+import errno
 import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 from monitor_node.__main__ import MonitorNode
+from monitor_node.baseline.references import ProcessReference
 from monitor_node.baseline.training import TrainingState
-from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob
+from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, read_equations
 from monitor_node.diagnosis_worker import DiagnosisWorker, PlantFinding
 from reactorwatch.contract.codec import Publication
 from reactorwatch.diagnosis.result import NAMED
@@ -45,6 +49,23 @@ def test_a_training_that_cannot_be_diagnosed_is_a_finding_and_the_next_is_diagno
         assert finding.why == "training: a diagnosis needs at least 200 rows, got 2; record for longer"
 
 
+class NoProcess(SerialExecutor):
+    """An executor on a machine that has no room for another process."""
+
+    def map_unordered(self, work: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+
+def test_where_no_process_can_be_started_each_diagnosis_has_failed_and_the_next_is_tried() -> None:
+    worker = DiagnosisWorker(NoProcess())
+    for name in ("a", "b"):
+        worker.submit(name, SHORT)
+        ((plant, finding),) = wait_for_findings(worker)
+        assert (plant, finding.verdict) == (name, FAILED)
+        assert finding.why == "no process can be started: [Errno 11] Resource temporarily unavailable"
+    worker.close()
+
+
 def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_model_at_the_next_row(
     warm: Run,
 ) -> None:
@@ -53,7 +74,7 @@ def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_
     for message in warm.messages[:TRAINED]:
         published += node.on_message(message, 0)
     assert not node._worker.is_busy
-    assert not has_preparation(node)
+    assert node.equations is node.model
     for message in warm.messages[TRAINED:LATE]:
         published += node.on_message(message, 0)
     assert node.rows == LATE // 3
@@ -72,3 +93,6 @@ def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_
     assert change == changes(warm.published)[0]
     assert warm.finding.verdict == NAMED
     assert not node._worker.is_busy
+    reference = node._pipeline._reference
+    assert isinstance(reference, ProcessReference)
+    assert reference.model is node.equations is read_equations(change.model)  # the one that was prepared

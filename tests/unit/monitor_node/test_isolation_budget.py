@@ -110,8 +110,8 @@ def test_no_run_of_bad_values_fails_or_exceeds_the_budget_and_a_restart_over_it_
 def test_a_look_that_stopped_names_no_cause_and_the_alarm_says_so_until_the_next_look_that_ends(
     run: list[Encoded], trained: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Twenty rows of 700 K, with a tenth of the budget: few values exceed the full one."""
-    monkeypatch.setattr("monitor_node.isolation.isolation.LOOK_STEPS_A_ROW", -100)
+    """Twenty rows of 700 K, with 20,000 steps: few values exceed the full budget."""
+    monkeypatch.setattr("monitor_node.isolation.isolation.LOOK_STEPS_A_ROW", -300)
     bad = range(3 * TRAINED + 2, 3 * (TRAINED + 20), 3)
     messages = [with_value(m, 700.0) if at in bad else m for at, m in enumerate(run)]
     _, alarms = watched_on(trained, messages[3 * TRAINED :])

@@ -10,7 +10,7 @@ from monitor_node.isolation.causes import CAUSES
 from monitor_node.isolation.fit import Fitter
 from monitor_node.isolation.glr_scan import GlrScan
 from monitor_node.isolation.window import Window, window_of
-from reactorwatch.diagnosis.fitting.profiles import EndedRamp, Ramp, Step
+from reactorwatch.diagnosis.fitting.profiles import EndedRamp, FittedProfile, Ramp, Step
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.step_budget import BudgetExceededError, StepBudget
 from reactorwatch.process.library.cstr.model import cstr
@@ -58,11 +58,28 @@ def test_sizes_stay_possible_and_none_begins_at_nothing() -> None:
         assert item.parameters[0] != 0.0
 
 
-def test_a_ramp_keeps_its_slope_where_rows_are_added() -> None:
-    ramp = Candidate(CAUSES[0], Ramp, np.array([2.0, 10.0]), 0.0, np.empty((0, 0)), 0.0, 1.0, 1.0)
-    np.testing.assert_allclose(ramp.extrapolate(20.0, 40.0), [6.0, 10.0])
-    step = Candidate(CAUSES[0], Step, np.array([2.0, 10.0]), 0.0, np.empty((0, 0)), 0.0, 1.0, 1.0)
-    np.testing.assert_allclose(step.extrapolate(20.0, 40.0), [2.0, 10.0])
+def candidate(profile: type[FittedProfile], parameters: list[float]) -> Candidate:
+    return Candidate(CAUSES[0], profile, np.array(parameters), 0.0)
+
+
+def test_a_ramp_keeps_its_slope_where_rows_are_added_and_nothing_else_changes() -> None:
+    for profile, before, after in (
+        (Ramp, [2.0, 10.0], [6.0, 10.0]),
+        (Step, [2.0, 10.0], [2.0, 10.0]),
+        (EndedRamp, [2.0, 10.0, 15.0], [2.0, 10.0, 15.0]),
+    ):
+        assert candidate(profile, before).extrapolate(20.0, 40.0).parameters.tolist() == after
+
+
+def test_a_ramp_may_end_elsewhere_with_the_same_slope() -> None:
+    assert candidate(Step, [2.0, 10.0]).end_trials(40.0) == []
+    for item in (candidate(Ramp, [6.0, 10.0]), candidate(EndedRamp, [2.0, 10.0, 20.0])):
+        trials = item.end_trials(40.0)
+        assert len(trials) > 3
+        for trial in trials:
+            end_min = 40.0 if trial.profile is Ramp else trial.parameters[2]
+            assert trial.parameters[0] / (end_min - 10.0) == pytest.approx(0.2)
+    assert [trial.profile for trial in trials][-1] is Ramp  # one that has ended may go on
 
 
 def test_a_fit_ends_where_its_budget_does() -> None:

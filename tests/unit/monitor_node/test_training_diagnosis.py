@@ -5,16 +5,26 @@ from dataclasses import replace
 import msgspec
 import pytest
 
-from monitor_node.baseline.training_diagnosis import FAILED, read_equations
+from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, read_equations
 from monitor_node.core import Monitor
+from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.replay import backtest
 from monitor_node.replay.verification import verify
 from monitor_node.state.monitor_state import SEAL, equations_text
 from reactorwatch.contract.codec import Encoded, Publication, encode
+from reactorwatch.contract.messages_pb2 import Baseline, Sample
 from reactorwatch.diagnosis.result import NAMED, NOMINAL
+from reactorwatch.errors import InputError
+from reactorwatch.process.extended_model import ExtendedModel
+from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.stored_state import pack_times, unpack_times
 
 from .warm_plant import CONFIG, GIVEN, LATE, TRAINED, Run, changes, plant, publish, without_baseline
+
+START_NS = 1_750_000_000 * 10**9
+SECOND_NS = 10**9
 
 
 def test_a_diagnosis_of_the_training_finds_what_the_plant_was_before(warm: Run) -> None:
@@ -53,6 +63,24 @@ def test_a_replay_of_the_recorded_change_is_bit_identical(warm: Run) -> None:
     for change in changes(warm.published):
         again.schedule(change)
     assert publish(again, warm.messages) == warm.published
+
+
+def test_a_given_model_with_effects_is_what_the_training_is_compared_with_on_the_clock_of_the_bus(warm: Run) -> None:
+    """The plant was 2 K warmer since five minutes before its training, and its model has it."""
+    monitor = Monitor(CONFIG, 0)
+    publish(monitor, warm.messages[: TRAINED + 3])
+    job = monitor.diagnosis_job
+    assert job is not None
+    times_ns = pack_times(START_NS + time_ns for time_ns in unpack_times(job.rows.times_ns))
+    known = parse_fault(f"feed_temperature:step:2@{START_NS / MINUTE_NS - 5}min")
+    found = find_deviations(
+        DiagnosisJob(
+            msgspec.structs.replace(job.rows, times_ns=times_ns),
+            job.signals,
+            msgspec.json.encode(ExtendedModel("cstr", (known,)).to_object()).decode(),
+        )
+    )
+    assert (found.first_ns, found.verdict, found.equations) == (START_NS, NOMINAL, "")
 
 
 def test_a_change_whose_row_was_lost_holds_from_the_next_row_on(warm: Run) -> None:
@@ -150,8 +178,21 @@ def test_the_alarms_of_a_nominal_plant_are_the_same_with_the_diagnosis_and_witho
     assert found.alarm_messages == given.alarm_messages
 
 
-START_NS = 1_750_000_000 * 10**9
-SECOND_NS = 10**9
+@pytest.mark.parametrize("is_warm", [False, True])
+def test_a_disturbance_of_the_training_changes_no_model_and_a_lasting_deviation_beside_it_is_found(
+    warm: Run, *, is_warm: bool
+) -> None:
+    """The thermometer reads 5 K too much for six minutes."""
+    disturbed = list(warm.messages if is_warm else plant())
+    for at in range(3 * 100 + 2, 3 * 160, 3):
+        item = Sample.FromString(disturbed[at].payload)
+        item.value += 5.0
+        disturbed[at] = disturbed[at]._replace(payload=item.SerializeToString())
+    monitor = Monitor(CONFIG, 0, diagnose=find_deviations)
+    publish(monitor, disturbed)
+    effects = [] if monitor.baseline is None else msgspec.json.decode(monitor.baseline.model)["effects"]
+    assert [effect.split(":")[:2] for effect in effects] == [["feed_temperature", "constant"]] * is_warm
+    assert any("in the course of a curve" in note or "no cause" in note for note in monitor.notes)
 
 
 def recording(warm: Run, *, killed: bool = False) -> list[Encoded]:
@@ -187,3 +228,14 @@ def test_a_recording_with_a_change_of_the_model_is_verified_value_for_value(warm
 def test_a_recording_without_the_change_is_not_reproduced(warm: Run) -> None:
     log = [message for message in recording(warm) if not message.key.endswith("/baseline/monitor")]
     assert not verify(lambda: log, CONFIG).exact
+
+
+def test_a_recorded_change_whose_model_cannot_be_read_is_one_line(warm: Run) -> None:
+    (change,) = changes(warm.published)
+    change = Baseline(time_ns=change.time_ns, model=change.model[:-9])
+    log = [
+        encode(Publication(item.key, change)) if item.key.endswith("/baseline/monitor") else item
+        for item in recording(warm)
+    ]
+    with pytest.raises(InputError, match=r"^the model of the baseline is not JSON: "):
+        verify(lambda: log, CONFIG)

@@ -143,7 +143,9 @@ def test_cut_and_merged_recordings_describe_their_processes(tanks: Path, tmp_pat
 
 
 def test_a_table_that_is_no_record_of_the_reactor_is_refused_with_the_cure(tanks: Path, tmp_path: Path) -> None:
-    cure = "is no record of the reactor; name its process with --process, or its columns with --input and --output"
+    cure = (
+        "if it is no record of the reactor, name its process with --process, or its columns with --input and --output"
+    )
     with pytest.raises(InputError, match=rf"tanks.csv, row 1: expected a column 'qc' in the header, got .*{cure}"):
         import_csv(tanks.with_suffix(".csv"), tmp_path / "x.mcap")
     assert not (tmp_path / "x.mcap").exists()

@@ -48,6 +48,17 @@ def recorded(folder: Path) -> list[int]:
     ]
 
 
+@pytest.mark.parametrize("room", range(19_000, 22_000, 100))
+def test_what_is_counted_as_not_recorded_is_missing_wherever_the_disk_is_full(tmp_path: Path, room: int) -> None:
+    disk = Disk(room)
+    fed = recorder(tmp_path / "run.mcap", START, disk.open, health_period_s=60.0, resume_mb=0.0)
+    fed.hear(samples(1000), SECOND // 100)
+    disk.room = 10**9
+    fed.pass_time(3 * SECOND)
+    fed.stop()
+    assert fed.last_health().refused_by_reason["disk"] == 1000 - len(recorded(tmp_path)) > 0
+
+
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EIO])
 def test_recording_stops_with_an_alarm_keeps_what_is_there_and_goes_on_when_there_is_room(
     tmp_path: Path, error: int

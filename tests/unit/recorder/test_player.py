@@ -9,9 +9,9 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
-from reactorwatch.records.record import Record
+from reactorwatch.records.record import NEVER_NS, Record
 from recorder.message import RecordedMessage
-from recorder.tools.player import BATCH, EVERYTHING, NEVER_NS, Player, filter_playable, filter_time, samples_of
+from recorder.tools.player import BATCH, EVERYTHING, Player, filter_playable, filter_time, samples_of
 from tests.unit.recorder import golden
 
 SECOND = 10**9

@@ -9,8 +9,8 @@ import pytest
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.read_table import SignalColumn, read_table
-from reactorwatch.records.record import Record
-from reactorwatch.records.several_files import read_tables
+from reactorwatch.records.record import Record, join_runs
+from reactorwatch.records.several_files import join_files
 from tests.unit.records.variants import (
     BERLIN,
     HOLES,
@@ -163,6 +163,15 @@ REFUSED = {
         FileFormat(),
         "row 2, column 'C': expected a finite number or nothing, got 'high'; --missing high reads it as not measured",
     ),
+    "two decimal signs": (
+        table(
+            MINUTES,
+            [["100,5", "0,11", "438.2" if row[0] == "7" else "438,2"] for row in zip(MINUTES, strict=True)],
+            separator=";",
+        ),
+        FileFormat(),
+        "row 9, column 'T': expected a finite number or nothing, got '438.2'; state --decimal if its sign is another",
+    ),
     "a day or a month": (
         table([f"03/04/2026 10:{row // 60:02d}:{row % 60:02d}" for row in range(ROWS)], cells(), STAMPS),
         FileFormat(),
@@ -249,6 +258,8 @@ def test_the_option_that_is_named_settles_it(tmp_path: Path, name: str, stated: 
         ({"separator": ",", "decimal": ","}, "--separator and --decimal must differ"),
         ({"period": "4"}, "--period must be a positive number with its unit, such as 4 s, got '4'"),
         ({"period": "-4 s"}, "--period must be a positive number"),
+        ({"time_format": "%Y-%Q"}, "--time-format '%Y-%Q': unknown directive '%Q'"),
+        ({"time_format": "%Y-%Y"}, "--time-format '%Y-%Y': each part once"),
         ({"zone": "Mars/Olympus"}, "--zone must be a time zone such as Europe/Berlin"),
     ],
 )
@@ -271,17 +282,44 @@ def test_files_in_a_row_are_one_record(tmp_path: Path) -> None:
     for number, part in enumerate((slice(0, 100), slice(100, ROWS))):
         paths.append(tmp_path / f"{number}.csv")
         paths[-1].write_text(table(times[part], cells()[part], STAMPS))
-    record = read_tables(paths, [SignalColumn(name, unit) for name, unit in UNITS.items()])
+    signals = [SignalColumn(name, unit) for name, unit in UNITS.items()]
+    record = join_files([read_table(path, signals) for path in paths])
     assert_same(record, Variant(b"", start=START))
-    turned = read_tables(paths[::-1])
+    turned = join_files([read_table(path) for path in paths[::-1]])
     assert turned.runs is not None
     assert [run.rows for run in turned.split_runs()] == [ROWS - 100, 100]
     assert turned.time_min[0] == 0.0
     assert turned.time_min[ROWS - 100] == -100.0
 
 
+def test_a_file_of_several_runs_goes_on_where_the_one_before_ended() -> None:
+    def part(*times: float) -> Record:
+        return Record(np.array(times), {"T": np.array(times)}, "part")
+
+    whole = join_files([part(0, 1, 2), join_runs([part(3, 4, 5), part(1, 2)]), part(3, 4)])
+    assert [run.time_min.tolist() for run in whole.split_runs()] == [[0, 1, 2, 3, 4, 5], [1, 2, 3, 4]]
+    assert whole.columns["T"].tolist() == [0, 1, 2, 3, 4, 5, 1, 2, 3, 4]
+
+
+def test_files_of_other_units_or_clocks_are_no_record() -> None:
+    times = np.arange(3.0)
+    record = Record(times, {"T": times}, "a", units={"T": "K"})
+    with pytest.raises(InputError, match="b: expected the units of a"):
+        join_files([record, Record(times + 3, {"T": times}, "b", units={"T": "degC"})])
+    with pytest.raises(InputError, match="b: expected no clock time, as a has"):
+        join_files([record, Record(times + 3, {"T": times}, "b", zero_ns=1, units={"T": "K"})])
+
+
 def test_files_of_other_signals_are_no_record(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / f"{name}.csv").write_text(f"time_min,{name}\n0,1\n1,2\n")
     with pytest.raises(InputError, match=r"b\.csv: expected the signals of a\.csv, a, got b"):
-        read_tables([tmp_path / "a.csv", tmp_path / "b.csv"])
+        join_files([read_table(tmp_path / f"{name}.csv") for name in ("a", "b")])
+
+
+def test_values_may_be_changed_in_place(tmp_path: Path) -> None:
+    (tmp_path / "record.csv").write_text("time_min,qc,T\n0,1,2\n1,1,2\n", encoding="utf-8")
+    record = read_table(tmp_path / "record.csv")
+    for values in (record.time_min, *record.columns.values()):
+        values[1:] += 1.0
+    assert record.columns["T"].tolist() == [2.0, 3.0]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.errors import InputError
+from reactorwatch.records import source_text
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.read_table import read_table
 from reactorwatch.records.record import Record, join_runs
@@ -70,7 +71,7 @@ def test_a_compressed_file_has_the_same_bytes_each_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "line"),
     [
-        ("a.csv.gz", gzip.compress(b"time_min,qc\n0,1\n" * 100)[:-9], "expected a complete gzip file"),
+        ("a.csv.gz", gzip.compress(b"time_min,qc\n0,1\n" * 100, mtime=0)[:-9], "expected a complete gzip file"),
         ("a.xlsx", b"PK\x03\x04 and no more", "expected a workbook"),
         ("a.parquet", b"PAR1 and no more", "expected a Parquet file with columns of plain values"),
         ("a.txt", b"\xff\xfet", "expected UTF-16 text"),
@@ -86,3 +87,15 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, name: str, conten
         read_table(path)
     assert str(refused.value).startswith(f"{path}: ")
     assert "\n" not in str(refused.value)
+
+
+def test_a_small_file_that_expands_to_gigabytes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(source_text, "LARGEST_TEXT", 1000)
+    for rows, fits in ((100, True), (300, False)):
+        path = tmp_path / f"{rows}.csv.gz"
+        path.write_bytes(gzip.compress(b"time_min,qc\n" + b"".join(b"%d,1\n" % row for row in range(rows))))
+        if fits:
+            assert read_table(path).rows == rows
+        else:
+            with pytest.raises(InputError, match=r"300\.csv\.gz: expected at most 1e-06 GB of text, got more"):
+                read_table(path)

@@ -28,7 +28,7 @@ def test_a_training_of_which_too_much_is_disturbed_begins_anew() -> None:
     time_min, columns = sound_run(230.0, seed=2)
     columns["T"][550:1000] += 3.0
     run = watched(time_min, columns)
-    assert run.monitor.notes[0] == "the training begins anew: more than a third of it was disturbed in T"
+    assert run.monitor.notes[0] == "the training starts again: more than a third of it was disturbed in T"
     assert run.monitor.watching_since_ns is not None
     assert run.monitor.watching_since_ns / 60e9 == pytest.approx(200.0, abs=0.2)
 
@@ -38,7 +38,7 @@ def test_a_plant_that_never_rests_is_watched_after_the_third_training() -> None:
     time_min, columns = sound_run(340.0, seed=3)
     columns["T"] += np.repeat(np.tile([-12.0, 6.0, 0.0, 12.0, -6.0], 4), 200)[: time_min.size]
     run = watched(time_min, columns)
-    assert len([note for note in run.monitor.notes if "begins anew" in note]) == 2
+    assert len([note for note in run.monitor.notes if "starts again" in note]) == 2
     assert run.monitor.phase == "watching"
 
 
