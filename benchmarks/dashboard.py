@@ -23,9 +23,11 @@ from plant_node.record import simulate_record
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication, encode
-from reactorwatch.records.record import UNITS
+from reactorwatch.process.library.cstr.model import cstr
 from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import RecordingWriter, read_messages
+
+UNITS = cstr().units
 
 SAMPLES = 1_000_000
 HOUR = 600  # rows

@@ -22,12 +22,15 @@ from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Quality, Sample
-from reactorwatch.records.record import UNITS, to_time_ns
+from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
+
+UNITS = cstr().units
 
 RATE = 100.0  # rows a second
 TRAINING_ROWS, WATCHED_ROWS, EVERY = 400, 2000, 10

@@ -16,8 +16,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from reactorwatch.records.csv_file import read_csv, write_csv
+from reactorwatch.description.find import find_process
+from reactorwatch.description.read import read_process_table
 from reactorwatch.records.record import Record
+from reactorwatch.records.write_table import write_table
 
 ROWS = 1_000_000
 REPETITIONS = 5
@@ -67,8 +69,8 @@ def main() -> None:
     arguments = parser.parse_args()
     with TemporaryDirectory() as folder:
         full, short, german, stamps = (Path(folder) / f"{name}.csv" for name in ("full", "short", "german", "stamps"))
-        write_csv(full, make_record(arguments.rows, None))
-        write_csv(short, make_record(arguments.rows, 4))
+        write_table(full, make_record(arguments.rows, None))
+        write_table(short, make_record(arguments.rows, 4))
         write_german(german, short)
         write_stamps(stamps, make_record(arguments.rows, 4))
         print(f"{arguments.rows} rows of 4 columns, the best of {arguments.repetitions}")
@@ -77,7 +79,7 @@ def main() -> None:
             if peer not in peers:
                 load = partial(np.loadtxt, peer, delimiter=",", skiprows=1)
                 peers[peer] = fastest_s(load, arguments.repetitions)
-            ours = fastest_s(partial(read_csv, path), arguments.repetitions)
+            ours = fastest_s(partial(read_process_table, path, find_process()), arguments.repetitions)
             print(f"{path.stem:8} {ours:7.3f} s  {peers[peer] / ours:5.1f} times numpy.loadtxt of {peer.stem}")
         print(f"goal: {GOAL:g} for full and short")
 

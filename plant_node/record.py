@@ -12,7 +12,7 @@ from plant_node.scenario import FromFile, HeldRecord
 from reactorwatch.process.effect import TIMING
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.csv_file import read_csv
+from reactorwatch.records.read_table import SignalColumn, read_table
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import read_extended_model
 
@@ -34,7 +34,8 @@ def plant_from(config: PlantConfig, model: ProcessModel | None = None, driver: R
     if driver is not None:
         return Plant(config, model, HeldRecord.of(driver))
     if isinstance(scenario, FromFile):
-        return Plant(config, model, HeldRecord.of(read_csv(Path(scenario.path), required=("qc",))))
+        signals = [SignalColumn(name, unit, required=name in model.input_names) for name, unit in model.units.items()]
+        return Plant(config, model, HeldRecord.of(read_table(Path(scenario.path), signals)))
     return Plant(config, model, scenario)
 
 

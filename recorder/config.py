@@ -90,9 +90,13 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         from_min: start, in minutes since the first sample; for a CSV file in its own time.
         to_min: end, in the minutes of `from_min`.
         loop: True to restart at the end.
-        plant: name of the plant on the bus; empty keeps the recorded name (`cstr` for a CSV file).
+        plant: name of the plant on the bus; empty keeps the recorded name (for a table, that of its process).
         everything: True to play estimates, charts, alarms and faults too, not only samples.
         wait_for: names of nodes that must be alive before the first sample is published.
+        process: process whose signals are played, by name or file; None: all signals of a recording, those of the
+            reactor in a table.
+        inputs: columns of a table that are inputs, without a process.
+        outputs: columns of a table that are outputs, without a process.
         columns: names of the columns in a table, by signal, where they differ.
         table: form of a table, where it is not to be guessed.
     """
@@ -105,6 +109,9 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     plant: str = ""
     everything: bool = False
     wait_for: tuple[str, ...] = ()
+    process: str | None = None
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
     columns: dict[str, str] = {}
     table: FileFormat = GUESS
 

@@ -12,8 +12,11 @@ from benchmarks.study_figures.flow_chart import Conclusion, follow
 from benchmarks.study_figures.study import TRAINING_ROWS, Study
 from reactorwatch.arrays import Array
 from reactorwatch.identification.structure import Structure
-from reactorwatch.records.record import UNITS, Record
+from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.records.record import Record
 from reactorwatch.spc.charts.shewhart import Shewhart, probability_out
+
+UNITS = cstr().units
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

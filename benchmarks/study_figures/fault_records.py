@@ -12,7 +12,9 @@ from monitor_node.alarms.on_off_delay import OnOffDelay
 from monitor_node.config import MonitorConfig
 from plant_node.presets import ONSET_MIN, PRESETS
 from reactorwatch.arrays import Array
-from reactorwatch.records.record import UNITS
+from reactorwatch.process.library.cstr.model import cstr
+
+UNITS = cstr().units
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

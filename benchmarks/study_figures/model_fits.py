@@ -10,7 +10,9 @@ from benchmarks.study_figures.canvas import BLACK, BY_ORDER, label, legend_below
 from benchmarks.study_figures.figure import Finding, verdict
 from benchmarks.study_figures.study import NAMES, ORDERS, OUTPUTS, Study, holdout_half
 from reactorwatch.identification.linear_model import fit_percent
-from reactorwatch.records.record import UNITS
+from reactorwatch.process.library.cstr.model import cstr
+
+UNITS = cstr().units
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

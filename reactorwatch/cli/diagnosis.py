@@ -19,10 +19,10 @@ from reactorwatch.diagnosis.result import Diagnosis, Experiment
 from reactorwatch.process import effects_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.csv_file import write_csv
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.folder import fill_folder
 from reactorwatch.records.record import Record
+from reactorwatch.records.write_table import write_table
 from reactorwatch.runtime.model_file import write_extended_model
 
 PAGE, OBJECT, MODEL, DRAWING = "report.html", "report.json", "extended.json", "report.rrd"
@@ -150,4 +150,4 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
 def _write_experiment(experiment: Experiment, path: Path) -> None:
     """Write the level from each change on, and at the end."""
     time_min, level = np.array([*experiment.input, (experiment.span_min, experiment.input[-1][1])]).T
-    write_csv(path, Record(time_min, {experiment.signal: level}, path.name))
+    write_table(path, Record(time_min, {experiment.signal: level}, path.name))

@@ -6,7 +6,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Force, Plant, check_input, check_output, check_recording, parse_columns
+from reactorwatch.cli.options import (
+    Columns,
+    Force,
+    Inputs,
+    Outputs,
+    Plant,
+    Process,
+    check_input,
+    check_output,
+    check_recording,
+    choose_process,
+    parse_columns,
+)
 from reactorwatch.cli.printing import print_lines, print_text
 from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
@@ -24,7 +36,7 @@ def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("dashboard")(take_table_options(dashboard))
     app.command("import")(take_table_options(import_csv))
-    app.command("export")(export_csv)
+    app.command("export")(take_table_options(export_csv))
 
 
 def dashboard(
@@ -33,6 +45,9 @@ def dashboard(
     ],
     out: Out,
     plant: Plant = None,
+    process: Process = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
     diagnosis: Annotated[
         Path | None,
         typer.Option(help="The report of a diagnosis of it (a folder), drawn into a tab.", show_default=False),
@@ -51,15 +66,16 @@ def dashboard(
     from recorder.dashboard.file import write_rrd
     from recorder.dashboard.picture import picture_names, render_tabs
 
+    choice = choose_process(process, inputs, outputs)
     drawn = diagnosis / DRAWING if diagnosis is not None else None
-    out = check_output(out, ".rrd", (file, drawn), force=force)
+    out = check_output(out, ".rrd", (file, drawn, choice.file), force=force)
     if drawn is not None and not drawn.is_file():
         raise InputError(f"--diagnosis {diagnosis}: holds no {DRAWING}; it must be the folder that diagnose -o wrote")
     if png is not None:
-        check_output_folder(png, picture_names(), (file,), option="--png", force=force)
+        check_output_folder(png, picture_names(), (file, choice.file), option="--png", force=force)
     with task(f"drawing {file.name}"):
-        recording = open_messages(check_recording(file), plant, stated=stated)
-        run = read_segments(recording.messages, given_zero_ns=recording.zero_ns)
+        recording = open_messages(check_recording(file), plant, stated=stated, choice=choice)
+        run = read_segments(recording.messages, given_zero_ns=recording.zero_ns, process=recording.process)
         write_rrd(_check_samples(run, file), out, diagnosis=drawn)
     print_lines(f"wrote {out}", *([f"note: read as: {recording.read_as}"] if recording.read_as else []))
     if png is not None:
@@ -92,6 +108,9 @@ def import_csv(
     ],
     out: Out,
     plant: Plant = None,
+    process: Process = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
     column: Columns = None,
     force: Force = False,
     stated: FileFormat = GUESS,
@@ -100,27 +119,36 @@ def import_csv(
     from reactorwatch.cli.progress import task
     from recorder.tools.convert import import_csv as convert
 
-    out = check_output(out, ".mcap", files, force=force)
+    choice = choose_process(process, inputs, outputs)
+    out = check_output(out, ".mcap", (*files, choice.file), force=force)
     with task(f"importing {files[0].name}"):
-        record = convert(list(map(check_input, files)), out, plant or "cstr", parse_columns(column), stated=stated)
+        sources = list(map(check_input, files))
+        record = convert(sources, out, plant, parse_columns(column), stated=stated, choice=choice)
     print_text(_report_text(out, record))
 
 
 def export_csv(
-    file: Annotated[Path, typer.Argument(help="A recording (.mcap), or a folder of them.", show_default=False)],
+    file: Annotated[
+        Path, typer.Argument(help="A recording (.mcap), a folder of them, or a record (.csv).", show_default=False)
+    ],
     out: Out,
     plant: Plant = None,
+    process: Process = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
     clock: Annotated[bool, typer.Option("--clock", help="Add a column with the clock time, ISO 8601 in UTC.")] = False,
     force: Force = False,
+    stated: FileFormat = GUESS,
 ) -> None:
-    """Turn a recording (.mcap) into a record (.csv, .csv.gz, .xlsx or .parquet)."""
+    """Turn a recording (.mcap) into a record (.csv, .csv.gz, .xlsx or .parquet), with all its signals."""
     from reactorwatch.cli.progress import task
     from reactorwatch.records.write_table import WRITTEN_SUFFIXES
     from recorder.tools.convert import export_csv as convert
 
-    out = check_output(out, WRITTEN_SUFFIXES, (file,), force=force)
+    choice = choose_process(process, inputs, outputs)
+    out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
     with task(f"exporting {file.name}"):
-        record = convert(check_recording(file), out, plant, clock=clock)
+        record = convert(check_recording(file), out, plant, clock=clock, stated=stated, choice=choice)
     print_text(_report_text(out, record))
 
 

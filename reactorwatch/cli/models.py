@@ -8,10 +8,10 @@ import typer
 from reactorwatch.cli.options import (
     Columns,
     Force,
+    Inputs,
     Json,
     Plant,
     Processes,
-    ProcessInputs,
     Scheduler,
     check_recording,
     parse_columns,
@@ -38,7 +38,7 @@ def identify(
             help="A process: a name in the catalogue, or a .toml, .py or extended.json file [cstr].", show_default=False
         ),
     ] = None,
-    inputs: ProcessInputs = None,
+    inputs: Inputs = None,
     output: Annotated[
         list[str] | None,
         typer.Option(

@@ -12,12 +12,16 @@ from reactorwatch.cli.options import (
     Columns,
     Diagnose,
     Endpoint,
+    Inputs,
     Json,
     Model,
+    Outputs,
     Plant,
+    Process,
     Settings,
     check_input,
     check_recording,
+    choose_process,
     parse_columns,
     parse_pace,
     parse_span_ns,
@@ -206,6 +210,9 @@ def replay(
         str | None, typer.Option("--to", help="Since the start, such as 20min [the end].", show_default=False)
     ] = None,
     loop: Annotated[bool | None, typer.Option("--loop", help="Restart at the end.", show_default=False)] = None,
+    process: Process = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
     column: Columns = None,
     verify: Annotated[
         bool,
@@ -225,7 +232,7 @@ def replay(
     if verify:
         from reactorwatch.cli.verification import run
 
-        given = {"--rate": rate, "--from": begin, "--to": end, "--loop": loop, "--column": column}
+        given = {"--rate": rate, "--from": begin, "--to": end, "--loop": loop, "--column": column, "--process": process}
         for option, value in given.items():
             if value:
                 raise InputError(f"--verify publishes nothing and takes the whole recording; leave out {option}")
@@ -237,6 +244,7 @@ def replay(
 
     if column and not is_table(file):
         raise InputError(f"--column is for the columns of a .csv file or another table, got {file}")
+    choice = choose_process(process, inputs, outputs)
     tables, bus = _settings(config, endpoint)
     flags = {
         "file": str(check_recording(file)),
@@ -245,6 +253,9 @@ def replay(
         "from_min": parse_span_ns(begin, "--from") / MINUTE_NS if begin is not None else None,
         "to_min": parse_span_ns(end, "--to") / MINUTE_NS if end is not None else None,
         "loop": loop,
+        "process": choice.process,
+        "inputs": choice.inputs or None,
+        "outputs": choice.outputs or None,
         "columns": parse_columns(column) or None,
         "table": {name: value for name, value in asdict(stated).items() if value not in (None, ())} or None,
     }

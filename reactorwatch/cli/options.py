@@ -4,12 +4,15 @@ import re
 from collections.abc import Iterable
 from math import inf
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.output import check_output_file
+
+if TYPE_CHECKING:
+    from reactorwatch.description.choice import ProcessChoice
 
 Settings = Annotated[
     Path | None, typer.Option("--config", help="Settings file (TOML), a table for each node.", show_default=False)
@@ -39,10 +42,16 @@ Process = Annotated[
         show_default=False,
     ),
 ]
-ProcessInputs = Annotated[
+Inputs = Annotated[
     list[str] | None,
     typer.Option(
-        "--input", help="A column that is an input of a process without a file (repeatable).", show_default=False
+        "--input", help="A column that is an input, without a process (repeatable, or with commas).", show_default=False
+    ),
+]
+Outputs = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--output", help="A column to watch, without a process (repeatable, or with commas).", show_default=False
     ),
 ]
 Force = Annotated[
@@ -86,6 +95,18 @@ def check_encodable(text: str) -> str:
     except UnicodeEncodeError as error:
         raise typer.BadParameter(f"must be UTF-8, got {text!r}") from error
     return text
+
+
+def choose_process(process: str | None, inputs: list[str] | None, outputs: list[str] | None) -> "ProcessChoice":
+    """Choice of a process by `--process`, or by `--input` and `--output`.
+
+    Raises:
+        InputError: as `ProcessChoice`.
+    """
+    from reactorwatch.description.choice import ProcessChoice
+
+    named = [tuple(name.strip() for text in texts or () for name in text.split(",")) for texts in (inputs, outputs)]
+    return ProcessChoice(process, *named)
 
 
 def parse_columns(pairs: list[str] | None) -> dict[str, str]:

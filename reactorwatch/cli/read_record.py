@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.keys import check_plant
+from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.input_file import list_files
 from reactorwatch.records.record import Record, format_utc
+from reactorwatch.records.source_text import TABLE_SUFFIXES, is_table
 
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process
-from reactorwatch.records.source_text import TABLE_SUFFIXES, is_table
 
 DEFAULT_PLANT = "cstr"
 
@@ -43,14 +44,14 @@ def record(
         InputError: the file is neither a table nor an .mcap, or is malformed.
     """
     from reactorwatch.description.find import find_process
+    from reactorwatch.description.read import convert_to_process, read_process_table
 
     described = process or find_process()
     if file_kind(path) == "mcap":
         from recorder.tools.mcap_file import read_record
 
-        return read_record(path, plant, (*described.inputs, *described.outputs))
-    from reactorwatch.description.read import read_process_table
-
+        recorded = read_record(path, plant, described)
+        return recorded if process is None else convert_to_process(recorded, process)
     return read_process_table(path, described, columns, stated)
 
 
@@ -62,12 +63,14 @@ class MessageSource(NamedTuple):
         zero_ns: time from which the file's minutes are counted; None: that of the first sample.
         has_clock: True if the times of the messages are clock times.
         read_as: guesses about the form of a table; empty: none.
+        process: process of the messages' plant; None: unknown.
     """
 
     messages: Iterator[Encoded]
     zero_ns: int | None
     has_clock: bool
     read_as: str = ""
+    process: "Process | None" = None
 
     def zero(self, first_ns: int) -> str | None:
         """Time from which the minutes are counted, as ISO 8601; None: unknown.
@@ -84,6 +87,7 @@ def open_messages(
     columns: dict[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     stated: FileFormat = GUESS,
+    choice: ProcessChoice = DEFAULT_CHOICE,
 ) -> MessageSource:
     """Open a file as messages.
 
@@ -93,26 +97,37 @@ def open_messages(
         columns: names of a table's columns, by signal.
         units: units of the signals; None: those of the columns.
         stated: statements about the form of a table.
+        choice: process of the plant; the default: as recorded, and of a table the reactor.
 
     Raises:
         InputError: as `record`.
     """
     if file_kind(path) == "table":
-        from reactorwatch.description.find import find_process
+        from reactorwatch.description.read import read_signals
         from recorder.tools.player import samples_of
 
         # any rig may be watched without equations under the reactor's names, in units of its own
-        measured = record(path, plant, columns, find_process().without_equations(), stated)
+        measured = read_signals(path, choice, columns, stated)
         if units is not None:
             measured = replace(measured, units=units)
         publications = samples_of(measured, plant or DEFAULT_PLANT, measured.stored_zero_ns)
         encoded = (encode(item) for item in publications)
-        return MessageSource(encoded, measured.stored_zero_ns, bool(measured.zero_ns), measured.read_as)
-    from recorder.tools.mcap_file import ZERO_NS, has_clock, read_messages, read_metadata, zero_from
+        zero_ns, has_clock_time = measured.stored_zero_ns, bool(measured.zero_ns)
+        return MessageSource(encoded, zero_ns, has_clock_time, measured.read_as, choice.load())
+    from recorder.tools.mcap_file import (
+        ZERO_NS,
+        has_clock,
+        read_messages,
+        read_metadata,
+        recorded_process,
+        zero_from,
+    )
 
     read = (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
     metadata = read_metadata(path)
-    return MessageSource(read, zero_from(metadata, 0) if ZERO_NS in metadata else None, has_clock(metadata))
+    given_ns = zero_from(metadata, 0) if ZERO_NS in metadata else None
+    process = recorded_process(path, plant) if choice.is_default else choice.load()
+    return MessageSource(read, given_ns, has_clock(metadata), process=process)
 
 
 def messages(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Iterator[Encoded]:

@@ -1,9 +1,11 @@
 """Output of `recover` and `info`: a JSON object, or lines for people."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from reactorwatch.contract.alarm_text import format_moment, priority_word
+from reactorwatch.description.process import ROLES, Process
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.terminal import printable_lines
 from recorder.storage.recover import RecoveryResult
@@ -103,6 +105,16 @@ def info_object(seen: FileInfo, file: Path) -> dict[str, Any]:
             for alarm in overview.alarms
         ],
         "metadata": seen.metadata,
+        "processes": [
+            {
+                "plant": plant,
+                "process": process.name,
+                "signals": {
+                    signal.name: {"role": signal.role, "unit": signal.unit or None} for signal in process.signals
+                },
+            }
+            for plant, process in sorted(seen.processes.items())
+        ],
     }
 
 
@@ -128,6 +140,10 @@ def info_text(seen: FileInfo, file: Path) -> str:
         f"{name} {seen.metadata[name]}" for name in ("plant", "version", "seed", "started") if name in seen.metadata
     ]
     lines += [", ".join(facts)] if facts else []
+    lines += [
+        f"{plant} is a process {process.name!r}: {'; '.join(_describe_roles(process))}"
+        for plant, process in sorted(seen.processes.items())
+    ]
     lines += [
         f"  {topic['messages']:9d}  {topic['rate_per_s'] or 0.0:9.3g}/s  {topic['topic']}" for topic in report["topics"]
     ]
@@ -161,3 +177,13 @@ def info_text(seen: FileInfo, file: Path) -> str:
     if seen.damages:
         lines.append(f"not whole: {'; '.join(seen.damages)}; `reactorwatch recover {file}` saves the rest")
     return printable_lines(lines)
+
+
+def _describe_roles(process: Process) -> Iterator[str]:
+    """Signals of each role: `inputs Q1, Q2 (cm3/s)`."""
+    for role in ROLES:
+        signals = [signal for signal in process.signals if signal.role == role]
+        by_unit = {signal.unit: [item.name for item in signals if item.unit == signal.unit] for signal in signals}
+        groups = [f"{', '.join(names)}{f' ({unit})' if unit else ''}" for unit, names in by_unit.items()]
+        if groups:
+            yield f"{role}{'s' if len(signals) > 1 else ''} {', '.join(groups)}"

@@ -1,11 +1,23 @@
 """Commands for recordings: `recover`, `info`, `cut` and `merge`."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Force, Json, check_input, check_output, check_recording, parse_span_ns
+from reactorwatch.cli.options import (
+    Force,
+    Inputs,
+    Json,
+    Outputs,
+    Process,
+    check_input,
+    check_output,
+    check_recording,
+    choose_process,
+    parse_span_ns,
+)
 from reactorwatch.cli.printing import print_lines, print_text
 from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
@@ -49,6 +61,9 @@ def info(
     file: Annotated[
         Path, typer.Argument(help="A recording (.mcap), a folder of them, or a table.", show_default=False)
     ],
+    process: Process = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
     as_json: Json = False,
     stated: FileFormat = GUESS,
 ) -> None:
@@ -58,16 +73,20 @@ def info(
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.recording_reports import info_object, info_text
     from reactorwatch.cli.table_report import table_object, table_text
+    from reactorwatch.description.read import read_signals
     from reactorwatch.records.read_table import read_table
     from reactorwatch.records.source_text import is_table
     from recorder.tools.inspect import inspect
 
+    choice = choose_process(process, inputs, outputs)
     with task(f"reading {file.name}"):
         if is_table(check_recording(file)) and not file.is_dir():
-            record = read_table(file, None, stated)
+            record = read_table(file, None, stated) if choice.is_default else read_signals(file, choice, None, stated)
             text = msgspec.json.encode(table_object(record, file)).decode() if as_json else table_text(record, file)
         else:
             seen = inspect(file)
+            if not choice.is_default:
+                seen = replace(seen, processes=dict.fromkeys(seen.overview.runs, choice.load()))
             text = msgspec.json.encode(info_object(seen, file)).decode() if as_json else info_text(seen, file)
     print_text(text)
 

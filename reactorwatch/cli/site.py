@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Settings
+from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Process, Settings, choose_process
 from reactorwatch.cli.printing import print_lines
 
 
@@ -154,6 +154,7 @@ def status(
     name: Annotated[
         str | None, typer.Option("--plant", help="Which plant [all that may be read].", show_default=False)
     ] = None,
+    process: Process = None,
     once: Annotated[bool, typer.Option("--once", help="Show it once.")] = False,
     seconds: Annotated[
         float, typer.Option(help="How long to listen before showing it once.", min=0.1, max=MAX_WAIT_S)
@@ -164,6 +165,8 @@ def status(
     from reactorwatch.cli.observer import load_recorder_settings
     from reactorwatch.cli.status import run
 
+    described = choose_process(process, None, None).load() if process is not None else None
     bus, recorder = load_recorder_settings(config, endpoint, name)
     # a certificate is for one plant, and messages of others are not received
-    run(bus, recorder.plant if name is not None or bus.ca is not None else None, seconds, once=once, as_json=as_json)
+    plant = recorder.plant if name is not None or bus.ca is not None else None
+    run(bus, plant, seconds, described, once=once, as_json=as_json)

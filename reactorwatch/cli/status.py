@@ -4,6 +4,7 @@ import contextlib
 import threading
 import time
 from collections import Counter
+from math import isnan
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -18,9 +19,12 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import stop_on_signals
 from reactorwatch.terminal import printable_lines
+from recorder.columns.measurement import measured_value
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+    from reactorwatch.description.process import Process
 
 SECOND_NS = 1_000_000_000
 WINDOW_S = 10
@@ -36,10 +40,13 @@ class StatusBoard:
 
     Args:
         start_ns: time of the subscription.
+        process: process of the plants, all of whose signals are shown; None: unknown.
     """
 
-    def __init__(self, start_ns: int) -> None:
+    def __init__(self, start_ns: int, process: "Process | None" = None) -> None:
         self._start_ns = start_ns
+        self._process = process
+        self._newest: dict[str, dict[str, Sample]] = {}  # by plant and signal
         self._alive: set[tuple[str, str]] = set()
         self._health: dict[tuple[str, str], Health] = {}
         self._alarms: dict[tuple[str, str], Alarm] = {}
@@ -68,6 +75,7 @@ class StatusBoard:
             elif isinstance(body, Alarm):
                 self._alarms[topic.plant, body.alarm] = body
             elif isinstance(body, Sample):
+                self._newest.setdefault(topic.plant, {})[topic.name] = body
                 seconds = self._samples.setdefault(topic.plant, Counter())
                 second = message.received_ns // SECOND_NS
                 seconds[second] += 1
@@ -99,9 +107,24 @@ class StatusBoard:
             return {
                 "plant": name,
                 "samples_per_s": samples / span_s if span_s > 0 else None,
+                "signals": self._signals(name),
                 "nodes": [self._node(name, node, now_ns) for node in sorted(nodes)],
                 "alarms": [_alarm(alarm) for alarm in sorted(alarms, key=_rank) if _is_visible(alarm)],
             }
+
+    def _signals(self, plant: str) -> dict[str, dict[str, Any]]:
+        """Newest value of each signal; null where none was received or measured."""
+        newest = self._newest.get(plant, {})
+        described = {} if self._process is None else {signal.name: signal for signal in self._process.signals}
+        signals: dict[str, dict[str, Any]] = {}
+        for name in dict.fromkeys((*described, *sorted(newest))):
+            sample, signal = newest.get(name), described.get(name)
+            value = None if sample is None else measured_value(sample)
+            unit = (sample.unit if sample is not None else "") or (signal.unit if signal is not None else "")
+            signals[name] = {"value": None if value is None or isnan(value) else value, "unit": unit or None}
+            if signal is not None:
+                signals[name]["role"] = signal.role
+        return signals
 
     def _node(self, plant: str, node: str, now_ns: int) -> dict[str, Any]:
         state: dict[str, Any] = {"node": node, "alive": (plant, node) in self._alive}
@@ -118,13 +141,22 @@ class StatusBoard:
         return state
 
 
-def run(config: BusConfig, plant: str | None, listen_s: float, *, once: bool, as_json: bool) -> None:
+def run(
+    config: BusConfig,
+    plant: str | None,
+    listen_s: float,
+    process: "Process | None" = None,
+    *,
+    once: bool,
+    as_json: bool,
+) -> None:
     """Show the status, once or until SIGINT or SIGTERM.
 
     Args:
         config: connection to the bus.
         plant: name of the plant; None: all plants.
         listen_s: seconds before the status is shown once.
+        process: process of the plants; None: unknown.
         once: show it once.
         as_json: show it once, as one JSON object.
 
@@ -139,7 +171,7 @@ def run(config: BusConfig, plant: str | None, listen_s: float, *, once: bool, as
         try:
             stopped = threading.Event()
             stop.call_on_set(stopped.set)
-            board = _subscribe(bus, plant or "*")
+            board = _subscribe(bus, plant or "*", process)
             if once or as_json:
                 stopped.wait(listen_s)
                 _query_alarms(bus, board)
@@ -150,8 +182,8 @@ def run(config: BusConfig, plant: str | None, listen_s: float, *, once: bool, as
             bus.close()
 
 
-def _subscribe(bus: ZenohBus, plant: str) -> StatusBoard:
-    board = StatusBoard(time.time_ns())
+def _subscribe(bus: ZenohBus, plant: str, process: "Process | None") -> StatusBoard:
+    board = StatusBoard(time.time_ns(), process)
     bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), board.on_token)
     bus.subscribe(keys.all_keys(plant, keys.HEALTH), board.on_message, history_s=HISTORY_S)
     for kind in (keys.SAMPLE, keys.ALARM):
@@ -207,6 +239,8 @@ def _table(board: StatusBoard, now_ns: int) -> "Table":
         rate = plant["samples_per_s"]
         alarms = printable_lines(f"{item['alarm']} ({item['priority']}): {item['state']}" for item in plant["alarms"])
         rates = "" if rate is None else f"{rate:.3g}"
+        missing = [item for item, signal in plant["signals"].items() if signal["value"] is None]
+        rates += f"\nno {', '.join(missing)}" if missing else ""
         for number, node in enumerate(plant["nodes"] or [{"node": "", "alive": True}]):
             first = number == 0
             cells = (

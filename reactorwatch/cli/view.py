@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Endpoint, Plant, Settings
+from reactorwatch.cli.options import Endpoint, Plant, Process, Settings, choose_process
 from reactorwatch.cli.printing import print_lines
 
 LOOPBACK = "127.0.0.1"
@@ -19,6 +19,7 @@ def view(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
+    process: Process = None,
     web: Annotated[bool, typer.Option("--web", help="In the browser, at the address that is printed.")] = False,
     bind: Annotated[str, typer.Option(help="The address that the viewer listens on.")] = LOOPBACK,
     port: Annotated[
@@ -40,5 +41,8 @@ def view(
     from reactorwatch.cli.observer import load_recorder_settings
     from recorder.dashboard.live import DisplayTarget, show
 
+    described = choose_process(process, None, None).load() if process is not None else None
+    if described is not None and config is None:
+        name = name or described.name
     bus, recorder = load_recorder_settings(config, endpoint, name, logging.INFO)
-    show(recorder.plant, bus, DisplayTarget(web=web, bind=bind, port=port), print_lines)
+    show(recorder.plant, bus, DisplayTarget(web=web, bind=bind, port=port), print_lines, described)

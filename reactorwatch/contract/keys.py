@@ -38,6 +38,8 @@ matches it."""
 
 _PLANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
+_SIGNAL = re.compile(r"[^@*$#?/\0][^*$#?/\0]*")
+
 _PART = re.compile(r"\*\*?|(\$\*)?[^/*$#?\0]+(\$\*[^/*$#?\0]+)*(\$\*)?")
 
 
@@ -61,6 +63,19 @@ def check_plant(plant: str) -> str:
             f"got {plant!r}"
         )
     return plant
+
+
+def check_signal(signal: str) -> str:
+    """Check that samples of a signal can be published under its name; returns it.
+
+    Raises:
+        ValueError: it holds characters with a meaning in key expressions.
+    """
+    if not all(map(_SIGNAL.fullmatch, signal.split("/"))):
+        raise ValueError(
+            f"name of a published signal must not hold '*', '$', '#' or '?' or start with '@', got {signal!r}"
+        )
+    return signal
 
 
 def check_expression(expression: str) -> str:

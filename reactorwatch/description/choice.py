@@ -39,6 +39,11 @@ class ProcessChoice:
             raise InputError(f"--input needs an --output, got only the input {', '.join(self.inputs)}")
 
     @property
+    def is_default(self) -> bool:
+        """True if neither a process nor columns are named."""
+        return self.process is None and not self.outputs
+
+    @property
     def file(self) -> Path | None:
         """File that describes the process; None: it is named otherwise."""
         path = None if self.process is None else Path(self.process)
@@ -74,3 +79,7 @@ class ProcessChoice:
         """
         process = self.load(zero_ns)
         return process.require_model()
+
+
+DEFAULT_CHOICE = ProcessChoice()
+"""No process and no columns are named: the reactor."""

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.read_table import SignalColumn, read_table
+from reactorwatch.records.read_table import MissingColumnError, SignalColumn, read_table
 from reactorwatch.records.record import Record
 from reactorwatch.records.time_column import STANDARD
 from reactorwatch.units import conversion
@@ -57,6 +58,45 @@ def read_process_table(
     return _to_model_units(_drop_impossible(read_table(path, signals, stated), process), process)
 
 
+def read_signals(
+    path: Path, choice: ProcessChoice, columns: Mapping[str, str] | None = None, stated: FileFormat = GUESS
+) -> Record:
+    """Read the signals of a chosen process from a table, in the units of the signals, for use without equations.
+
+    Args:
+        path: see `read_process_table`.
+        choice: the process.
+        columns: see `read_process_table`.
+        stated: see `read_process_table`.
+
+    Raises:
+        InputError: as `read_process_table`; where no process is chosen and the reactor's columns are missing, with the
+            cure.
+    """
+    try:
+        return read_process_table(path, choice.load().without_equations(), columns, stated)
+    except MissingColumnError as error:
+        if not choice.is_default:
+            raise
+        cure = "name its process with --process, or its columns with --input and --output"
+        raise InputError(f"{error}; if it is no record of the reactor, {cure}") from error
+
+
+def convert_to_process(record: Record, process: Process) -> Record:
+    """Convert recorded signals to the units of a process, without values outside their bounds.
+
+    Args:
+        record: samples in the units that they were published in; one without a unit is in that of its signal.
+        process: decides the units: those of the equations, else those of the signals.
+
+    Raises:
+        InputError: a unit is one of another quantity.
+    """
+    known = {name: unit for name, unit in process.units.items() if name in record.columns}
+    described = replace(record, units={**known, **record.units})
+    return _to_model_units(_drop_impossible(_convert(described, known), process), process)
+
+
 def _drop_impossible(record: Record, process: Process) -> Record:
     """Replace values outside the bounds of their signals by NaN."""
     columns, notes = dict(record.columns), [record.read_as] if record.read_as else []
@@ -74,10 +114,15 @@ def _drop_impossible(record: Record, process: Process) -> Record:
 
 def _to_model_units(record: Record, process: Process) -> Record:
     """Convert signals of the equations to their units there."""
+    return record if process.model is None else _convert(record, process.model.units)
+
+
+def _convert(record: Record, wanted_units: Mapping[str, str]) -> Record:
+    """Convert signals to units, by name of the signal."""
     columns, units = dict(record.columns), dict(record.units)
-    for name, wanted in ({} if process.model is None else process.model.units).items():
+    for name, wanted in wanted_units.items():
         unit = units.get(name, wanted)
-        if unit == wanted:
+        if unit == wanted or name not in columns:
             continue
         scale, offset = conversion(unit, wanted, f"{record.name}, signal {name!r}")
         columns[name], units[name] = scale * columns[name] + offset, wanted

@@ -23,6 +23,10 @@ from reactorwatch.records.write_table import RUN
 from reactorwatch.units import UnknownUnitError, conversion
 
 
+class MissingColumnError(InputError):
+    """A table has no column, or no rows, of a required signal."""
+
+
 @dataclass(frozen=True)
 class SignalColumn:
     """Signal of a process, and the column that holds it.
@@ -119,7 +123,7 @@ def _check_required(layout: Layout, signals: Sequence[SignalColumn], mapped: dic
             asked = repr(signal.column or signal.name)
             named = f" (for {signal.name})" if signal.column and signal.column != signal.name else ""
             found = ", ".join(map(repr, layout.names))
-            raise InputError(
+            raise MissingColumnError(
                 f"{layout.path}, row {layout.header_row or layout.first_row}: expected a column {asked} in the header"
                 f"{named}, got {found}; --column {signal.name}=NAME names another"
             )
@@ -248,7 +252,7 @@ def _read_long(
         if tag is None:
             if signal.required:
                 found = ", ".join(map(repr, series))
-                raise InputError(
+                raise MissingColumnError(
                     f"{layout.path}: expected rows of the tag {signal.column or signal.name!r}, got {found}"
                 )
             continue

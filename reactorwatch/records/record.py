@@ -33,9 +33,6 @@ GAP_ROWS = 20
 MAX_SPANS = 5
 """Runs whose times are named in messages."""
 
-UNITS = {"qc": "l/min", "C": "mol/l", "T": "K"}
-"""Units of the signals of the reactor, the default process."""
-
 
 def to_time_ns(minutes: float, zero_ns: int = 0) -> int:
     """Convert minutes to nanoseconds, to the nearest microsecond, so that decimal minutes convert back exactly."""

@@ -15,8 +15,8 @@ from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN, MINUTE_NS, Record
 from reactorwatch.records.source_text import PARQUET_SUFFIXES, import_openpyxl
 
-RUN, CLOCK = "run", "time"
-"""Columns with the run of each row, if a record has several, and with its clock time, if it is asked for."""
+TIME, RUN, CLOCK = "time_min", "run", "time"
+"""Columns beside the signals: minutes, the run of each row if there are several, and clock time if it is asked for."""
 
 WRITTEN_SUFFIXES = (".csv", ".gz", ".xlsx", ".parquet")
 MAX_SHEET_ROWS = 1_048_576
@@ -32,7 +32,7 @@ def write_table(path: Path, record: Record, *, clock: bool = False) -> None:
 
     Raises:
         InputError: the folder does not exist or cannot be written to, the record has no clock time to be added, a
-            library is not installed, or a workbook cannot hold so many rows.
+            signal has the name of another column, a library is not installed, or a workbook cannot hold so many rows.
         ValueError: a time or a value that `read_table` refuses, such as an infinite one.
     """
     suffix = path.suffix.lower()
@@ -48,7 +48,14 @@ def _columns(record: Record, clock: bool) -> dict[str, list[Any]]:
     """Cells by header; None where nothing was measured."""
     if not (np.abs(record.time_min) <= LONGEST_MIN).all():
         raise ValueError(f"times must be within {LONGEST_MIN:.3g} min of their zero to be read again")
-    columns: dict[str, list[Any]] = {"time_min": record.time_min.tolist()}
+    own = [TIME, *([RUN] if record.runs is not None else []), *([CLOCK] if clock else [])]
+    for name in own:
+        if name in record.columns:
+            raise InputError(
+                f"{record.name}: signal {name!r} has the name of a column that is written beside the signals "
+                f"({', '.join(own)}); give it another name, with column = {name!r} in the description of its process"
+            )
+    columns: dict[str, list[Any]] = {TIME: record.time_min.tolist()}
     for signal, values in record.columns.items():
         if (np.abs(values) >= LARGEST_VALUE).any():
             raise ValueError(

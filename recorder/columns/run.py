@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.description.process import Process
 
 Times = NDArray[np.int64]
 Values = NDArray[np.float64]
@@ -166,6 +167,7 @@ class RunColumns:
         statistics: statistics of each signal up to the end of the segment.
         context: data of earlier segments.
         given_zero_ns: time that minutes count from; None for the first sample.
+        process: process of the plant, with the roles of its signals; None: unknown.
     """
 
     plant: str
@@ -181,6 +183,7 @@ class RunColumns:
     statistics: dict[str, SignalStatistics] = field(default_factory=dict)
     context: SegmentContext = SegmentContext()
     given_zero_ns: int | None = None
+    process: Process | None = None
 
     @property
     def span_ns(self) -> tuple[int, int]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
+from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from recorder.columns.measurement import measured_value
 from recorder.columns.run import (
@@ -68,6 +69,7 @@ def read_segments(
     recording: Iterable[RecordedMessage | Encoded],
     segment_messages: int = SEGMENT_MESSAGES,
     given_zero_ns: int | None = None,
+    process: Process | None = None,
 ) -> Iterator[RunColumns]:
     """Segments of the run of a recording, at least one.
 
@@ -75,11 +77,12 @@ def read_segments(
         recording: messages as in `read_run`, of any number.
         segment_messages: number of messages in a segment.
         given_zero_ns: see `RunColumns`.
+        process: see `RunColumns`.
 
     Raises:
         InputError: see `read_run`.
     """
-    reader, taken = RunReader(given_zero_ns), 0
+    reader, taken = RunReader(given_zero_ns, process), 0
     for entry in recording:
         reader.add(entry)
         taken += 1
@@ -94,10 +97,11 @@ class RunReader:
 
     Args:
         given_zero_ns: see `RunColumns`.
+        process: see `RunColumns`.
     """
 
-    def __init__(self, given_zero_ns: int | None = None) -> None:
-        self._given_zero_ns = given_zero_ns
+    def __init__(self, given_zero_ns: int | None = None, process: Process | None = None) -> None:
+        self._given_zero_ns, self._process = given_zero_ns, process
         self._plant = ""
         self._columns: dict[str, _KeyColumns | None] = {}
         self._alarms: list[AlarmChange] = []
@@ -188,6 +192,7 @@ class RunReader:
             statistics=dict(self._statistics),
             context=self._context,
             given_zero_ns=self._given_zero_ns,
+            process=self._process,
         )
         self._context = _next_context(run)
         for item in found:

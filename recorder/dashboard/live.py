@@ -23,6 +23,7 @@ import rerun as rr
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode, encoding_of
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
+from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
@@ -64,7 +65,13 @@ class DisplayTarget(NamedTuple):
     port: int | None
 
 
-def show(plant: str, bus_config: BusConfig, target: DisplayTarget, say: Callable[[str], None]) -> None:
+def show(
+    plant: str,
+    bus_config: BusConfig,
+    target: DisplayTarget,
+    say: Callable[[str], None],
+    process: Process | None = None,
+) -> None:
     """Show a plant until the viewer is closed, or SIGINT (Ctrl-C) or SIGTERM comes.
 
     Args:
@@ -72,6 +79,7 @@ def show(plant: str, bus_config: BusConfig, target: DisplayTarget, say: Callable
         bus_config: settings of the bus.
         target: window or web page.
         say: called with the address of the web page.
+        process: process of the plant; None: unknown.
 
     Raises:
         InputError: the viewer does not run on this machine, its address or port is unavailable, or the endpoint is
@@ -85,23 +93,24 @@ def show(plant: str, bus_config: BusConfig, target: DisplayTarget, say: Callable
     arguments = ("--serve-web", "--web-viewer-port", str(page), *_origins(target, page)) if target.web else ()
     with tempfile.TemporaryDirectory() as folder, stop_on_signals() as stop:
         log = Path(folder) / "viewer.log"
-        with viewer(*arguments, port=data, bind=target.bind, log=log) as process:
-            _wait_for(process, data, target, log)
+        with viewer(*arguments, port=data, bind=target.bind, log=log) as child:
+            _wait_for(child, data, target, log)
             if target.web:
-                _wait_for(process, page, target, log)  # it is served some time after the data
+                _wait_for(child, page, target, log)  # it is served some time after the data
                 host = _in_url(_reachable_address(target.bind))
                 say(f"open http://{host}:{page}/?url=rerun%2Bhttp://{host}:{data}/proxy")
-            threading.Thread(target=_stop_with, args=(process, stop), name="viewer", daemon=True).start()
+            threading.Thread(target=_stop_with, args=(child, stop), name="viewer", daemon=True).start()
             bus = bus_zenoh.connect(bus_config, NODE, stop)
             if bus is None:
-                if process.poll() not in CLEAN_EXIT_CODES:
-                    raise _exit_error(process.returncode, target, log)
+                if child.poll() not in CLEAN_EXIT_CODES:
+                    raise _exit_error(child.returncode, target, log)
                 return
             try:
                 recording = stream_to(data, target.bind, f"{plant}-{time.time_ns()}")
                 past = query_history(bus, plant)
                 query = HistoryQuery(lambda: query_history(bus, plant), past.answered)
-                dashboard = LiveDashboard(recording, lambda: process.poll() is not None, time.time_ns(), past, query)
+                now_ns = time.time_ns()
+                dashboard = LiveDashboard(recording, lambda: child.poll() is not None, now_ns, past, query, process)
                 loop = EventLoop(dashboard, bus, stop)
                 loop.subscribe(f"{keys.ROOT}/{plant}/**", history_s=bus_config.history_s)
                 loop.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), on_token=dashboard.on_alive)
@@ -120,6 +129,7 @@ class LiveDashboard:
         now_ns: clock reading.
         past: history of the run before the subscription.
         query: repeats the query for alarms when a node appears; None never repeats it.
+        process: process of the plant; None: unknown.
     """
 
     def __init__(
@@ -129,11 +139,12 @@ class LiveDashboard:
         now_ns: int,
         past: RunHistory = RunHistory(),  # noqa: B008 (it is frozen)
         query: HistoryQuery | None = None,
+        process: Process | None = None,
     ) -> None:
         self._recording = recording
         self._is_closed = is_closed
         self._drawing = Renderer(recording)
-        self._reader = RunReader(past.zero_ns)
+        self._reader = RunReader(past.zero_ns, process)
         self._has_zero = past.zero_ns is not None
         # a fleet's monitor stores no health report: the next one holds the zero
         self._zero_within_ns = now_ns + (ZERO_TIMEOUT_NS if not self._has_zero and "monitor" in past.answered else 0)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.process.steady_state import SteadyState
-from recorder.columns.process_annotations import find_process, operating_branch, steady_states_at
+from recorder.columns.process_annotations import find_model, operating_branch, steady_states_at
 from recorder.columns.run import RunColumns, Times, Values
 from recorder.panels.base import (
     ALARM,
@@ -36,7 +36,7 @@ _ACTIVE = (messages.ALARM_STATE_UNACKNOWLEDGED, messages.ALARM_STATE_ACKNOWLEDGE
 
 def draw(run: RunColumns) -> tuple[PlanePlot, ...]:
     """Path around the operating branch and among all steady states; empty for signals of no known process."""
-    model = find_process({name: run.units.get(name, "") for name in run.statistics})
+    model = find_model({name: run.units.get(name, "") for name in run.statistics}, run.process)
     if model is None or len(model.outputs) < 2 or len(model.inputs) != 1:
         return ()
     (input_,), (x_output, y_output) = model.inputs, model.outputs[:2]
@@ -46,9 +46,9 @@ def draw(run: RunColumns) -> tuple[PlanePlot, ...]:
         return ()
     around = MARGIN * abs(level.mean)
     ends = (min(level.lowest, level.mean - around), max(level.highest, level.mean + around))
-    branch = operating_branch(model.name, *ends, level.mean)
+    branch = operating_branch(model, *ends, level.mean)
     rounded = float(f"{level.mean:.4g}")
-    states = steady_states_at(model.name, rounded) if branch else ()
+    states = steady_states_at(model, rounded) if branch else ()
     data = Box(x_seen.lowest, x_seen.highest, y_seen.lowest, y_seen.highest)
     near, far = (_around(points, data) for points in (branch, (*branch, *states)))
     marks = tuple(_mark(state) for state in states)

@@ -1,4 +1,4 @@
-"""Convert between recordings (MCAP) and records (CSV)."""
+"""Convert between recordings (MCAP) and records (tables)."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -6,16 +6,20 @@ from pathlib import Path
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import encode
+from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.description.process import Process
+from reactorwatch.description.read import convert_to_process, read_signals
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.output import refuse_source
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, to_time_ns
 from reactorwatch.records.several_files import join_files
+from reactorwatch.records.source_text import is_table
 from reactorwatch.records.write_table import write_table
 from recorder.columns.run_splitter import ContinuousTime
 from recorder.message import RecordedMessage
+from recorder.storage.process_metadata import PROCESS, to_metadata
 from recorder.tools.mcap_file import CLOCK, NO_CLOCK, ZERO_NS, RecordingWriter, read_record
 from recorder.tools.player import samples_of
 
@@ -23,10 +27,11 @@ from recorder.tools.player import samples_of
 def import_csv(
     csv: Path | Sequence[Path],
     mcap: Path,
-    plant: str,
+    plant: str | None = None,
     columns: Mapping[str, str] | None = None,
     zero_ns: int = 0,
     stated: FileFormat = GUESS,
+    choice: ProcessChoice = DEFAULT_CHOICE,
 ) -> Record:
     """Convert a record to a recording; the time of receipt is the sample time.
 
@@ -36,10 +41,11 @@ def import_csv(
     Args:
         csv: the record, or the files of it in a row.
         mcap: the recording; an existing file is replaced.
-        plant: name of the plant.
-        columns: column names of the file by signal, as in `read_csv`.
+        plant: name of the plant; None: that of the process.
+        columns: column names of the file by signal, as in `read_process_table`.
         zero_ns: time that the minutes of a record without clock time count from; 0 if unknown.
         stated: statements about the form of the file.
+        choice: process of which the record is; its signals with their roles are described in the recording.
 
     Returns:
         The record.
@@ -47,13 +53,11 @@ def import_csv(
     Raises:
         InputError: the record is malformed, or has times that a recording cannot hold; or the plant's name is invalid.
     """
-    try:
-        keys.check_plant(plant)
-    except ValueError as error:
-        raise InputError(str(error)) from error
+    process = choice.load()
+    plant = plant_name(plant, process)
     files = [csv] if isinstance(csv, Path) else list(csv)
     refuse_source(mcap, files)
-    record = join_files([read_csv(file, columns, stated=stated) for file in files])
+    record = join_files([read_signals(file, choice, columns, stated) for file in files])
     metadata = {"plant": plant, "source": record.name}
     zero_ns = record.zero_ns or zero_ns
     if not zero_ns:
@@ -65,6 +69,7 @@ def import_csv(
         atomic_write(mcap) as temporary,
         RecordingWriter(temporary, {**metadata, ZERO_NS: str(zero_ns)}) as writer,
     ):
+        writer.add_metadata(PROCESS, to_metadata(plant, process, record))
         for publication in samples_of(record, plant, zero_ns):
             encoded = encode(publication)
             received_ns = received.continuous_ns(*publication)
@@ -73,25 +78,56 @@ def import_csv(
     return record
 
 
-def export_csv(mcap: Path, csv: Path, plant: str | None = None, *, clock: bool = False) -> Record:
-    """Convert the samples of a recording to a record.
+def export_csv(
+    mcap: Path,
+    csv: Path,
+    plant: str | None = None,
+    *,
+    clock: bool = False,
+    stated: FileFormat = GUESS,
+    choice: ProcessChoice = DEFAULT_CHOICE,
+) -> Record:
+    """Convert the samples of a recording, or a table of another form, to a record.
 
     Args:
-        mcap: the recording.
+        mcap: the recording, or the table.
         csv: the record, in the form of its suffix (see `write_table`); an existing file is replaced.
         plant: name of the plant; None if the recording has only one.
         clock: add a column with the clock time.
+        stated: statements about the form of the table that is read.
+        choice: process whose signals are exported, in its units; the default: all recorded signals, as recorded, and
+            of a table those of the reactor.
 
     Returns:
         The record.
 
     Raises:
-        InputError: the recording cannot be read, or has several plants and `plant` is None.
+        InputError: the recording cannot be read, or has several plants and `plant` is None; or the record cannot be
+            written, see `write_table`.
     """
     refuse_source(csv, (mcap,))
-    record = read_record(mcap, plant)
+    if is_table(mcap) and not mcap.is_dir():
+        record = read_signals(mcap, choice, None, stated)
+    elif choice.is_default:
+        record = read_record(mcap, plant)
+    else:
+        process = choice.load().without_equations()
+        record = convert_to_process(read_record(mcap, plant, process), process)
     write_table(csv, record, clock=clock)
     return record
+
+
+def plant_name(plant: str | None, process: Process) -> str:
+    """Name of a record's plant: the given one, else that of its process.
+
+    Raises:
+        InputError: it cannot be the name of a plant.
+    """
+    try:
+        return keys.check_plant(plant or process.name)
+    except ValueError as error:
+        cure = "" if plant else f"; the name of process {process.name!r} is none, choose one by --plant"
+        raise InputError(f"{error}{cure}") from error
 
 
 def _check_times(csv: Path, record: Record, zero_ns: int) -> None:

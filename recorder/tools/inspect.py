@@ -1,13 +1,14 @@
 """Inspect a recording: a file in any state, or the files in a folder."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.contract.messages_pb2 import Sample
+from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.columns.run_splitter import RunSplitter
@@ -16,6 +17,7 @@ from recorder.storage.mcap_chunks import metadata_records
 from recorder.storage.mcap_scan import Scan
 from recorder.storage.mcap_types import Metadata
 from recorder.storage.mcap_writer import own_metadata
+from recorder.storage.process_metadata import processes_in
 from recorder.tools.mcap_file import read_messages, read_metadata, recordings_in, zero_from
 from recorder.tools.overview import Overview, overview
 
@@ -30,6 +32,7 @@ class FileInfo:
         zero_ns: time that minutes count from.
         damages: unreadable parts; empty if the file is intact.
         gaps: messages lost on the bus before the recorder.
+        processes: processes by plant, as the recording describes them.
     """
 
     overview: Overview
@@ -37,6 +40,7 @@ class FileInfo:
     zero_ns: int
     damages: tuple[str, ...]
     gaps: tuple[Gap, ...] = ()
+    processes: Mapping[str, Process] = field(default_factory=dict)
 
 
 def inspect(path: Path) -> FileInfo:
@@ -47,7 +51,9 @@ def inspect(path: Path) -> FileInfo:
     """
     if path.is_dir():
         found, metadata = overview(read_messages(path)), read_metadata(path)
-        return FileInfo(found, metadata, zero_from(metadata, found.starts_ns or 0), (), gaps_in(path))
+        records = [record for file in recordings_in(path) for record in metadata_records(file)]
+        zero_ns = zero_from(metadata, found.starts_ns or 0)
+        return FileInfo(found, metadata, zero_ns, (), _gaps(records), processes_in(records))
     scan = Scan(path)
     found = overview(stored.recorded_message for stored in scan)
     metadata = own_metadata(scan.metadata)
@@ -55,7 +61,7 @@ def inspect(path: Path) -> FileInfo:
     if scan.orphans:
         damages.append(f"{scan.orphans} messages of channels that are described nowhere")
     zero_ns = zero_from(metadata, found.starts_ns or 0)
-    return FileInfo(found, metadata, zero_ns, tuple(damages), _gaps(scan.metadata))
+    return FileInfo(found, metadata, zero_ns, tuple(damages), _gaps(scan.metadata), processes_in(scan.metadata))
 
 
 def gaps_in(path: Path) -> tuple[Gap, ...]:

@@ -8,13 +8,15 @@ The metadata record "reactorwatch" holds the version that wrote the file and det
 time that minutes count from, where that is not the first sample. If its `clock` is `none`, the record had no clock
 time, and its times were shifted so that none is before 1970.
 
+A metadata record "reactorwatch.process" names the process of a plant, and its signals with their units and roles.
+
 A folder is read as one recording, file by file in the order of time, or interleaved where times overlap. Latched
 messages are skipped in all files but the first.
 """
 
 import heapq
 from array import array
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,10 +26,12 @@ import numpy as np
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, decode, encoding_of
+from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import list_files
-from reactorwatch.records.record import MINUTE_NS, UNITS, Record, join_runs
+from reactorwatch.records.record import MINUTE_NS, Record, join_runs
 from recorder.columns.measurement import measured_value
+from recorder.columns.process_annotations import signal_roles
 from recorder.columns.run_splitter import RunSplitter
 from recorder.message import RecordedMessage
 from recorder.storage.mcap_chunks import (
@@ -40,6 +44,7 @@ from recorder.storage.mcap_chunks import (
 )
 from recorder.storage.mcap_types import Summary
 from recorder.storage.mcap_writer import RecordingWriter, own_metadata
+from recorder.storage.process_metadata import processes_in
 from recorder.tools.overlap import group_overlapping
 
 __all__ = ["RecordingWriter", "plants_in", "read_messages", "read_metadata", "read_record", "recordings_in"]
@@ -102,14 +107,23 @@ def plants_in(path: Path) -> tuple[str, ...]:
     Raises:
         InputError: as `read_messages`.
     """
-    found: set[str] = set()
+    return tuple(sorted({topic.plant for topic in sample_topics_in(path)}))
+
+
+def sample_topics_in(path: Path) -> set[keys.Topic]:
+    """Topics of the samples in the recording.
+
+    Raises:
+        InputError: as `read_messages`.
+    """
+    found: set[keys.Topic] = set()
     for file in _files(path):
         topics = {channel.topic for channel in file.summary.channels.values()}
         if not topics:  # nothing was recorded, or the file's index does not say what
             topics = {entry.key for entry in sorted_messages(file.path, file.summary)}
         parsed = map(keys.parse, topics)
-        found.update(topic.plant for topic in parsed if topic is not None and topic.kind == keys.SAMPLE)
-    return tuple(sorted(found))
+        found.update(topic for topic in parsed if topic is not None and topic.kind == keys.SAMPLE)
+    return found
 
 
 def one_plant_in(path: Path, plant: str | None = None) -> str:
@@ -137,30 +151,48 @@ def read_metadata(path: Path) -> dict[str, str]:
     return own_metadata(metadata_records(recordings_in(path)[0]))
 
 
-def read_record(path: Path, plant: str | None = None, signals: Sequence[str] = tuple(UNITS)) -> Record:
+def recorded_process(path: Path, plant: str | None) -> Process | None:
+    """Process of a plant, or of the only plant, as the recording describes it; None: it does not.
+
+    Raises:
+        InputError: as `read_messages`.
+    """
+    found = processes_in(record for file in recordings_in(path) for record in metadata_records(file))
+    if plant is None:
+        return next(iter(found.values())) if len(found) == 1 else None
+    return found.get(plant)
+
+
+def read_record(path: Path, plant: str | None = None, process: Process | None = None) -> Record:
     """Samples of one plant as rows of equal sample time; runs are split by `RunSplitter`.
 
     Args:
         path: the recording.
         plant: name of the plant; None if the recording has only one.
-        signals: names of the signals that are read.
+        process: process whose signals are read, its inputs and outputs in any case; None: all recorded signals.
 
     Returns:
-        The signals; NaN where a signal has no sample at the time of another one, or no valid one. The first of
-        duplicate samples in a run counts, and stray samples are counted as `strays`. Time counts from `zero_ns` of the
-        metadata, else from the first sample of the first run.
+        The signals in the units in which they were published, in the order of their process if there is one; NaN where
+        a signal has no sample at the time of another one, or no valid one. The first of duplicate samples in a run
+        counts, and stray samples are counted as `strays`. Time counts from `zero_ns` of the metadata, else from the
+        first sample of the first run.
 
     Raises:
-        InputError: as `read_messages` and `one_plant_in`; or a sample cannot be decoded.
+        InputError: as `read_messages` and `one_plant_in`; or there are no samples of the process.
     """
     plant = one_plant_in(path, plant)
-    by_key = {keys.key(plant, keys.SAMPLE, signal): signal for signal in signals}
+    wanted = None if process is None else {signal.name for signal in process.signals}
+    names: dict[str, str | None] = {}
     runs: list[dict[str, tuple[array[int], array[float]]]] = []
     newest: dict[str, tuple[array[int], array[float]]] = {}  # columns of the newest sample, by signal
     units: dict[str, str] = {}
     splitter = RunSplitter()
     for entry in read_messages(path, {keys.SAMPLE}, plant):
-        if entry.key not in by_key or entry.encoding != _SAMPLE:
+        if entry.key not in names:
+            name = entry.key.split("/", 3)[3]
+            names[entry.key] = name if wanted is None or name in wanted else None
+        signal = names[entry.key]
+        if signal is None or entry.encoding != _SAMPLE:
             continue
         try:
             sample: Any = decode(entry.payload, entry.encoding)
@@ -168,23 +200,32 @@ def read_record(path: Path, plant: str | None = None, signals: Sequence[str] = t
             continue  # the recorder has counted it as refused
         value = measured_value(sample)
         if value is not None:
-            signal, strays = by_key[entry.key], splitter.strays
+            strays = splitter.strays
             number = splitter.update(signal, sample.sequence, sample.time_ns)
             if splitter.strays > strays:
                 for column in newest[signal]:
                     column.pop()
             if number > len(runs):
-                runs.append({name: (array("q"), array("d")) for name in signals})
+                runs.append({})
             if sample.unit:
                 units.setdefault(signal, sample.unit)
-            newest[signal] = times, values = runs[number - 1][signal]
+            series = runs[number - 1].get(signal)
+            if series is None:
+                series = runs[number - 1][signal] = (array("q"), array("d"))
+            newest[signal] = times, values = series
             times.append(sample.time_ns)
             values.append(value)
     if not runs:
-        raise InputError(f"{path}: holds no samples of {', '.join(signals)} of plant {plant!r}")
+        sought = "that can be used" if process is None else f"of {', '.join(item.name for item in process.signals)}"
+        raise InputError(f"{path}: holds no samples {sought} of plant {plant!r}")
     metadata = read_metadata(path)
     zero_ns = zero_from(metadata, splitter.runs[0].first_ns)
-    rows = [_rows(series, zero_ns, path.name) for series in runs if any(times for times, _ in series.values())]
+    present = {name: units.get(name, "") for series in runs for name in series}
+    needed = () if process is None else (*process.inputs, *process.outputs)
+    if process is None and (process := recorded_process(path, plant)) is not None:
+        needed = tuple(signal.name for signal in process.signals)
+    columns = signal_roles({**dict.fromkeys(needed, ""), **present}, process)
+    rows = [_rows(series, columns, zero_ns, path.name) for series in runs if any(times for times, _ in series.values())]
     clock_ns = zero_ns if has_clock(metadata) else 0
     return replace(join_runs(rows), zero_ns=clock_ns, strays=splitter.strays, units=units)
 
@@ -202,10 +243,12 @@ def has_clock(metadata: dict[str, str]) -> bool:
     return metadata.get(CLOCK) != NO_CLOCK and metadata.get(ZERO_NS) != "0"
 
 
-def _rows(series: dict[str, tuple["array[int]", "array[float]"]], zero_ns: int, name: str) -> Record:
+def _rows(
+    series: dict[str, tuple["array[int]", "array[float]"]], names: Iterable[str], zero_ns: int, name: str
+) -> Record:
     """Rows of one run, from times and values by signal."""
     all_times = np.unique(np.concatenate([np.asarray(times, np.int64) for times, _ in series.values()]))
-    columns = {signal: np.full(all_times.size, np.nan) for signal in series}
+    columns = {signal: np.full(all_times.size, np.nan) for signal in names}
     for signal, (times, values) in series.items():
         own_times, first = np.unique(np.asarray(times, np.int64), return_index=True)
         columns[signal][np.searchsorted(all_times, own_times)] = np.asarray(values)[first]

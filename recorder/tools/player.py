@@ -7,7 +7,7 @@ before is published at once. After the plant's clock stepped back, the next run 
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from typing import NamedTuple, cast
 
 from reactorwatch.contract import keys
@@ -79,7 +79,10 @@ def samples_of(record: Record, plant: str, zero_ns: int = 0) -> Iterator[Publica
 
 
 def filter_playable(
-    recording: Iterable[RecordedMessage], plant: str = "", kinds: frozenset[str] = SAMPLES
+    recording: Iterable[RecordedMessage],
+    plant: str = "",
+    kinds: frozenset[str] = SAMPLES,
+    signals: Container[str] | None = None,
 ) -> Iterator[Publication]:
     """Messages of a recording that can be replayed.
 
@@ -87,6 +90,7 @@ def filter_playable(
         recording: messages in the order of receipt.
         plant: name of the plant to publish under; empty keeps the recorded name.
         kinds: kinds of messages to replay.
+        signals: signals whose samples are replayed; None: all.
 
     Yields:
         The publications, without undecodable messages and keys of other programs.
@@ -94,6 +98,8 @@ def filter_playable(
     for entry in recording:
         topic = keys.parse(entry.key)
         if topic is None or topic.kind not in kinds:
+            continue
+        if signals is not None and topic.kind == keys.SAMPLE and topic.name not in signals:
             continue
         try:
             message = decode(entry.payload, entry.encoding)

@@ -1,6 +1,6 @@
 """Replay a recording or a record on the bus."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from math import inf, isinf
 from pathlib import Path
 
@@ -8,8 +8,9 @@ import structlog
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
+from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.read import read_signals
 from reactorwatch.errors import InputError
-from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import NEVER_NS, to_time_ns
 from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime import bus_zenoh
@@ -17,8 +18,9 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.liveliness import wait_alive
 from recorder.config import ReplayConfig
+from recorder.tools.convert import plant_name
 from recorder.tools.inspect import zero_ns_of
-from recorder.tools.mcap_file import plants_in, read_messages
+from recorder.tools.mcap_file import read_messages, sample_topics_in
 from recorder.tools.player import (
     COMMANDS,
     EVERYTHING,
@@ -34,8 +36,6 @@ __all__ = ["Player", "ReplayConfig", "replay", "run_replay", "samples_of"]
 log = structlog.get_logger()
 
 NODE = "replay"
-PLANT = "cstr"
-"""Name of the plant for a CSV record."""
 
 
 def run_replay(config: ReplayConfig, bus_config: BusConfig) -> None:
@@ -57,7 +57,7 @@ def replay(config: ReplayConfig, bus_config: BusConfig, stop: StopSignal) -> int
     Raises:
         InputError: as `run_replay`.
     """
-    plants, tape = _open_tape(config)
+    plants, tape = open_tape(config)
     player = Player(tape, config.rate, loop=config.loop)
     if player.finished:
         begin = "the start" if isinf(config.from_min) else f"{config.from_min:g} min"
@@ -81,18 +81,28 @@ def replay(config: ReplayConfig, bus_config: BusConfig, stop: StopSignal) -> int
     return player.published
 
 
-def _open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iterator[Publication]]]:
-    """Names of the plants on the bus, and the function that returns the publications."""
-    path = Path(config.file)
+def open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iterator[Publication]]]:
+    """Names of the plants on the bus, and the function that returns the publications.
+
+    Raises:
+        InputError: as `run_replay`.
+    """
+    path, choice = Path(config.file), ProcessChoice(config.process, config.inputs, config.outputs)
     if is_table(path):
-        plant, record = config.plant or PLANT, read_csv(path, config.columns, stated=config.table)
+        plant, record = (
+            plant_name(config.plant, choice.load()),
+            read_signals(path, choice, config.columns, config.table),
+        )
+        _check_signals(path, record.columns)
         if record.read_as:
             log.info("read as", file=config.file, form=record.read_as)
         if record.runs is not None:
             log.warning("plays several runs one after the other", file=config.file, runs=record.describe_runs())
         zero_ns = record.stored_zero_ns
         return (plant,), lambda: filter_time(samples_of(record, plant, zero_ns), *_span_ns(config, zero_ns))
-    plants = plants_in(path)
+    signals = None if choice.is_default else {signal.name for signal in choice.load().signals}
+    topics = [topic for topic in sample_topics_in(path) if signals is None or topic.name in signals]
+    plants = tuple(sorted({topic.plant for topic in topics}))
     if not plants:
         raise InputError(f"{path}: holds no samples")
     if not config.plant:
@@ -101,6 +111,7 @@ def _open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iter
                 keys.check_plant(plant)
             except ValueError as error:
                 raise InputError(f"{path}: {error}; choose the name by --plant") from error
+    _check_signals(path, sorted({topic.name for topic in topics}))
     if config.plant and len(plants) > 1:
         raise InputError(f"{path}: holds samples of {', '.join(plants)}; they cannot all be played as {config.plant!r}")
     kinds = EVERYTHING if config.everything else SAMPLES
@@ -108,9 +119,24 @@ def _open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iter
     from_ns, to_ns = _span_ns(config, 0 if whole else zero_ns_of(path))
 
     def tape() -> Iterator[Publication]:
-        return filter_time(filter_playable(read_messages(path, kinds), config.plant, kinds), from_ns, to_ns)
+        played = filter_playable(read_messages(path, kinds), config.plant, kinds, signals)
+        return filter_time(played, from_ns, to_ns)
 
     return (config.plant,) if config.plant else plants, tape
+
+
+def _check_signals(path: Path, names: Iterable[str]) -> None:
+    """Check that signals can be published.
+
+    Raises:
+        InputError: the name of one cannot be part of a key.
+    """
+    for name in names:
+        try:
+            keys.check_signal(name)
+        except ValueError as error:
+            cure = f"import it with a process that gives the signal another name and has column = {name!r}"
+            raise InputError(f"{path}: {error}; {cure}") from error
 
 
 def _span_ns(config: ReplayConfig, zero_ns: int) -> tuple[int, int]:

@@ -16,8 +16,8 @@ from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.library.three_tanks.effects import THREE_TANKS_EFFECTS
 from reactorwatch.process.library.three_tanks.model import three_tanks
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.records.csv_file import write_csv
 from reactorwatch.records.record import Record
+from reactorwatch.records.write_table import write_table
 from tests.integration.watched_hour import record_hour
 
 LEAK = "coolant_flow:step:-0.15@120min"
@@ -26,7 +26,7 @@ NARROW = {"kind": "random-steps", "low": 102.41, "high": 104.41}
 
 def _record(path: Path) -> None:
     """A simulated plant whose coolant leaks."""
-    write_csv(path, simulate_record(PlantConfig(seed=3, faults=(LEAK,)), 1500))
+    write_table(path, simulate_record(PlantConfig(seed=3, faults=(LEAK,)), 1500))
 
 
 def _renamed_record(path: Path) -> None:
@@ -57,7 +57,7 @@ def _later_record(path: Path) -> None:
 def _narrow_record(path: Path) -> None:
     """A record whose input hardly moves, so that several causes explain it."""
     config = PlantConfig(seed=4, faults=("coolant_flow:constant:-0.02",), scenario=NARROW)
-    write_csv(path, simulate_record(config, 600))
+    write_table(path, simulate_record(config, 600))
 
 
 def _tank_record(path: Path) -> None:
@@ -68,7 +68,7 @@ def _tank_record(path: Path) -> None:
     true = parse_fault("outlet_clogging:step:0.2@30min", TANK_EFFECTS).extend(tanks())
     true = true.with_values({"k1": 2.9})
     level = Simulator(true).run(time_min, u, np.array([4.0, 4.0])).outputs[:, 0]
-    write_csv(path, Record(time_min, {"u": u, "x2": level + random.normal(0.0, 0.01, level.size)}, path.name))
+    write_table(path, Record(time_min, {"u": u, "x2": level + random.normal(0.0, 0.01, level.size)}, path.name))
 
 
 def _three_tanks_record(path: Path) -> None:
@@ -94,7 +94,7 @@ def _records(folder: Path) -> None:
     """Two short records of sound plants."""
     folder.mkdir()
     for seed in range(2):
-        write_csv(folder / f"{seed}.csv", simulate_record(PlantConfig(seed=seed), 250))
+        write_table(folder / f"{seed}.csv", simulate_record(PlantConfig(seed=seed), 250))
 
 
 GIVEN: dict[str, Callable[[Path], None]] = {

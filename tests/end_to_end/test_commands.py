@@ -13,12 +13,12 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.messages_pb2 import CommandReply, InjectFault, SetInput
-from reactorwatch.records.csv_file import read_csv
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from recorder.dashboard.picture import count_coloured
 from recorder.tools.mcap_file import read_messages
+from tests.tables import read_csv
 
 from .conftest import PATIENCE_S, Command, Start, WaitAlive
 

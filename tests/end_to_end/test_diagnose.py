@@ -14,8 +14,9 @@ from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.result import Diagnosis
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.record import Record
+from reactorwatch.records.write_table import write_table
+from tests.tables import read_csv
 
 from .conftest import Command
 
@@ -37,7 +38,7 @@ def known(record: Record) -> Diagnosis:
 def folder(tmp_path_factory: pytest.TempPathFactory, record: Record) -> Path:
     """Where the record lies, and later its report."""
     folder = tmp_path_factory.mktemp("diagnose")
-    write_csv(folder / "leak.csv", record)
+    write_table(folder / "leak.csv", record)
     return folder
 
 
@@ -129,9 +130,9 @@ def test_a_plant_of_the_extended_model_has_the_fault_in_it(
 def test_several_files_give_one_line_each_in_their_order_and_a_bad_one_stops_none_of_the_rest(
     folder: Path, called: Command
 ) -> None:
-    write_csv(folder / "quiet.csv", simulate_record(PlantConfig(seed=6), 300))
+    write_table(folder / "quiet.csv", simulate_record(PlantConfig(seed=6), 300))
     (folder / "again").mkdir()
-    write_csv(folder / "again" / "quiet.csv", simulate_record(PlantConfig(seed=8), 300))
+    write_table(folder / "again" / "quiet.csv", simulate_record(PlantConfig(seed=8), 300))
     (folder / "short.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,0.1,440\n")
     files = ["short.csv", "quiet.csv", "nowhere.csv", "again/quiet.csv"]
     done = called("diagnose", *files, "--json", "--jobs", "1", "-o", "all", cwd=folder)
@@ -162,7 +163,7 @@ def test_the_proposed_experiment_is_a_file_that_drives_a_plant(tmp_path: Path, c
         faults=("heat_loss:constant:0.02",),
         scenario={"kind": "random-steps", "low": 102.41, "high": 104.41},
     )
-    write_csv(tmp_path / "narrow.csv", simulate_record(narrow, 1200))
+    write_table(tmp_path / "narrow.csv", simulate_record(narrow, 1200))
     limits = ["--limits", "qc=97..110,T=425..455"]
     done = called("diagnose", "narrow.csv", "--json", "-o", "report", *limits, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -182,7 +183,7 @@ def test_the_proposed_experiment_is_a_file_that_drives_a_plant(tmp_path: Path, c
     expected = levels[np.searchsorted(times, driven.time_min + 1e-6, side="right") - 1]
     np.testing.assert_array_equal(driven.columns["qc"], expected)
 
-    write_csv(tmp_path / "right.csv", simulate_record(PlantConfig(seed=6), 600))
+    write_table(tmp_path / "right.csv", simulate_record(PlantConfig(seed=6), 600))
     again = called("diagnose", "right.csv", "-o", "report", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert not (tmp_path / "report" / "experiment.csv").exists()  # that of the earlier report

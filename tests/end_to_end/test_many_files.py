@@ -17,7 +17,7 @@ import pytest
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.records.csv_file import write_csv
+from reactorwatch.records.write_table import write_table
 from recorder.tools.convert import import_csv
 from tests.cluster import dask_cluster
 
@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("many")
     for number in range(FILES):
         faults = ("coolant_flow:step:-0.2@20min",) if number == 1 else ()
-        write_csv(folder / f"run-{number}.csv", simulate_record(PlantConfig(seed=30 + number, faults=faults), 400))
+        write_table(folder / f"run-{number}.csv", simulate_record(PlantConfig(seed=30 + number, faults=faults), 400))
     (folder / "run-2b.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,x,440\n")
     return folder
 

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reactorwatch.records.csv_file import read_csv, write_csv
+from reactorwatch.records.write_table import write_table
 from reactorwatch.runtime.bus_zenoh import ZenohBus
+from tests.tables import read_csv
 
 from .conftest import PATIENCE_S, Command, Start, WaitAlive
 
@@ -72,7 +73,7 @@ def test_a_fault_put_into_the_record_is_found_in_either_format_at_the_same_minut
     measured = read_csv(daisy_csv)
     measured.columns["T"][5000:] += 2.0
     csv, recording = tmp_path / "biased.csv", tmp_path / "biased.mcap"
-    write_csv(csv, measured)
+    write_table(csv, measured)
     assert called("import", csv, "-o", recording).returncode == 0
     said = []
     for file in (csv, recording):

@@ -7,8 +7,9 @@ import pytest
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.records.csv_file import read_csv, write_csv
+from reactorwatch.records.write_table import write_table
 from recorder.tools.mcap_file import RecordingWriter
+from tests.tables import read_csv
 
 from .conftest import Command
 
@@ -16,7 +17,7 @@ from .conftest import Command
 @pytest.fixture
 def recording(tmp_path: Path, called: Command) -> Path:
     """Half an hour of a plant."""
-    write_csv(tmp_path / "run.csv", simulate_record(PlantConfig(seed=3), 300))
+    write_table(tmp_path / "run.csv", simulate_record(PlantConfig(seed=3), 300))
     assert called("import", tmp_path / "run.csv", "-o", tmp_path / "run.mcap").returncode == 0
     return tmp_path / "run.mcap"
 

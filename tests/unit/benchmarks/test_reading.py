@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from benchmarks import reading
-from reactorwatch.records.csv_file import read_csv, write_csv
+from reactorwatch.records.write_table import write_table
+from tests.tables import read_csv
 
 
 def test_each_form_holds_the_same_numbers(tmp_path: Path) -> None:
     record = reading.make_record(50, 4)
-    write_csv(tmp_path / "short.csv", record)
+    write_table(tmp_path / "short.csv", record)
     reading.write_german(tmp_path / "german.csv", tmp_path / "short.csv")
     reading.write_stamps(tmp_path / "stamps.csv", record)
     for name in ("short", "german", "stamps"):

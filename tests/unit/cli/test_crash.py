@@ -20,7 +20,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
-from reactorwatch.records.csv_file import write_csv
+from reactorwatch.records.write_table import write_table
 from reactorwatch.runtime import crash
 from reactorwatch.runtime.config import read_settings
 from recorder.config import RecorderConfig
@@ -45,7 +45,7 @@ def run(typed: list[str], monkeypatch: Patch) -> object:
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A record, and recordings of plants whose names no plant of ours can have."""
     folder = tmp_path_factory.mktemp("files")
-    write_csv(folder / "good.csv", simulate_record(PlantConfig(seed=1), ROWS))
+    write_table(folder / "good.csv", simulate_record(PlantConfig(seed=1), ROWS))
     for number, plant in enumerate(("cstr", *IMPOSSIBLE)):
         with RecordingWriter(folder / f"plant{number}.mcap", {"plant": plant}) as writer:
             for row in range(ROWS):

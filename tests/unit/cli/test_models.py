@@ -12,8 +12,8 @@ from reactorwatch.cli import identification
 from reactorwatch.cli.linear_models import describe
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
-from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import Record
+from tests.tables import read_csv
 
 TWO = ModelForm(order=2)
 

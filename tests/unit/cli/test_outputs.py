@@ -46,21 +46,21 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "export": [Case("export run.mcap", {"file": "run.mcap"}, "new.csv")],
-    "import": [Case("import run.csv", {"files": "run.csv"}, "new.mcap")],
+    "export": [Case("export run.mcap --process model.json", {"file": "run.mcap", "process": "model.json"}, "new.csv")],
+    "import": [Case("import run.csv --process model.json", {"files": "run.csv", "process": "model.json"}, "new.mcap")],
     "simulate": [
         Case("simulate run.csv --model model.json", {"file": "run.csv", "process": "model.json"}, "new.csv"),
         Case("simulate run.mcap", {"file": "run.mcap", "process": ""}, "new.csv"),
     ],
     "dashboard": [
         Case(
-            "dashboard run.mcap --diagnosis report",
-            {"file": "run.mcap", "diagnosis": "report/report.rrd"},
+            "dashboard run.mcap --diagnosis report --process model.json",
+            {"file": "run.mcap", "diagnosis": "report/report.rrd", "process": "model.json"},
             "new.rrd",
         ),
         Case(
-            "dashboard run.mcap -o new.rrd",
-            {"file": "run.mcap", "diagnosis": ""},
+            "dashboard run.mcap -o new.rrd --process model.json",
+            {"file": "run.mcap", "diagnosis": "", "process": "model.json"},
             "pictures",
             tuple(picture_names()),
             option="--png",

@@ -17,17 +17,16 @@ from reactorwatch.cli.backtest_jobs import _units
 from reactorwatch.cli.read_record import open_messages
 from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process import MODELS
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.records.csv_file import read_csv
-from reactorwatch.records.record import UNITS, Record
+from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
 from reactorwatch.spc.charts.base import format_quantity
-from recorder.columns.process_annotations import find_process, signal_title
+from recorder.columns.process_annotations import find_model, signal_title
 from recorder.columns.run_reader import read_run
 from recorder.panels.overview import draw
 from recorder.tools.convert import import_csv
 from recorder.tools.mcap_file import read_messages, read_record
 from recorder.tools.player import samples_of
+from tests.tables import UNITS, read_csv
 
 HEADER = "ts,flow,TI-1 [degC],TI-2"
 COLUMNS = {"time_min": "ts", "qc": "flow", "C": "TI-1 [degC]", "T": "TI-2"}
@@ -49,10 +48,6 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def watched(path: Path, **options: object) -> Backtest:
     config = MonitorConfig(training_min=20.0, isolation=False, **options)  # type: ignore[arg-type]
     return run(open_messages(path, "cstr", COLUMNS, _units(config)).messages, config)
-
-
-def test_the_units_of_the_reactor_are_those_of_its_equations() -> None:
-    assert cstr().units == UNITS
 
 
 @pytest.mark.parametrize("reference", ["auto", "arx"])
@@ -91,8 +86,8 @@ def test_units_go_into_recordings_and_drawings_and_back(rig: Path, tmp_path: Pat
     drawn = read_run(read_messages(tmp_path / "rig.mcap"))
     assert drawn.units == {"C": "degC"}
     assert {(view.title, view.unit) for view in draw(drawn)[:3]} == {("C", "degC"), ("T", ""), ("qc", "")}  # type: ignore[union-attr]
-    assert find_process(drawn.units) is None
-    assert find_process(UNITS) is not None
+    assert find_model(drawn.units) is None
+    assert find_model(UNITS) is not None
     assert signal_title("T", "K") != "T" == signal_title("T", "degC")
 
 

@@ -5,7 +5,8 @@ from google.protobuf.message import Message
 from reactorwatch.cli.alarm import _line as alarm_line
 from reactorwatch.cli.status import StatusBoard, _text
 from reactorwatch.contract.codec import Encoded, encode_message
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Priority, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Priority, Quality, Sample
+from reactorwatch.description.find import find_process
 
 S = 10**9
 START_NS = 1_000 * S
@@ -104,3 +105,21 @@ def test_an_alarm_of_a_priority_or_state_that_this_version_does_not_know_is_show
     assert [item["priority"] for item in board.plant("a", START_NS)["alarms"]] == ["99"]
     odd.state = 88  # type: ignore[assignment]
     assert alarm_line(odd).startswith("x/T (99): 88")
+
+
+def test_each_signal_has_its_newest_value_and_unit_and_a_missing_one_of_the_process_is_named() -> None:
+    board = StatusBoard(START_NS, find_process("three_tanks"))
+    good = Quality.QUALITY_GOOD
+    for value in (1.5, 2.5):
+        board.on_message(said("a/sample/h1", Sample(value=value, unit="mm", quality=good)))
+    board.on_message(said("a/sample/h2", Sample(value=7.0, quality=Quality.QUALITY_BAD)))
+    board.on_message(said("a/sample/pH", Sample(value=6.0, quality=good)))
+    assert board.plant("a", START_NS)["signals"] == {
+        "Q1": {"value": None, "unit": "cm3/s", "role": "input"},
+        "Q2": {"value": None, "unit": "cm3/s", "role": "input"},
+        "h1": {"value": 2.5, "unit": "mm", "role": "output"},
+        "h2": {"value": None, "unit": "cm", "role": "output"},
+        "h3": {"value": None, "unit": "cm", "role": "output"},
+        "pH": {"value": 6.0, "unit": None},
+    }
+    assert "no Q1, Q2, h2, h3" in " ".join(_text(board, as_json=False).split())

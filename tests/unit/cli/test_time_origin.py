@@ -20,8 +20,8 @@ from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.records.csv_file import write_csv
 from reactorwatch.records.record import Record
+from reactorwatch.records.write_table import write_table
 from reactorwatch.runtime.model_file import write_extended_model
 from recorder.columns.run_reader import read_run
 from recorder.tools.convert import import_csv
@@ -43,7 +43,7 @@ def written(folder: Path, leaking: Record, origin_min: float) -> tuple[Path, Pat
     """The record with its time beginning elsewhere, as CSV and as a recording."""
     csv, mcap = folder / "run.csv", folder / "run.mcap"
     times = np.round(leaking.time_min + origin_min, 6)
-    write_csv(csv, replace(leaking, time_min=times))
+    write_table(csv, replace(leaking, time_min=times))
     import_csv(csv, mcap, "cstr")
     return csv, mcap
 

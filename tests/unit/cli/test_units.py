@@ -16,8 +16,8 @@ from reactorwatch.cli.main import app
 from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.records.csv_file import write_csv
 from reactorwatch.records.record import Record
+from reactorwatch.records.write_table import write_table
 from tests.unit.diagnosis.runs import record_of
 
 SOUND = record_of(rows=300)
@@ -49,7 +49,7 @@ IN_OTHER_TIMES = {
 def remarks_of(record: Record, folder: Path) -> dict[str, str]:
     """What each command says of the units."""
     path, found = folder / "a.csv", {}
-    write_csv(path, record)
+    write_table(path, record)
     job = backtest_jobs.Job(path, path, LEARNING, None, {}, as_json=True, among=False)
     found["backtest"] = backtest_jobs.run_job(job).remark
     for command in (["identify"], ["simulate", "-o", str(folder / "out.csv")], ["diagnose"]):

@@ -14,8 +14,9 @@ from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.record import Record
+from reactorwatch.records.write_table import write_table
+from tests.tables import read_csv
 from tests.unit.diagnosis.rig import Rig
 from tests.unit.diagnosis.rig import record_of as rig_record
 from tests.unit.diagnosis.runs import record_of
@@ -63,7 +64,7 @@ def test_any_value_outside_a_signals_bounds_is_named_in_any_rows(signal: str, va
 @pytest.mark.parametrize("rows", [[0], [123], list(range(5, ROWS, 50))])
 def test_of_a_file_the_row_is_its_line(signal: str, rows: list[int], tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    write_csv(path, spoiled(sound("qc"), signal, rows, -999.0))
+    write_table(path, spoiled(sound("qc"), signal, rows, -999.0))
     line = next(number for number, text in enumerate(path.read_text().split("\n"), start=1) if "-999" in text)
     with pytest.raises(InputError, match=rf"a\.csv, row {line} \(.*\), column '{signal}': .* got -999"):
         load_case(path, None, DiagnosisOptions())
@@ -79,7 +80,7 @@ def test_values_at_the_bounds_are_no_sentinels(signal: str) -> None:
 
 def test_where_lines_are_no_rows_the_time_is_told_alone(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    write_csv(path, spoiled(sound("qc"), "T", [2], 9999.0))
+    write_table(path, spoiled(sound("qc"), "T", [2], 9999.0))
     lines = path.read_text().split("\n")
     path.write_text("\n".join([*lines[:2], "", *lines[2:]]))
     with pytest.raises(InputError, match=r"a\.csv, at 0\.2 min, column 'T'"):

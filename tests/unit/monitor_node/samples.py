@@ -12,7 +12,8 @@ from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.records.record import UNITS, to_time_ns
+from reactorwatch.records.record import to_time_ns
+from tests.tables import UNITS
 
 PLANT = "cstr"
 Rows = NDArray[np.float64]

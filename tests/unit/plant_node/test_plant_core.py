@@ -17,8 +17,8 @@ from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import Record
+from tests.tables import read_csv
 from tests.unit.plant_node.rows import QUIET, column, rows
 
 

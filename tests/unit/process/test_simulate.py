@@ -13,7 +13,7 @@ from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.records.csv_file import read_csv
+from tests.tables import read_csv
 from tests.unit.process.by_hand import nominal
 
 START = np.array(OPERATING_STATE)

@@ -13,8 +13,9 @@ import numpy as np
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication, encode
-from reactorwatch.records.record import UNITS, to_time_ns
+from reactorwatch.records.record import to_time_ns
 from recorder.message import RecordedMessage
+from tests.tables import UNITS
 
 PLANT = "cstr"
 ZERO_NS = 1_700_000_000_000_000_000

@@ -10,11 +10,12 @@ from hypothesis.extra.numpy import arrays
 
 from reactorwatch.cli.recording_reports import info_object
 from reactorwatch.errors import InputError
-from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.record import Record, join_runs
+from reactorwatch.records.write_table import write_table
 from recorder.tools.convert import export_csv, import_csv
 from recorder.tools.inspect import inspect
 from recorder.tools.mcap_file import read_messages, read_metadata, read_record
+from tests.tables import read_csv
 from tests.unit.records.test_csv_file import A_VALUE, assert_same
 
 
@@ -53,7 +54,7 @@ def test_the_runs_of_a_record_come_back_identical(
 
 def assert_comes_back(tmp_path: Path, record: Record, zero_ns: int) -> None:
     """A record is the same after import and export, and the recording between them holds nothing but its rows."""
-    write_csv(tmp_path / "run.csv", record)
+    write_table(tmp_path / "run.csv", record)
     assert import_csv(tmp_path / "run.csv", tmp_path / "run.mcap", "cstr", zero_ns=zero_ns).rows == record.rows
     assert export_csv(tmp_path / "run.mcap", tmp_path / "again.csv").rows == record.rows
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "run.csv").read_bytes()

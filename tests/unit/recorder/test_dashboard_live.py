@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from reactorwatch.contract.codec import Encoded
+from reactorwatch.description.find import find_process
 from recorder.columns.run import RunColumns
 from recorder.columns.run_reader import read_run
 from recorder.dashboard.live import DRAW_INTERVAL_NS, LiveDashboard
@@ -100,3 +101,14 @@ def test_it_is_finished_when_the_viewer_is_closed() -> None:
     assert not dashboard.finished
     closed[0] = True
     assert dashboard.finished
+
+
+def test_the_process_that_view_names_reaches_the_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawings: list[RunColumns] = []
+    monkeypatch.setattr(Renderer, "draw", lambda _self, run, _panels: drawings.append(run))
+    process = find_process("three_tanks")
+    dashboard = LiveDashboard(rr.RecordingStream("test"), lambda: False, 0, process=process)
+    dashboard.on_message(MESSAGES[0], 0)
+    dashboard.on_tick(DRAW_INTERVAL_NS)
+    dashboard.on_stop(DRAW_INTERVAL_NS)
+    assert [run.process for run in drawings] == [process]

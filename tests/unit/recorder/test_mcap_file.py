@@ -14,6 +14,7 @@ from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
+from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
 from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
@@ -212,11 +213,12 @@ def test_a_record_has_nan_where_a_signal_was_not_measured(tmp_path: Path) -> Non
         RecordedMessage("reactor/cstr/sample/T", b"", encoding_of(messages.Sample), 8, 8),
     ]
     record = read_record(recorded(tmp_path / "run.mcap", entries))
-    assert record.time_min.tolist() == [0.0, 1.0, 2.0]
+    assert record.time_min.tolist() == [0.0, 1.0, 2.0, 3.0]
     nan = np.nan
-    assert np.array_equal(record.columns["T"], [10.0, 20.0, nan], equal_nan=True)
-    assert np.array_equal(record.columns["qc"], [1.0, nan, nan], equal_nan=True)
-    assert np.array_equal(record.columns["C"], [nan, nan, nan], equal_nan=True)
+    assert np.array_equal(record.columns["T"], [10.0, 20.0, nan, nan], equal_nan=True)
+    assert np.array_equal(record.columns["qc"], [1.0, nan, nan, nan], equal_nan=True)
+    assert np.array_equal(record.columns["C"], [nan, nan, nan, nan], equal_nan=True)
+    assert np.array_equal(record.columns["level"], [nan, nan, nan, 5.0], equal_nan=True)
 
 
 def test_a_record_is_of_one_plant(tmp_path: Path) -> None:
@@ -229,7 +231,7 @@ def test_a_record_is_of_one_plant(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no samples"):
         read_record(recorded(tmp_path / "empty.mcap", []))
     with pytest.raises(InputError, match="holds no samples of qc, C, T of plant 'cstr'"):
-        read_record(recorded(tmp_path / "level.mcap", [sample(1, signal="level")]))
+        read_record(recorded(tmp_path / "level.mcap", [sample(1, signal="level")]), process=find_process())
 
 
 def test_the_file_s_sequence_numbers_are_those_of_the_samples(tmp_path: Path) -> None:

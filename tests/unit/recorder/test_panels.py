@@ -10,6 +10,8 @@ import pytest
 
 import recorder.panels
 from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.description.find import find_process
+from reactorwatch.description.process import Process, Signal
 from recorder.columns.run import (
     ADAPTIVE,
     EQUATIONS,
@@ -19,10 +21,11 @@ from recorder.columns.run import (
     HealthReport,
     ReconstructionColumns,
     RunColumns,
+    SampleColumns,
     Snapshot,
 )
 from recorder.columns.run_reader import read_run, read_segments
-from recorder.panels import PANELS, alarms, charts, health, model, overview
+from recorder.panels import PANELS, alarms, charts, health, model, overview, phase_plane
 from recorder.panels.base import ALARM, EventLog, Panel, PlanePlot, StateLines, TimePlot, View, ViewReference
 from tests.unit.recorder import golden
 
@@ -288,3 +291,54 @@ def test_health_shows_phases_lag_and_troubles_of_each_node(run: RunColumns) -> N
     assert isinstance(troubles, TimePlot)
     assert [series.value.tolist() for series in lag.series] == [[1.5, 2.5], [0.0]]
     assert [series.value.tolist() for series in troubles.series] == [[0.0, 7.0], [0.0]]
+
+
+def described(*signals: tuple[str, str, str]) -> RunColumns:
+    """A run of a process of these signals: name, role and unit."""
+    process = Process("rig", tuple(Signal(name, unit, role) for name, role, unit in signals))
+    time_ns = np.arange(3, dtype=np.int64)
+    samples = {name: SampleColumns(time_ns, np.arange(3.0)) for name, _, _ in reversed(signals)}
+    return RunColumns("rig", process.units, samples, {}, {}, (), (), process=process)
+
+
+def overview_of(run: RunColumns) -> dict[str, tuple[list[str], bool]]:
+    """Lines of each plot of the overview, and whether the signal of the plot is held between its samples."""
+    plots = of_kind(overview.draw(run), TimePlot)
+    return {plot.title: ([line.legend or line.name for line in plot.series], plot.series[-1].held) for plot in plots}
+
+
+def test_plots_are_ordered_by_role_and_set_points_are_drawn_with_their_outputs() -> None:
+    run = described(
+        ("mode", "mode", ""), ("Q1", "input", "%"), ("T1", "output", "degC"), ("T2", "output", "degC"),
+        ("SP2", "setpoint", "degC"), ("T1.sp", "setpoint", "degC"), ("SP3", "setpoint", "degC"),
+        ("p", "output", "bar"), ("p_sp", "setpoint", "mbar"), ("q", "output", "l/min"), ("target", "setpoint", "l/min"),
+    )  # fmt: skip
+    assert list(overview_of(run).items()) == [
+        ("T1", (["T1.sp", "measured"], False)),
+        ("T2", (["SP2", "measured"], False)),
+        ("p", (["measured"], False)),
+        ("q", (["target", "measured"], False)),
+        ("SP3", (["measured"], True)),
+        ("p_sp", (["measured"], True)),
+        ("Q1", (["measured"], True)),
+        ("mode", (["measured"], True)),
+    ]
+
+
+def test_a_signal_has_the_role_and_meaning_that_its_process_gives_it_and_not_those_of_its_name() -> None:
+    run = described(("u", "output", "V"), ("T", "output", "K"), ("qc", "output", "l/min"), ("C", "input", "mol/l"))
+    assert list(overview_of(run).items()) == [
+        *((name, (["measured"], False)) for name in ("u", "T", "qc")),
+        ("C", (["measured"], True)),
+    ]
+    assert list(overview_of(replace(run, process=None)))[-1].startswith("qc: ")
+
+
+def test_the_phase_plane_is_that_of_the_equations_that_the_process_has(run: RunColumns) -> None:
+    """Of a process of the same signals without equations, and with equations of other constants."""
+    reactor = find_process("cstr")
+    hotter = Process("rig", reactor.signals, reactor.equations, parameters={"Tf": (360.0, 0.0, "K")})
+    (nominal, _), (own, _) = phase_plane.draw(run), phase_plane.draw(replace(run, process=reactor.without_equations()))
+    assert own.box == nominal.box
+    assert phase_plane.draw(replace(run, process=replace(reactor.without_equations(), name="rig"))) == ()
+    assert phase_plane.draw(replace(run, process=hotter))[0].box != nominal.box

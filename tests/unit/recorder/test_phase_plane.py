@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reactorwatch.records.record import UNITS
 from recorder.columns.run import RunColumns, SampleColumns, SignalStatistics
 from recorder.columns.run_reader import read_run, read_segments
 from recorder.panels import phase_plane
 from recorder.panels.base import STABLE, UNSTABLE, PlanePlot
+from tests.tables import UNITS
 from tests.unit.recorder import golden
 
 # at qc = 103.41 l/min: C in mol/l, T in K, and whether it is stable (docs/plant.md; solved by hand from the equations)

@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.csv_file import read_csv, write_csv
+from reactorwatch.records.read_table import SignalColumn, read_table
 from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN, Record
+from reactorwatch.records.write_table import write_table
+from tests.tables import read_csv
 
 PLAIN = "time_min,qc,C,T\n0.1,100,0.1,438\n0.2,101,0.2,439\n0.5,102,0.3,440\n"
 
@@ -81,7 +83,8 @@ def test_an_empty_cell_was_not_measured(tmp_path: Path, quote: str) -> None:
 
 
 def test_a_signal_that_is_not_required_may_be_absent(tmp_path: Path) -> None:
-    record = read_csv(written(tmp_path, "time_min,qc\n0,1\n"), required=("qc",))
+    signals = [SignalColumn("qc"), SignalColumn("T", required=False)]
+    record = read_table(written(tmp_path, "time_min,qc\n0,1\n"), signals)
     assert list(record.columns) == ["qc"]
 
 
@@ -161,7 +164,9 @@ def test_reading_row_by_row_gives_what_reading_at_once_gives(tmp_path: Path) -> 
 
 def test_writing_replaces_what_was_there_and_names_the_columns(tmp_path: Path) -> None:
     path = written(tmp_path, "old")
-    write_csv(path, Record(np.array([0.1, 0.2]), {"qc": np.array([100.0, np.nan]), "T": np.array([1e-5, 438.54])}, "x"))
+    write_table(
+        path, Record(np.array([0.1, 0.2]), {"qc": np.array([100.0, np.nan]), "T": np.array([1e-5, 438.54])}, "x")
+    )
     assert path.read_text() == "time_min,qc,T\n0.1,100.0,1e-05\n0.2,,438.54\n"
 
 
@@ -169,9 +174,9 @@ def test_writing_replaces_what_was_there_and_names_the_columns(tmp_path: Path) -
 def test_what_could_not_be_read_again_is_not_written(tmp_path: Path, value: float) -> None:
     record = Record(np.array([0.1]), {"qc": np.array([value])}, "x")
     with pytest.raises(ValueError, match=r"column 'qc' must be below 1e\+15 or NaN"):
-        write_csv(tmp_path / "run.csv", record)
+        write_table(tmp_path / "run.csv", record)
     with pytest.raises(ValueError, match="times must be within"):
-        write_csv(tmp_path / "run.csv", Record(np.array([value]), {"qc": np.array([1.0])}, "x"))
+        write_table(tmp_path / "run.csv", Record(np.array([value]), {"qc": np.array([1.0])}, "x"))
     assert not list(tmp_path.iterdir())
 
 
@@ -189,7 +194,7 @@ def test_what_is_written_reads_back_exactly(
     path = tmp_path_factory.mktemp("csv") / "run.csv"
     columns = {signal: values[number, : len(times)] for number, signal in enumerate(("qc", "C", "T"))}
     record = Record(np.array(times), columns, "run.csv")
-    write_csv(path, record)
+    write_table(path, record)
     assert_same(read_csv(path), record)
 
 

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.record import GAP_ROWS, Record, join_runs
+from reactorwatch.records.write_table import write_table
+from tests.tables import read_csv
 
 
 def run(*times: float) -> Record:
@@ -29,7 +30,7 @@ def test_runs_come_back_from_a_csv_as_they_were(
     """Wherever a run starts: before, at or after the end of the one before it."""
     path = tmp_path_factory.mktemp("csv") / "run.csv"
     record = join_runs([run(*(item / 10 for item in one)) for one in times])
-    write_csv(path, record)
+    write_table(path, record)
     found = read_csv(path)
     assert (",run\n" in path.read_text()) == (len(times) > 1)
     assert [item.time_min.tolist() for item in found.split_runs()] == [[item / 10 for item in one] for one in times]

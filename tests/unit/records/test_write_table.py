@@ -8,11 +8,11 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.records import source_text
-from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.read_table import read_table
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
+from tests.tables import read_csv
 from tests.unit.records.test_csv_file import assert_same
 
 ZERO_NS = 1_772_352_000_250_000_000

@@ -1,0 +1,16 @@
+"""Records of the reactor as tables, for tests."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from reactorwatch.description.find import find_process
+from reactorwatch.description.read import read_process_table
+from reactorwatch.records.record import Record
+
+REACTOR = find_process().without_equations()
+UNITS = REACTOR.units
+
+
+def read_csv(path: Path, columns: Mapping[str, str] | None = None) -> Record:
+    """Read a record of the reactor in the units of its columns."""
+    return read_process_table(path, REACTOR, columns)
