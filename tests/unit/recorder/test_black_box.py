@@ -1,4 +1,4 @@
-"""Which read_segments of time are kept for good."""
+"""Segments of time that are kept for good."""
 
 import itertools
 
