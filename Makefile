@@ -4,8 +4,6 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-# one more than cores: a third of the tests' time is waiting for nodes
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 # keep bytecode: without it each process that tests start compiles every module again
 unexport PYTHONDONTWRITEBYTECODE
 # each has a target of its own
@@ -33,7 +31,7 @@ demo: $(READY) ## run a reactor with a fault, watch, record and draw it
 	@$(BIN)/reactorwatch demo
 
 test: $(READY) ## all tests
-	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadgroup
+	@$(BIN)/python -m pytest --numprocesses auto --dist loadgroup
 
 lint: $(READY) ## style, types, and layers of imports
 	@$(BIN)/ruff format --check .
