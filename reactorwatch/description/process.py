@@ -84,7 +84,6 @@ class Process:
         controllers: controllers of its inputs, for a simulation.
         parameters: constants of the equations that are given, by name: value, standard deviation and unit.
         file_format: statements on how to read its files; the rest is guessed for each file.
-        has_generic_effects: whether the effects made from the equations are added to its own.
 
     Raises:
         InputError: a rule above is broken, or signals and equations do not fit.
@@ -97,7 +96,6 @@ class Process:
     controllers: tuple[object, ...] = ()
     parameters: Mapping[str, KnownParameter | tuple[float, float, str]] = field(default_factory=dict)
     file_format: FileFormat = field(default_factory=FileFormat)
-    has_generic_effects: bool = False
 
     def __post_init__(self) -> None:
         if not self.name:

@@ -143,6 +143,7 @@ def test_a_python_file_that_gives_no_process_is_refused_with_its_path(tmp_path: 
         ('decimal = ","', 'decimal = ";"', r"\[file\] decimal must be"),
         ('separator = ";"', 'separator = ","', r"\[file\] separator and \[file\] decimal must differ"),
         ('separator = ";"', 'separator = "::"', r"\[file\] separator must be one character"),
+        ('name = "exchanger"', 'name = "exchanger"\n    generic = true', "generic must be false in this version"),
         ('name = "exchanger"', "", "missing required field `name`"),
         ('name = "exchanger"', 'name = "exchanger"\n    equations = "three_tank"', r"did you mean 'three_tanks'\?"),
         ('name = "exchanger"', 'name = "exchanger"\n    equations = "tanks"', "need the input 'u'"),
