@@ -39,7 +39,10 @@ MODELS: dict[str, Callable[..., FittedModel]] = {
 }
 """Fits by the kind of model."""
 
-SCHEMES: Mapping[str, Mapping[str, Callable[..., FittedModel]]] = {"least-squares": MODELS, "report": report_scheme.MODELS}
+SCHEMES: Mapping[str, Mapping[str, Callable[..., FittedModel]]] = {
+    "least-squares": MODELS,
+    "report": report_scheme.MODELS,
+}
 """Fits by scheme and kind of model."""
 
 RECURSIVE_MODELS = ("arx", "oe")
