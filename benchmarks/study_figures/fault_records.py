@@ -10,9 +10,9 @@ from benchmarks.study_figures.figure import Finding, Verdict
 from benchmarks.study_figures.study import TRAINING_ROWS, Study
 from monitor_node.alarms.on_off_delay import OnOffDelay
 from monitor_node.config import MonitorConfig
-from plant_node.presets import ONSET_MIN, PRESETS
 from reactorwatch.arrays import Array
 from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr.operation import ONSET_MIN, OPERATION
 
 UNITS = cstr().units
 
@@ -25,11 +25,11 @@ _OUTPUTS = ("T", "C")
 def draw(study: Study, drawing: Drawing) -> Finding:
     """Residuals of T and C for each record, the alarm marked."""
     rule = MonitorConfig()
-    axes = iter(panels(drawing, len(PRESETS), len(_OUTPUTS), sharex=True, sharey="col"))
+    axes = iter(panels(drawing, len(OPERATION.presets), len(_OUTPUTS), sharex=True, sharey="col"))
     rows, right = [], 0
-    for preset in PRESETS:
+    for preset in OPERATION.presets:
         record = study.fault_record(preset.name)
-        faulty, cells, seen = bool(preset.faults), [], False
+        faulty, cells, seen = bool(preset.settings["faults"]), [], False
         for output in _OUTPUTS:
             one = next(axes)
             _, residuals, chart = monitor_record(record, output)
@@ -60,12 +60,12 @@ def draw(study: Study, drawing: Drawing) -> Finding:
         f"370: the alarm takes {rule.raise_count} of {rule.window}.\n\n| record | T: out since {ONSET_MIN:g} min | "
         f"alarm | C: out since {ONSET_MIN:g} min | alarm |\n"
         "|---|---|---|---|---|\n" + "\n".join(rows) + "\n\n"
-        f"Right in {right} of {len(PRESETS)} records (an alarm after the onset of a fault, none without a fault). In "
-        "the pictures the shaded rows are those learned from, the line is the onset, the triangle the first alarm. "
-        "Shewhart's chart has no memory: faults that shift the residual by less than its noise it sees late or only "
-        "for moments."
+        f"Right in {right} of {len(OPERATION.presets)} records (an alarm after the onset of a fault, none without a "
+        "fault). In the pictures the shaded rows are those learned from, the line is the onset, the triangle the first "
+        "alarm. Shewhart's chart has no memory: faults that shift the residual by less than its noise it sees late or "
+        "only for moments."
     )
-    if right == len(PRESETS):
+    if right == len(OPERATION.presets):
         return Finding(text, Verdict.AGREES)
     return Finding(text, Verdict.IN_PART if right else Verdict.DISAGREES)
 

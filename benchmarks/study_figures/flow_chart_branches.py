@@ -14,11 +14,11 @@ from benchmarks.study_figures.study import FAST_PERIOD_MIN, TRAINING_ROWS, Study
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
-from plant_node.presets import PRESETS
 from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps
 from reactorwatch.contract.codec import encode
 from reactorwatch.identification.structure import Structure
+from reactorwatch.process.library.cstr.operation import OPERATION
 from reactorwatch.records.record import Record, to_minutes
 from recorder.tools.player import samples_of
 
@@ -36,8 +36,8 @@ _WATCHED_ROWS = 2000
 def draw(study: Study, drawing: Drawing) -> Finding:
     """A row for each record: the answers, and where the chart ended."""
     ends = {
-        preset.name: (monitor_record(study.fault_record(preset.name), _OUTPUT)[0], bool(preset.faults))
-        for preset in PRESETS
+        preset.name: (monitor_record(study.fault_record(preset.name), _OUTPUT)[0], bool(preset.settings["faults"]))
+        for preset in OPERATION.presets
     }
     fast = study.fast(noise=False)
     extra = {
@@ -71,7 +71,7 @@ def draw(study: Study, drawing: Drawing) -> Finding:
         "the innovations of a filter of the equations instead of the residuals of a linear model. On the same records "
         "it says:\n\n| record | first alarm | likeliest cause at the end | since |\n|---|---|---|---|\n"
     )
-    text += "\n".join(_isolation_row(preset.name, study.fault_record(preset.name)) for preset in PRESETS)
+    text += "\n".join(_isolation_row(preset.name, study.fault_record(preset.name)) for preset in OPERATION.presets)
     text += "\n\nWhere the cause is a sensor, it also tells what that sensor should read (`docs/watching.md`)."
     return Finding(text, Verdict.IN_PART if right else Verdict.DISAGREES)
 
@@ -100,7 +100,7 @@ def _small_then_large(study: Study, small: float, rows: int) -> Record:
     """A plant without a fault, driven by small random steps about 100 l/min for some rows, then by large ones."""
     time_min = row_times(rows + _WATCHED_ROWS, _PERIOD_MIN)
     parts = [
-        levels(RandomSteps(100.0 - size, 100.0 + size), times, study.seed)
+        levels(RandomSteps(100.0 - size, 100.0 + size, 1.0), times, study.seed)
         for size, times in ((small, time_min[:rows]), (10.0, time_min[rows:]))
     ]
     driver = Record(time_min, {"qc": np.concatenate(parts)}, "random steps")

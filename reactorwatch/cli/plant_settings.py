@@ -1,0 +1,28 @@
+"""Settings of a plant and of the processes of a run, from a settings file and the flags of a command."""
+
+from typing import Any
+
+from plant_node.config import PlantConfig
+from reactorwatch.description.find import find_process
+from reactorwatch.runtime.config import section
+from recorder.tools.convert import plant_name
+
+Tables = dict[str, dict[str, Any]]
+
+
+def load_plant_settings(tables: Tables, flags: dict[str, Any]) -> PlantConfig:
+    """Settings of a plant; one whose process the flags name is named after it.
+
+    Args:
+        tables: tables of the settings file.
+        flags: flags by key; None: not given.
+
+    Raises:
+        InputError: invalid settings, or there is no such process.
+    """
+    table, process = tables.get("plant", {}), flags.get("process")
+    if process is not None:
+        table = {key: value for key, value in table.items() if key != "model"}  # the older name
+        name = flags.get("name") or table.get("name")
+        flags = {**flags, "name": name if name is not None else plant_name(None, find_process(process))}
+    return section(PlantConfig, "plant", {"plant": table}, flags)
