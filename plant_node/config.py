@@ -1,7 +1,8 @@
 """The plant's settings."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import isfinite
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
@@ -24,9 +25,8 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         duration_min: length of the run, in minutes of the plant; None: endless.
         seed: seed of the input and all noise.
         zero_ns: plant time 0, in nanoseconds since 1970-01-01 UTC; None: the time of the start.
-        process: the process, by name or file, with equations; None: the reactor, or `model`.
-        model: older name of `process`, for the file of an extended model (`diagnose -o`), whose minutes are those of
-            the plant.
+        process: the process, by name or file, with equations; the minutes of an extended model are those of the plant.
+            None: the reactor.
         scenario: the inputs: a kind (random-steps, sines, square, constant) with its defaults, the path of a record, or
             a table with `kind` and its parameters (see `plant_node.scenario`); of several inputs, a table with one of
             these for each. Under control it is used as dither only.
@@ -56,6 +56,10 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     presets: ClassVar[dict[str, Mapping[str, Any]]] = {
         preset.name: preset.settings for operation in OPERATIONS.values() for preset in operation.presets
     }
+    older_keys: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = MappingProxyType(
+        {"model": ("process", lambda name: name)}
+    )
+    """Older names of keys, each with the present one and the function from a value of the older to one of it."""
 
     name: str = "cstr"
     period_min: Annotated[float, msgspec.Meta(ge=1e-4, le=60.0)] = 0.1
@@ -74,7 +78,6 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     resolution: dict[str, float] = {}
     limits: dict[str, tuple[float, float]] = {}
     valve_limits_l_min: tuple[float, float] | None = None
-    model: str | None = None
     faults: tuple[str, ...] = ()
     start: Literal["operating", "extinguished"] | dict[str, float] = "operating"
     health_period_s: Annotated[float, msgspec.Meta(ge=0.1, le=3600.0)] = 5.0
@@ -87,11 +90,6 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"speed must be above 0, or inf for as fast as it goes, got {self.speed:g}")
         if self.duration_min is not None and not (isfinite(self.duration_min) and self.duration_min > 0):
             raise ValueError(f"duration_min must be above 0, or left out for an endless run, got {self.duration_min:g}")
-        if self.process is not None and self.model is not None:
-            raise ValueError(
-                f"process and model name the same, got process {self.process!r} and model {self.model!r}; "
-                "leave model out"
-            )
         valve = {} if self.valve_limits_l_min is None else {"valve_limits_l_min": self.valve_limits_l_min}
         for name, (lower, upper) in {**self.limits, **valve}.items():
             if not lower < upper:
@@ -104,11 +102,6 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             for name, value in per_name.items():
                 if not (isfinite(value) and value >= 0):
                     raise ValueError(f"{what} of {name} must be at least 0, got {value:g}")
-
-    @property
-    def process_name(self) -> str | None:
-        """Name or file of the process; None: the reactor."""
-        return self.process if self.process is not None else self.model
 
     @property
     def rows(self) -> int | None:

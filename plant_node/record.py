@@ -54,7 +54,7 @@ def load_process(config: PlantConfig) -> tuple[PlantConfig, Process]:
     Raises:
         InputError: as `find_process`.
     """
-    choice = ProcessChoice(config.process_name)
+    choice = ProcessChoice(config.process)
     if choice.file is None or choice.file.suffix.lower() != ".json":
         return config, choice.load()
     loaded = read_extended_model(choice.file)

@@ -20,9 +20,7 @@ def load_plant_settings(tables: Tables, flags: dict[str, Any]) -> PlantConfig:
     Raises:
         InputError: invalid settings, or there is no such process.
     """
-    table, process = tables.get("plant", {}), flags.get("process")
-    if process is not None:
-        table = {key: value for key, value in table.items() if key != "model"}  # the older name
-        name = flags.get("name") or table.get("name")
-        flags = {**flags, "name": name if name is not None else plant_name(None, find_process(process))}
-    return section(PlantConfig, "plant", {"plant": table}, flags)
+    process = flags.get("process")
+    if process is not None and not (flags.get("name") or "name" in tables.get("plant", {})):
+        flags = {**flags, "name": plant_name(None, find_process(process))}
+    return section(PlantConfig, "plant", tables, flags)

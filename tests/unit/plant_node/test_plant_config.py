@@ -23,7 +23,7 @@ def read(table: dict[str, Any]) -> PlantConfig:
 
 def fit(table: dict[str, Any]) -> ProcessSettings:
     config = read(table)
-    return fit_settings(config, find_process(config.process_name or DEFAULT_PROCESS))
+    return fit_settings(config, find_process(config.process or DEFAULT_PROCESS))
 
 
 def test_all_settings_go_through_a_file() -> None:

@@ -20,6 +20,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
 from reactorwatch.process.controller import Controller
 from reactorwatch.process.simulate import Simulator
+from reactorwatch.runtime.config import section
 from tests.unit.plant_node.rows import column, rows
 
 NAMES = [make().name for make in MODELS]
@@ -241,6 +242,7 @@ def test_a_process_without_equations_is_refused_in_one_line_with_the_cure() -> N
     )
 
 
-def test_process_and_its_older_name_are_not_both_given() -> None:
-    with pytest.raises(ValueError, match=r"^process and model name the same, got process 'cstr' and model 'a\.json'"):
-        PlantConfig(process="cstr", model="a.json")
+def test_the_older_name_of_the_process_is_taken_too() -> None:
+    config = section(PlantConfig, "plant", {"plant": {"model": "three_tanks"}}, {})
+    assert config.process == "three_tanks"
+    assert section(PlantConfig, "plant", {"plant": {"model": "a.json"}}, {"process": "cstr"}).process == "cstr"
