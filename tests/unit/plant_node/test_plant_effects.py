@@ -85,7 +85,7 @@ def test_an_extended_model_is_the_plant_that_has_its_effects_as_faults(text: str
     path = tmp_path / "extended.json"
     path.write_text(json.dumps({"format": "reactorwatch.model.v1", "model": "cstr", "effects": [text]}))
     leak = "coolant_flow:step:-0.02@10min"
-    of_model = simulate_record(PlantConfig(seed=3, model=str(path), faults=(leak,)), 300)
+    of_model = simulate_record(PlantConfig(seed=3, process=str(path), faults=(leak,)), 300)
     of_faults = simulate_record(PlantConfig(seed=3, faults=(text, leak)), 300)
     for signal, values in of_model.columns.items():
         assert np.array_equal(values, of_faults.columns[signal])
