@@ -107,7 +107,7 @@ class PlantPipeline:
         self._board = board
         self._points = points
         self.model = _model(config, model)
-        self._is_process = self._is_process_given = model is not None or config.reference == "process"
+        self._is_process = self._is_process_given = model is not None or config.reference == "equations"
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
         self._numbers: Records = np.zeros(1, numbers_type(config))
@@ -269,7 +269,7 @@ class PlantPipeline:
             return 1.0
         if self._began_ns is None or last_ns is None:
             return 0.0
-        return min(max((last_ns - self._began_ns) / MINUTE_NS / self._config.training_min, 0.0), 1.0)
+        return max(self._config.training_length.share((last_ns - self._began_ns) / MINUTE_NS, self._training.rows), 0.0)
 
     @property
     def refused_trainings(self) -> int:
@@ -351,8 +351,8 @@ class PlantPipeline:
             self._promise_checked = True
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
-        trained_min = (time_ns - self._began_ns) / MINUTE_NS
-        if trained_min >= config.training_min and self._training.is_enough(self.signals.silence.silent[1:]):
+        share = config.training_length.share((time_ns - self._began_ns) / MINUTE_NS, self._training.rows)
+        if share >= 1.0 and self._training.is_enough(self.signals.silence.silent[1:]):
             rows = self._training.state
             trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
             if trained.refused:
@@ -650,7 +650,7 @@ def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | 
     if config.reference == "auto" and not given:
         return None
     raise InputError(
-        f"reference 'process' needs the signals of {model.name}, input {', '.join(model.input_names)} and outputs of "
+        f"reference 'equations' needs the signals of {model.name}, input {', '.join(model.input_names)} and outputs of "
         f"{', '.join(model.output_names)}, got {config.input} and {', '.join(config.outputs)}; "
         'set reference = "arx"'
     )

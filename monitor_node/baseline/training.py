@@ -153,6 +153,11 @@ class Training:
         for index, value in enumerate(values):
             self._counts[index] += isfinite(value)
 
+    @property
+    def rows(self) -> int:
+        """Number of rows so far."""
+        return len(self._rows)
+
     def is_enough(self, timed_out: list[bool]) -> bool:
         """True if there are enough rows, without regard to outputs whose data timeout is active.
 
@@ -239,7 +244,7 @@ class Training:
 
         z, process_screenings = _refit_without_outliers(innovations, outputs)
         residuals = z * np.array(process[-1].typical_sd)
-        if self._config.reference == "process" or _predicts_as_well(residuals, identified):
+        if self._config.reference == "equations" or _predicts_as_well(residuals, identified):
             return process[-1], z, process_screenings
         return ArxReference(given_inputs), identified, screenings
 
@@ -257,7 +262,7 @@ class Training:
         columns = np.column_stack([inputs, measured])
         lower, upper = np.array([(item.lower, item.upper) for item in signal_ranges(self._model, signals)]).T
         out = np.isfinite(columns) & ((columns < lower) | (columns > upper))
-        if self._config.reference != "process" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):
+        if self._config.reference != "equations" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):
             return None
         columns = np.where(out, np.nan, columns)
         return columns[:, 0], columns[:, 1:]
