@@ -117,7 +117,8 @@ class Training:
         self._rows: deque[tuple[int, float, list[float]]] = deque(maxlen=MOST_ROWS)
         self._counts = [0] * len(config.outputs)
         of_identified = max(fewest_rows(config.order, config.delay), FEWEST_ROWS)
-        self._fewest_rows = FEWEST_ROWS if model is not None else of_identified
+        self.fewest_rows = FEWEST_ROWS if model is not None else of_identified
+        """Least number of values of each output that a training needs."""
 
     @property
     def state(self) -> TrainingState:
@@ -135,6 +136,8 @@ class Training:
         times_ns, rows = unpack_times(state.times_ns), unpack_numbers(state.rows, 1 + outputs).tolist()
         if len(times_ns) != len(rows) or len(state.known) != outputs:
             raise ValueError(f"a training must have a time a row and {outputs} counts, got {len(times_ns)} times")
+        if len(times_ns) > MOST_ROWS:
+            self.keep_all_rows()
         self._rows.extend((time_ns, row[0], row[1:]) for time_ns, row in zip(times_ns, rows, strict=True))
         self._counts = list(state.known)
 
@@ -158,6 +161,10 @@ class Training:
         """Number of rows so far."""
         return len(self._rows)
 
+    def keep_all_rows(self) -> None:
+        """Use all rows of the training, however many they are."""
+        self._rows = deque(self._rows)
+
     def is_enough(self, timed_out: list[bool]) -> bool:
         """True if there are enough rows, without regard to outputs whose data timeout is active.
 
@@ -165,7 +172,7 @@ class Training:
             timed_out: one flag an output.
         """
         counts = [count for count, is_out in zip(self._counts, timed_out, strict=True) if not is_out]
-        return min(counts, default=0) >= self._fewest_rows
+        return min(counts, default=0) >= self.fewest_rows
 
     def finish(self, *, last_chance: bool) -> TrainingResult:
         """Learn from the rows, and drop them.
