@@ -8,6 +8,7 @@ from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
 from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.library.cascaded_tanks.operation import OPERATION as TANK_OPERATION
 from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.locations import LOCATIONS as CSTR_LOCATIONS
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.library.cstr.operation import OPERATION as CSTR_OPERATION
 from reactorwatch.process.library.three_tanks.effects import THREE_TANKS_EFFECTS
@@ -33,6 +34,9 @@ OPERATIONS: Mapping[str, Operation] = {
     "three_tanks": THREE_TANKS_OPERATION,
 }
 """Operation in a simulation, by name of a model."""
+
+LOCATION_PHRASES: Mapping[str, str] = CSTR_LOCATIONS
+"""Phrases of locations whose name is not enough, such as `on the side of the coolant`."""
 
 CONTROLLERS_OF: Mapping[str, tuple[Controller, ...]] = {"three_tanks": CONTROLLERS}
 """Controllers in a simulation, by name of a model; others are simulated in open loop."""
