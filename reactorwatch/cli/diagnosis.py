@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from reactorwatch.cli.options import check_recording
-from reactorwatch.cli.read_record import record
+from reactorwatch.cli.read_record import described_process, equations_on_clock, record
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.parameter_priors import parse_priors
@@ -94,9 +94,10 @@ def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path
     Raises:
         InputError: the file cannot be read or diagnosed, or an uncertain parameter does not exist.
     """
-    described = asked.process.load()
-    measured = record(check_recording(at or file), asked.plant, asked.columns, described, stated=asked.stated)
-    model = asked.process.load_model(measured.zero_ns)
+    path = check_recording(at or file)
+    described = described_process(path, asked.plant, asked.process)
+    measured = record(path, asked.plant, asked.columns, described, stated=asked.stated)
+    model = equations_on_clock(asked.process, described, measured.zero_ns)
     known = described.uncertain
     if asked.uncertain is not None:
         known = known | parse_priors(asked.uncertain, model)

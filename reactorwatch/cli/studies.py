@@ -56,15 +56,16 @@ def simulate(
     They start from its first row and run freely, driven by its inputs.
     """
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.read_record import record
+    from reactorwatch.cli.read_record import described_process, equations_on_clock, record
     from reactorwatch.cli.simulation import report, simulate_along
     from reactorwatch.description.choice import ProcessChoice
     from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
 
     choice = ProcessChoice(process)
     out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
-    measured = record(check_recording(file), plant, parse_columns(column), choice.load(), stated=stated)
-    model = choice.load_model(measured.zero_ns)
+    described = described_process(check_recording(file), plant, choice)
+    measured = record(file, plant, parse_columns(column), described, stated=stated)
+    model = equations_on_clock(choice, described, measured.zero_ns)
     with task(f"simulating {file.name}"):
         simulated = simulate_along(measured, model, fault or [])
         try:

@@ -6,8 +6,10 @@ from functools import cached_property
 from typing import Literal, get_args
 
 from reactorwatch.errors import InputError
+from reactorwatch.process import CONTROLLERS_OF, OPERATIONS, effects_of
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.operation import Operation
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.units import conversion
 
@@ -81,9 +83,10 @@ class Process:
         signals: the signals, each name once; at least one of them an output.
         equations: the model, in the units of the equations; None: it is learned from data.
         effects: what can be named as a cause and injected as a fault.
-        controllers: controllers of its inputs, for a simulation.
+        controllers: controllers of its inputs, for a simulation (see `reactorwatch.process.controller`).
         parameters: constants of the equations that are given, by name: value, standard deviation and unit.
         file_format: statements on how to read its files; the rest is guessed for each file.
+        operation: levels of its inputs, noise of its sensors and named runs, for a simulation.
 
     Raises:
         InputError: a rule above is broken, or signals and equations do not fit.
@@ -96,6 +99,7 @@ class Process:
     controllers: tuple[object, ...] = ()
     parameters: Mapping[str, KnownParameter | tuple[float, float, str]] = field(default_factory=dict)
     file_format: FileFormat = field(default_factory=FileFormat)
+    operation: Operation = field(default_factory=Operation)
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -217,13 +221,20 @@ class Process:
             raise InputError(f"process {self.name!r}: {error}") from error
 
 
-def describe_model(model: ProcessModel, effects: tuple[Effect, ...] = (), name: str | None = None) -> Process:
-    """Describe a model: each input and output is a signal of its name, with its unit."""
+def describe_model(model: ProcessModel) -> Process:
+    """Describe a model: each input and output is a signal of its name, with its unit; the rest is of the catalogue."""
     signals = (
         *(Signal(item.name, item.unit, "input") for item in model.inputs),
         *(Signal(item.name, item.unit, "output") for item in model.outputs),
     )
-    return Process(name or model.name, signals, model, effects)
+    return Process(
+        model.name,
+        signals,
+        model,
+        effects_of(model),
+        CONTROLLERS_OF.get(model.name, ()),
+        operation=OPERATIONS.get(model.name, Operation()),
+    )
 
 
 def _find_parameter(process: Process, name: str) -> str:

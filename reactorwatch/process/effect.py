@@ -17,18 +17,6 @@ from reactorwatch.process.profiles import CONSTANT, Profile
 TIMING = "timing"
 """Location of a deviation in the timestamps of a record, not in the plant."""
 
-LOCATIONS = (
-    "mass_balance",
-    "energy_balance",
-    "reaction",
-    "feed",
-    "coolant",
-    "temperature_sensor",
-    "concentration_sensor",
-    TIMING,
-)
-"""Locations of effects on the reactor."""
-
 
 class Effect(ABC):
     """A physical deviation.
@@ -36,7 +24,7 @@ class Effect(ABC):
     Attributes:
         name: name in the catalogue of causes.
         label: usual name of the effect in text.
-        location: part of the plant in which it acts; one of `LOCATIONS` for the reactor.
+        location: part of the plant in which it acts.
         unit: unit of its size.
         larger: meaning of a positive size, with `{}` for its amount: in the size's unit, or in % for a share.
         smaller: meaning of a negative size, like `larger`; empty: there is none.
@@ -193,13 +181,13 @@ class BiasEffect(ReadingEffect):
         return value + size
 
 
-def coolant_flow_of(effect: Effect, model: ProcessModel) -> Variable:
-    """The commanded coolant flow, an input.
+def input_of(effect: Effect, model: ProcessModel, name: str) -> Variable:
+    """An input of a model on which an effect acts.
 
     Raises:
-        ValueError: the model has no input qc.
+        ValueError: the model has no such input.
     """
     for item in model.inputs:
-        if item.name == "qc":
+        if item.name == name:
             return item
-    raise ValueError(f"{effect.name} needs a model with the input 'qc', {model.name} has {model.input_names}")
+    raise ValueError(f"{effect.name} needs a model with the input {name!r}, {model.name} has {model.input_names}")

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from reactorwatch.process.effect import Effect, coolant_flow_of
+from reactorwatch.process.effect import Effect, input_of
 from reactorwatch.process.model import ProcessModel
 
 
@@ -28,5 +28,5 @@ class CoolantFlow(Effect):
         Raises:
             ValueError: the model has no input qc.
         """
-        qc = coolant_flow_of(self, model).symbol
+        qc = input_of(self, model, "qc").symbol
         return model.substitute(qc, qc * (1 + size))

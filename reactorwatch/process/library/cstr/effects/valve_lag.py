@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from reactorwatch.process.effect import Effect, coolant_flow_of
+from reactorwatch.process.effect import Effect, input_of
 from reactorwatch.process.effect_states import add_lag
 from reactorwatch.process.model import ProcessModel, variable
 
@@ -26,7 +26,7 @@ class ValveLag(Effect):
         Raises:
             ValueError: the model has no input qc.
         """
-        qc = coolant_flow_of(self, model)
+        qc = input_of(self, model, "qc")
         name = f"{self.prefix(model)}.flow"
         state = variable(name, qc.unit, (qc.lower, qc.upper), qc.scale, "flow that the valve lets through")
         _, flow = add_lag(model, state, qc.symbol, size)

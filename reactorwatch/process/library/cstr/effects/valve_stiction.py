@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import casadi as ca
 
-from reactorwatch.process.effect import Effect, coolant_flow_of
+from reactorwatch.process.effect import Effect, input_of
 from reactorwatch.process.model import ProcessModel, variable
 
 
@@ -33,7 +33,7 @@ class ValveStiction(Effect):
         Raises:
             ValueError: the model has no input qc.
         """
-        qc = coolant_flow_of(self, model)
+        qc = input_of(self, model, "qc")
         name = f"{self.prefix(model)}.flow"
         state = variable(name, qc.unit, (qc.lower, qc.upper), self.typical, "flow that the valve stands at")
         free = ca.logic_or(ca.fabs(qc.symbol - state.symbol) > size, size <= 0)

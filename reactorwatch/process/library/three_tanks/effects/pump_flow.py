@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from reactorwatch.process.effect import Effect
+from reactorwatch.process.effect import Effect, input_of
 from reactorwatch.process.model import ProcessModel
 
 
@@ -23,11 +23,7 @@ class PumpFlow(Effect):
         Raises:
             ValueError: the model has no such input.
         """
-        if self.input not in model.input_names:
-            raise ValueError(
-                f"{self.name} needs a model with the input {self.input!r}, {model.name} has {model.input_names}"
-            )
-        flow = model.inputs[model.input_names.index(self.input)].symbol
+        flow = input_of(self, model, self.input).symbol
         return model.substitute(flow, flow + size)
 
 
