@@ -22,6 +22,7 @@ from reactorwatch.cli.options import (
     parse_columns,
     parse_limits,
     parse_tolerances,
+    split_names,
 )
 from reactorwatch.cli.printing import print_text
 from reactorwatch.cli.table_options import take_table_options
@@ -144,6 +145,12 @@ def diagnose(
         ),
     ] = None,
     process: Process = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--without", help="A cause that is left out (repeatable); nothing takes its place.", show_default=False
+        ),
+    ] = None,
     plant: Plant = None,
     column: Columns = None,
     jobs: Processes = None,
@@ -169,6 +176,7 @@ def diagnose(
         parse_tolerances(tolerance),
         parse_limits(limit),
         stated=stated,
+        without=split_names(without),
     )
     todo = make_jobs(named, out, asked, as_json=as_json, elsewhere=scheduler is not None)
     run_jobs(DIAGNOSIS, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)
