@@ -12,14 +12,12 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.profiles import STEP
 from reactorwatch.records.record import Record
 
 ROWS = 2400
 """Four hours at the plant's period of 0.1 min."""
 
 BOILING_FROM_K = 440.0
-BOILING_ONSET_MIN = 130.0
 BOILING_RATE = 0.6
 """1/min."""
 
@@ -71,8 +69,8 @@ EXAMPLES: dict[str, Example] = {
         ("coolant_flow:step:-0.1@130min", "temperature_bias:step:1.5@180min"),
     ),
     "unknown": Example(
-        "the contents boil at their hottest, which is no cause of the catalogue",
-        law=f"dT/dt - {BOILING_RATE:g} max(T - {BOILING_FROM_K:g} K, 0) from {BOILING_ONSET_MIN:g} min on",
+        "the contents boil above 440 K all the time, which is no cause of the catalogue",
+        law=f"energy balance: -{BOILING_RATE:g} 1/min max(T - {BOILING_FROM_K:g} K, 0)",
     ),
 }
 """The sample records, by name."""
@@ -92,8 +90,7 @@ def make_example(name: str, seed: int) -> tuple[Record, dict[str, Any]]:
         raise InputError(describe_unknown("example", name, EXAMPLES))
     example, model = EXAMPLES[name], cstr()
     if example.law is not None:
-        changes = {"boiling.size": BOILING_RATE, "boiling.onset": BOILING_ONSET_MIN}
-        model = Boiling().extend(model, STEP).with_values(changes)
+        model = Boiling().extend(model).with_values({"boiling.size": BOILING_RATE})
     record = simulate_record(PlantConfig(seed=seed, faults=example.faults), ROWS, model)
     faults = [parse_fault(text) for text in example.faults]
     causes = [
