@@ -1,6 +1,8 @@
 """The monitor's settings."""
 
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 
 import msgspec
 
@@ -40,7 +42,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         plant: name of the plant.
-        input: signal that drives the plant.
+        inputs: signals that drive the plant; none, one or several.
         outputs: signals that are predicted and monitored.
         order: order of the ARX models.
         delay: delay of the input in samples; with 1 it acts on the next sample.
@@ -75,7 +77,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     """
 
     plant: str = "cstr"
-    input: str = "qc"
+    inputs: tuple[str, ...] = ("qc",)
     outputs: tuple[str, ...] = ("C", "T")
     order: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
     delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
@@ -104,12 +106,18 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     health_period_s: Annotated[float, msgspec.Meta(ge=0.05, le=3600.0)] = 5.0
     priorities: dict[str, PriorityName] = msgspec.field(default_factory=lambda: DEFAULT_PRIORITIES)
 
+    older_keys: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = MappingProxyType(
+        {"input": ("inputs", lambda name: [name])}
+    )
+    """Older names of keys, each with the present one and the function from a value of the older to one of it."""
+
     def __post_init__(self) -> None:
         check_plant(self.plant)
         check_rule(self.raise_count, self.window, self.clear_count)
-        if not self.outputs or self.input in self.outputs or len(set(self.outputs)) != len(self.outputs):
+        if not self.outputs or len(set(self.signals)) != len(self.signals):
             raise ValueError(
-                f"outputs must be at least one signal, each once, without the input {self.input!r}, got {self.outputs}"
+                f"outputs must be at least one signal, and each signal be named once among inputs and outputs, "
+                f"got inputs {self.inputs} and outputs {self.outputs}"
             )
         check_bounds(MonitorConfig, msgspec.structs.asdict(self))
         if len(set(self.charts)) != len(self.charts) or not self.charts:
@@ -125,6 +133,11 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         for signal in self.priorities:
             if signal not in self.outputs:
                 raise ValueError(f"priorities are by output, {self.outputs}, got {signal!r}")
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Signals of a row: the inputs, then the outputs."""
+        return (*self.inputs, *self.outputs)
 
     @property
     def chart_settings(self) -> dict[str, float]:

@@ -25,6 +25,7 @@ from monitor_node.ingest.replay_filter import ReplayFilter
 from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, reject_reason
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from monitor_node.pipeline import PlantPipeline
+from monitor_node.process_settings import order_inputs
 from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
 from reactorwatch.contract import keys
@@ -70,14 +71,14 @@ class Monitor:
         model: ProcessModel | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
     ) -> None:
-        self.config = config
+        self.config = config = order_inputs(config, model)
         self._points, self._model, self._diagnose = points, model, diagnose
         self._changes: deque[ScheduledChange] = deque()
         self._republishes_baseline = False
         self._settings: dict[str, Any] | None = None
         self.rejects = RejectCounter()
         self.failures = Failures()
-        self._signals = (config.input, *config.outputs)
+        self._signals = config.signals
         self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in self._signals}
         self._indices = {signal: place for place, signal in enumerate(self._signals)}
         self._aligner = Aligner(self._signals, config.reorder_rows)

@@ -18,6 +18,7 @@ import msgspec
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor as MonitorCore
 from monitor_node.diagnosis_worker import find_deviations
+from monitor_node.process_settings import signal_settings
 from monitor_node.replay.backtest import run as run_backtest
 from reactorwatch.cli.read_record import DEFAULT_PLANT
 from reactorwatch.cli.read_record import record as read_file
@@ -413,9 +414,8 @@ def _settings(process: ProcessLike | None, settings: Mapping[str, Any]) -> Monit
     """
     defaults: dict[str, Any] = {"plant": DEFAULT_PLANT}
     if process is not None:
-        model = _model_of(process)
-        defaults |= {"input": model.input_names[0], "outputs": model.output_names}
-    return section(MonitorConfig, "monitor", {}, defaults | dict(settings))
+        defaults |= signal_settings(find_process(process))
+    return section(MonitorConfig, "monitor", {"monitor": defaults}, dict(settings))
 
 
 def _model_of(process: ProcessLike, record: Record | None = None) -> ProcessModel:

@@ -21,7 +21,7 @@ class Backtest:
     """Result of a back-test.
 
     Attributes:
-        input: name of the input.
+        inputs: names of the inputs.
         outputs: names of the outputs.
         rows: number of rows.
         first_ns: time of the first row; 0 without rows.
@@ -42,7 +42,7 @@ class Backtest:
             given.
     """
 
-    input: str
+    inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     rows: int
     first_ns: int
@@ -112,7 +112,7 @@ def run(
             first_ns = monitor.first_ns
     keep(monitor.finish())
     return Backtest(
-        input=config.input,
+        inputs=config.inputs,
         outputs=config.outputs,
         rows=monitor.rows,
         first_ns=(monitor.first_ns or 0) if first_ns is None else first_ns,

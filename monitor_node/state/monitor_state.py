@@ -13,7 +13,7 @@ import msgspec
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import AlignmentState
 from monitor_node.ingest.sequence_check import SequenceCheck
-from monitor_node.state import version_2
+from monitor_node.state import version_2, version_3
 from monitor_node.state.pipeline_state import PipelineState
 from monitor_node.state.seal import DIGEST_BYTES, Seal
 from reactorwatch.errors import InputError
@@ -23,7 +23,8 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import StoredState
 
 MAGIC = b"reactorwatch monitor"
-SEAL = Seal(MAGIC, 3, "state of a monitor", {2: version_2.upgrade})
+UPGRADES = {2: lambda body: version_3.upgrade(version_2.upgrade(body)), 3: version_3.upgrade}
+SEAL = Seal(MAGIC, 4, "state of a monitor", UPGRADES)
 
 NOT_LEARNED_BY = frozenset(
     {"model", "alarm_state_file", "state_file", "state_every_s", "health_period_s", "diagnose_training"}
@@ -40,7 +41,7 @@ class MonitorState(StoredState, frozen=True):
 
     Attributes:
         settings: settings of the training, see `learning_settings`.
-        runs: sequence checks of the signals, the input first.
+        runs: sequence checks of the signals, the inputs first.
         alignment: state of the alignment.
         board: state of the alarms, see `Annunciator.to_bytes`.
         watch: state of the pipeline.
