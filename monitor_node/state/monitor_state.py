@@ -31,6 +31,9 @@ NOT_LEARNED_BY = frozenset(
 )
 """Settings that do not change what was learned; the model is identified by its equations, not by its file."""
 
+TRAINING = ("training_min", "training_rows")
+"""Settings that are compared only where they are stated."""
+
 
 class OtherSettingsError(InputError):
     """The state is intact, but was learned with other settings."""
@@ -83,6 +86,9 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
         points: see `Monitor`.
     """
     fields = {field: value for field, value in msgspec.structs.asdict(config).items() if field not in NOT_LEARNED_BY}
+    for name in TRAINING:
+        if fields[name] is None:
+            del fields[name]
     fields |= {"points": points, "equations": fingerprint(model)}
     settings: dict[str, Any] = msgspec.msgpack.decode(msgspec.msgpack.encode(fields))  # as they are read back
     return settings
@@ -133,8 +139,9 @@ def open_state(data: bytes, settings: dict[str, Any]) -> MonitorState:
         state = MonitorState.from_bytes(body)
     except ValueError as error:
         raise InputError(f"is no state of this software's monitor: {error}") from error
-    if state.settings != settings:
-        raise OtherSettingsError(f"was learned with other settings: {_difference(state.settings, settings)}")
+    stored = {name: value for name, value in state.settings.items() if name in settings or name not in TRAINING}
+    if stored != settings:
+        raise OtherSettingsError(f"was learned with other settings: {_difference(stored, settings)}")
     return state
 
 
