@@ -27,7 +27,7 @@ UPGRADES = {2: lambda body: version_3.upgrade(version_2.upgrade(body)), 3: versi
 SEAL = Seal(MAGIC, 4, "state of a monitor", UPGRADES)
 
 NOT_LEARNED_BY = frozenset(
-    {"model", "alarm_state_file", "state_file", "state_every_s", "health_period_s", "diagnose_training"}
+    {"process", "alarm_state_file", "state_file", "state_every_s", "health_period_s", "diagnose_training"}
 )
 """Settings that do not change what was learned; the model is identified by its equations, not by its file."""
 

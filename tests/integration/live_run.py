@@ -14,8 +14,8 @@ from benchmarks.link_cuts import Router, connect_client
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
+from reactorwatch.api.files import messages
 from reactorwatch.cli.processes import MODULES, Processes, write_settings
-from reactorwatch.cli.read_record import messages
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Health, Sample
