@@ -83,6 +83,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         plant: name of the plant.
         inputs: signals that drive the plant; none, one or several.
         outputs: signals that are predicted and monitored.
+        units: unit by signal, as its process describes it: that of samples which name none, and, without equations,
+            the unit in which a signal is judged.
         order: order of the ARX models.
         delay: delay of the input in samples; with 1 it acts on the next sample.
         forgetting: forgetting factor of the adaptive model, in [0.5, 1]; with 1 it forgets nothing.
@@ -120,6 +122,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     plant: str = "cstr"
     inputs: tuple[str, ...] = ("qc",)
     outputs: tuple[str, ...] = ("C", "T")
+    units: dict[str, str] = {}
     order: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
     delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
     forgetting: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.999

@@ -60,10 +60,10 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
     """
     if config.reference == "equations":
         process.require_model()
-    changed: dict[str, object] = {}
+    changed: dict[str, object] = {"units": process.units}
     if config.signals == DEFAULT_SIGNALS:
-        changed = signal_settings(process)
-    for signal in () if changed else config.signals:
+        changed |= signal_settings(process)
+    for signal in () if "inputs" in changed else config.signals:
         if signal not in (*process.inputs, *process.outputs):
             raise InputError(describe_unknown("signal", signal, (*process.inputs, *process.outputs)))
     if process.model is None and config.reference == "auto":

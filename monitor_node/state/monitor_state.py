@@ -89,6 +89,8 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
     for name in TRAINING:
         if fields[name] is None:
             del fields[name]
+    if model is not None:
+        del fields["units"]  # the equations have their own
     fields |= {"points": points, "equations": fingerprint(model)}
     settings: dict[str, Any] = msgspec.msgpack.decode(msgspec.msgpack.encode(fields))  # as they are read back
     return settings
