@@ -122,7 +122,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     plant: str = "cstr"
     inputs: tuple[str, ...] = ("qc",)
     outputs: tuple[str, ...] = ("C", "T")
-    units: dict[str, str] = {}
+    units: dict[str, str] = msgspec.field(default_factory=dict)
     order: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
     delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
     forgetting: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.999
