@@ -1,4 +1,4 @@
-"""Figures 7 and 8: the plant under its proportional controllers of temperature and level."""
+"""Section 3.1: the plant under its proportional controllers of temperature and level."""
 
 from __future__ import annotations
 
@@ -93,8 +93,7 @@ def level(study: Study, drawing: Drawing) -> Finding:
     text = (
         f"The inflow rises by {_INFLOW_STEP:g} l/min at {OPERATING_COOLANT_FLOW} l/min of coolant; the volume is a "
         "state.\n\n| gain, 1/min | rise of the volume at the end, l | by the balance, l | largest distance of T from "
-        "the plant of "
-        "constant volume, K |\n|---|---|---|---|\n" + "\n".join(rows) + "\n\n"
+        "the plant of constant volume, K |\n|---|---|---|---|\n" + "\n".join(rows) + "\n\n"
         "From the slowest controller to the fastest the distance to the plant of constant volume, which the report's "
         f"equations suppose, goes from {distances[0]:.2f} to {distances[-1]:.2f} K. Run and balance of the volume "
         f"differ by at most {max(off):.0e} l."

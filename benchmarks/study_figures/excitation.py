@@ -1,4 +1,4 @@
-"""Figure 12: which inputs excite a model enough to be learned."""
+"""Section 3.5: which inputs excite a model enough to be learned."""
 
 from __future__ import annotations
 

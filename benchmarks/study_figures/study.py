@@ -14,7 +14,9 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import Scenario
 from reactorwatch.arrays import Array
+from reactorwatch.identification import report_scheme
 from reactorwatch.identification.families import LINEAR_FAMILIES, Model
+from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.structure import Structure
 from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, cstr
 from reactorwatch.process.library.cstr.operation import NOISE_SD, OPERATION
@@ -51,6 +53,7 @@ class Study:
         self.measured = measured
         self._points: dict[float, list[SteadyState]] = {}
         self._fits: dict[tuple[str, int, str], Model] = {}
+        self._report_fits: dict[tuple[str, int, str], LinearModel] = {}
         self._fault_records: dict[str, Record] = {}
 
     @cached_property
@@ -99,7 +102,7 @@ class Study:
 
     @property
     def source(self) -> str:
-        """Description of the identification record of figures 14 to 17."""
+        """Description of the identification record of figures 5, 6 and 11 to 16."""
         record = self.identification
         period = float(np.median(np.diff(record.time_min)))
         if self.measured is not None:
@@ -125,6 +128,21 @@ class Study:
             (kind,) = (item for item in LINEAR_FAMILIES if item.name == family)
             self._fits[key] = kind.fit(Structure.of_order(order), u[:half], y[:half], t[:half])
         return self._fits[key]
+
+    def report_fit(self, family: str, order: int, output: str) -> LinearModel:
+        """Fit a model to the first half of the identification record by the report's scheme; `arx` or `oe`."""
+        key = (family, order, output)
+        if key not in self._report_fits:
+            u, y, t = self.signals(output)
+            half = y.size // 2
+            fit = report_scheme.MODELS[family]
+            self._report_fits[key] = fit(Structure.of_order(order), u[:half], y[:half], t[:half])
+        return self._report_fits[key]
+
+    def spread(self, signal: str) -> float:
+        """Standard deviation of a signal over the first half of the identification record, in its unit."""
+        values = self.identification.columns[signal]
+        return float(np.nanstd(values[: values.size // 2]))
 
     def fault_record(self, preset: str) -> Record:
         """One of the four named records."""

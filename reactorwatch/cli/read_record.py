@@ -20,7 +20,6 @@ from reactorwatch.records.source_text import TABLE_SUFFIXES, is_table
 
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process
-    from reactorwatch.process.model import ProcessModel
 
 DEFAULT_PLANT = "cstr"
 
@@ -74,18 +73,15 @@ def described_process(path: Path, plant: str | None = None, choice: ProcessChoic
     return recorded_process(path, plant) or choice.load()
 
 
-def equations_on_clock(choice: ProcessChoice, described: "Process", zero_ns: int) -> "ProcessModel":
-    """Equations of a described process, on the clock of a record.
+def process_on_clock(choice: ProcessChoice, described: "Process", zero_ns: int) -> "Process":
+    """A described process on the clock of a record.
 
     Args:
         choice: the choice by which it was described.
         described: see `described_process`.
         zero_ns: zero of the record's minutes, from which those of a chosen extended model are counted.
-
-    Raises:
-        InputError: the process has no equations.
     """
-    return described.require_model() if choice.is_default else choice.load_model(zero_ns)
+    return described if choice.is_default else choice.load(zero_ns)
 
 
 class MessageSource(NamedTuple):

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from reactorwatch.process.controller import Controller
 from reactorwatch.process.effect import Effect
+from reactorwatch.process.generic_effects import generic_effects
 from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
 from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.library.cascaded_tanks.operation import OPERATION as TANK_OPERATION
@@ -43,5 +44,12 @@ CONTROLLERS_OF: Mapping[str, tuple[Controller, ...]] = {"three_tanks": CONTROLLE
 
 
 def effects_of(model: ProcessModel) -> tuple[Effect, ...]:
-    """Effects of a model; empty if there is no catalogue for it."""
-    return EFFECTS_OF.get(model.name, ())
+    """Effects of a model: its own catalogue, or the generic ones if it has none."""
+    return EFFECTS_OF.get(model.name) or generic_effects(model)
+
+
+def named_effects(model: ProcessModel) -> tuple[Effect, ...]:
+    """Effects that a text may name: those of the model's own catalogue first, then the generic ones."""
+    own = EFFECTS_OF.get(model.name, ())
+    names = {effect.name for effect in own}
+    return (*own, *(effect for effect in generic_effects(model) if effect.name not in names))

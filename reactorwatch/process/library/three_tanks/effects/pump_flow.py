@@ -1,30 +1,15 @@
 """Deviation of a pump's flow."""
 
-from typing import ClassVar
-
-import casadi as ca
-
-from reactorwatch.process.effect import Effect, input_of
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.input_effects import InputOffset
 
 
-class PumpFlow(Effect):
+class PumpFlow(InputOffset):
     """The real flow of a pump is Q + m."""
 
     unit = "cm3/s"
     lower = -150.0
     upper = 150.0
     typical = 1.0
-    input: ClassVar[str]
-
-    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no such input.
-        """
-        flow = input_of(self, model, self.input).symbol
-        return model.substitute(flow, flow + size)
 
 
 class Pump1(PumpFlow):
