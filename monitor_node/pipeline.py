@@ -702,7 +702,8 @@ def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | 
         return None
     raise InputError(
         f"reference 'equations' needs the signals of {model.name}, inputs {', '.join(model.input_names)} and outputs "
-        f"of {', '.join(model.output_names)}, got {', '.join(config.inputs) or 'none'} and {', '.join(config.outputs)}; "
+        f"of {', '.join(model.output_names)}, got {', '.join(config.inputs) or 'none'} and "
+        f"{', '.join(config.outputs)}; "
         'set reference = "arx"'
     )
 

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from reactorwatch.cli.display import print_report
 from reactorwatch.cli.options import (
     Columns,
     Force,
@@ -97,7 +98,7 @@ def identify(
         else:
             validation = identification.Validation(held_out, settle)
             text = identification.fit(measured, described.inputs, outputs, form, validation, as_json=as_json)
-    print_text(text)
+    print_report(text, as_json=as_json)
     write_remark(file, remark)
 
 

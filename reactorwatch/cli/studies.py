@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from reactorwatch.cli.display import print_report
 from reactorwatch.cli.options import (
     Columns,
     Files,
@@ -24,7 +25,6 @@ from reactorwatch.cli.options import (
     parse_tolerances,
     split_names,
 )
-from reactorwatch.cli.printing import print_text
 from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS, FileFormat
@@ -72,9 +72,9 @@ def simulate(
         try:
             write_table(out, simulated)
         except InputError:
-            print_text(report(measured, simulated, model, None, as_json=as_json))
+            print_report(report(measured, simulated, model, None, as_json=as_json), as_json=as_json)
             raise
-    print_text(report(measured, simulated, model, out, as_json=as_json))
+    print_report(report(measured, simulated, model, out, as_json=as_json), as_json=as_json)
 
 
 def backtest(

@@ -136,6 +136,19 @@ class Effect(ABC):
         )
         return replace(model, parameters=(*model.parameters, *added)), tuple(item.symbol for item in added)
 
+    def describe(self, size: float) -> str:
+        """Meaning of a size, rounded to two digits, for people.
+
+        Args:
+            size: the size, in the effect's unit.
+        """
+        text, amount = self.larger or f"{self.label}: {{}} {self.unit}".removesuffix(" 1"), size
+        if size < 0.0 and self.smaller:
+            text, amount = self.smaller, -size
+        if "{} %" in text:
+            amount *= 100.0
+        return text.format(f"{float(f'{amount:.2g}'):g}")
+
     def size_signal(self, clock: Clock, profile: Profile, symbols: dict[str, ca.SX]) -> ca.SX:
         """m(t) with a profile, as an expression of the clock and of the symbols of the profile's parameters."""
         return profile.expression(clock, symbols)
