@@ -127,17 +127,16 @@ class Demonstration:
         """Fault to inject.
 
         Raises:
-            InputError: it is invalid, or the process has no effects and none is given.
+            InputError: it is invalid, or the process has no equations.
         """
         text = self.fault
         if text is None and process.operation.fault:
             text = f"{process.operation.fault}@{ONSET_MIN:g}min"
         elif text is None:
-            if not process.effects:
-                raise InputError(f"process {process.name!r}: has no effects to demonstrate; name a fault by --fault")
-            effect = process.effects[0]
+            process.require_model()
+            effect = process.faults[0]
             text = f"{effect.name}:step:{effect.typical!r}@{ONSET_MIN:g}min"
-        return parse_fault(text, process.effects)
+        return parse_fault(text, process.faults)
 
 
 def run(demonstration: Demonstration, out: Path | None, site: Path | None = None) -> int:
