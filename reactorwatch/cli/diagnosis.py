@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeAlias
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from reactorwatch.cli.options import check_recording
 from reactorwatch.cli.read_record import record
+from reactorwatch.cli.report_origin import report_origin
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.parameter_priors import parse_priors
@@ -73,6 +75,7 @@ class Case:
         model: the simulation, on the clock of the record.
         folder: folder for the report; None: no report.
         uncertain: standard deviations of uncertain parameters, by name.
+        asked: options of the diagnosis.
     """
 
     file: Path
@@ -80,6 +83,7 @@ class Case:
     model: ProcessModel
     folder: Path | None
     uncertain: dict[str, float] = field(default_factory=dict)
+    asked: DiagnosisOptions = field(default_factory=DiagnosisOptions)
 
 
 def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path | None = None) -> Case:
@@ -101,7 +105,7 @@ def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path
     if asked.uncertain is not None:
         known = known | parse_priors(asked.uncertain, model)
     make_run(measured, model)
-    return Case(file, measured, model, folder, known)
+    return Case(file, measured, model, folder, known, asked)
 
 
 def run_diagnosis(
@@ -124,14 +128,23 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
         InputError: the folder cannot be made or written to.
     """
     # Imported only for a report: Rerun and Jinja take longer to import than most records to diagnose.
-    from reactorwatch.cli.diagnosis_drawing import write_drawing
     from reactorwatch.diagnosis.report.page import as_page
 
     assert case.folder is not None
     folder = case.folder
     catalogue, on_the_bus = effects_of(case.model), case.model.name == PLANT
     files = (str(case.file), str(folder / MODEL), str(folder / EXPERIMENT))
-    page = as_page(diagnosis, case.model, catalogue, *files, on_the_bus=on_the_bus)
+    asked = case.asked
+    settings = {
+        "process": asked.process.process or "cstr",
+        "plant": asked.plant,
+        "uncertain": asked.uncertain,
+        "tolerance": asked.tolerance,
+        "limits": asked.limits,
+        "columns": asked.columns,
+    }
+    origin = report_origin(case.file, settings)
+    page = as_page(diagnosis, case.model, catalogue, *files, on_the_bus=on_the_bus, origin=origin)
     plain = msgspec.json.format(
         msgspec.json.encode(report_object(diagnosis, str(case.file), seconds, case.measured.zero)), indent=2
     )
@@ -139,7 +152,10 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
         write_extended_model(temporary / MODEL, diagnosis.extended_model)
         if diagnosis.experiment is not None:
             _write_experiment(diagnosis.experiment, temporary / EXPERIMENT)
-        write_drawing(diagnosis, case.model, case.measured, temporary / DRAWING)
+        if find_spec("rerun") is not None:  # an image of nodes that never draw is without
+            from reactorwatch.cli.diagnosis_drawing import write_drawing
+
+            write_drawing(diagnosis, case.model, case.measured, temporary / DRAWING)
         for name, content in ((OBJECT, plain + b"\n"), (PAGE, page.encode())):
             with atomic_write(temporary / name) as file:
                 file.write_bytes(content)
