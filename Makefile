@@ -1,6 +1,6 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench faults study kills cuts fuzz soak pictures docs examples protobuf lock clean
+.PHONY: help setup demo test lint bench faults study kills cuts fuzz soak outside pictures docs examples protobuf lock clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -61,6 +61,9 @@ fuzz: $(READY) ## 200,000 random messages, commands, states and settings: no fai
 
 soak: $(READY) ## a fleet for ten minutes of kills, cuts and garbage (MINUTES=10 PLANTS=200 SEED=): what is missing or repeated
 	@$(BIN)/python -m benchmarks.soak $(or $(MINUTES),10) $(or $(PLANTS),200) $(SEED)
+
+outside: $(READY) ## public benchmarks beside other methods (DATA=folder of their data); writes its tables into docs/outside.md
+	@$(BIN)/python -m benchmarks.outside --data $(DATA) --write docs/outside.md
 
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
 	@$(BIN)/python docs/pictures/make.py

@@ -25,6 +25,7 @@ from monitor_node.ingest.replay_filter import ReplayFilter
 from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, reject_reason
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from monitor_node.pipeline import PlantPipeline
+from monitor_node.process_settings import order_inputs
 from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
 from reactorwatch.contract import keys
@@ -58,6 +59,7 @@ class Monitor:
         last_ns: time of the last row; None before the first.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
         received: number of messages so far.
+        on_row_end: called after each row with its time and the publications because of it; None: not called.
         stats: statistics by receive time, which a restart resets.
     """
 
@@ -70,14 +72,14 @@ class Monitor:
         model: ProcessModel | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
     ) -> None:
-        self.config = config
+        self.config = config = order_inputs(config, model)
         self._points, self._model, self._diagnose = points, model, diagnose
         self._changes: deque[ScheduledChange] = deque()
         self._republishes_baseline = False
         self._settings: dict[str, Any] | None = None
         self.rejects = RejectCounter()
         self.failures = Failures()
-        self._signals = (config.input, *config.outputs)
+        self._signals = config.signals
         self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in self._signals}
         self._indices = {signal: place for place, signal in enumerate(self._signals)}
         self._aligner = Aligner(self._signals, config.reorder_rows)
@@ -94,6 +96,7 @@ class Monitor:
         self._watching_since_ns: int | None = None
         self.received = 0
         self.stats = ReceiveStats(start_ns, start_ns)
+        self.on_row_end: Callable[[int, list[Publication]], None] | None = None
         self._published = 0
         self._snapshot_due_ns: int | None = None
         self._snapshot_ns = int(config.snapshot_min * MINUTE_NS)
@@ -469,7 +472,7 @@ class Monitor:
         return publications
 
     def _on_row(self, row: Row, publications: list[Publication]) -> None:
-        time_ns, due_ns = row.time_ns, self._snapshot_due_ns
+        time_ns, due_ns, before = row.time_ns, self._snapshot_due_ns, len(publications)
         if self.first_ns is None or time_ns < self.first_ns:
             self.first_ns = time_ns
         if self.last_ns is not None and not row.restarted:
@@ -486,6 +489,8 @@ class Monitor:
             self._snapshot_due_ns = time_ns + self._snapshot_ns
             if due_ns is not None:
                 publications.extend(self._snapshots(time_ns))
+        if self.on_row_end is not None:
+            self.on_row_end(time_ns, publications[before:])
 
     def _snapshots(self, time_ns: int) -> list[Publication]:
         try:

@@ -10,12 +10,14 @@ Signals are scaled by mean and spread of the first rows, so that the estimator w
 Snapshots are in the signals' own units.
 """
 
+from collections.abc import Sequence
 from math import inf, isfinite, nan
 
 import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.baseline.training_record import check_training
+from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
@@ -40,7 +42,7 @@ ROWS_A_PARAMETER = 10
 MOST_BUFFERED = 1000
 """Buffered rows; memory stays bounded."""
 
-_BREAK = (-(2**63), nan, nan)
+_BREAK: tuple[int, Sequence[float], float] = (-(2**63), (), nan)
 """Marks a gap between two buffered rows."""
 
 
@@ -50,7 +52,7 @@ class PredictorState(StoredState, frozen=True):
     Attributes:
         buffer: rows of the next regressor.
         rls: the adaptive model.
-        first_rows: rows from which the scaling will be made: doubles, input and output of each.
+        first_rows: rows from which the scaling will be made: doubles, inputs and output of each.
         scaling: scaling of the signals; None before it is known.
         reference: parameters of the reference, doubles; None before the fit.
         told: snapshot of the reference, a serialized `ModelSnapshot`; None without snapshots.
@@ -72,21 +74,21 @@ class ArxPredictor:
     """Predicts one output.
 
     Args:
-        order: order of the models.
-        delay: delay of the input in samples.
+        structure: structure of the models.
         forgetting: forgetting factor of the adaptive model.
         with_snapshots: True if a snapshot of the reference will be read.
     """
 
-    def __init__(self, order: int, delay: int, forgetting: float, *, with_snapshots: bool = True) -> None:
-        self._structure = Structure.of_order(order, delay)
+    def __init__(self, structure: Structure, forgetting: float, *, with_snapshots: bool = True) -> None:
+        self._structure = structure
         self._rls = RecursiveLeastSquares(self._structure.parameters, forgetting)
         self._buffer = RegressorBuffer(self._structure)
-        self._first_rows: list[tuple[float, float]] = []
+        self._first_rows: list[tuple[float, ...]] = []
         self._with_snapshots = with_snapshots
-        self._buffered: list[tuple[int, float, float]] = []
+        self._buffered: list[tuple[int, Sequence[float], float]] = []
         self._scaling: Scaling | None = None
-        self._scales = (0.0, 1.0, 0.0, 1.0)
+        self._input_scales: list[tuple[float, float]] = []
+        self._output_scale = 0.0, 1.0
         self._reference: Array | None = None
         self._reference_model: ModelSnapshot | None = None
         self._fitted: Rows | None = None
@@ -118,7 +120,7 @@ class ArxPredictor:
             raise ValueError(f"the state must be of {self._structure}, got {state.buffer.structure}")
         self._buffer = RegressorBuffer.from_state(state.buffer)
         self._rls = RecursiveLeastSquares.from_state(state.rls)
-        self._first_rows = [(first, second) for first, second in unpack_numbers(state.first_rows, 2).tolist()]
+        self._first_rows = [tuple(row) for row in unpack_numbers(state.first_rows, 1 + self._structure.inputs).tolist()]
         if state.scaling is not None:
             self._scale(state.scaling)
         if state.reference is not None:
@@ -128,25 +130,25 @@ class ArxPredictor:
         self._drift = None if state.drift is None else ParameterT2.from_state(state.drift)
         self._newest_drift = state.drifted
 
-    def update(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> float:
+    def update(self, time_ns: int, inputs: Sequence[float], value: float, *, follows: bool) -> float:
         """Update with a row; returns the prediction made before it, NaN if there is none.
 
         Args:
             time_ns: time of the row; later than the last row's if it follows.
-            input_value: input; NaN if missing.
+            inputs: one value an input; NaN if missing.
             value: output; NaN if missing.
             follows: True if the row before was one period ago.
         """
         if self._scaling is None:
-            self._learn_scaling(input_value, value)
+            self._learn_scaling(inputs, value)
             return nan
         if self._buffered:
             self.replay_buffer()
-        input_centre, input_spread, centre, spread = self._scales
+        centre, spread = self._output_scale
         if not follows:
             self._buffer.restart()
         scaled = (value - centre) / spread
-        regressor = self._buffer.update(time_ns, [(input_value - input_centre) / input_spread], [scaled])
+        regressor = self._buffer.update(time_ns, self._scale_inputs(inputs), [scaled])
         if regressor is None:
             return nan
         innovation = self._rls.update(regressor, scaled)
@@ -160,7 +162,7 @@ class ArxPredictor:
 
         Args:
             time_min: times in minutes, shape (rows,).
-            inputs: input values, shape (rows,); NaN if missing.
+            inputs: input values, shape (rows, inputs); NaN if missing.
             outputs: output values, shape (rows,); NaN if missing or left out.
 
         Returns:
@@ -170,8 +172,8 @@ class ArxPredictor:
         residual = np.full(time_min.size, nan)
         if self._scaling is None:
             return residual
-        input_centre, input_spread, centre, spread = self._scales
-        rows = rows_of(self._structure, (inputs - input_centre) / input_spread, (outputs - centre) / spread)
+        spread = self._output_scale[1]
+        rows = rows_of(self._structure, self._scaling.inputs(inputs), self._scaling.outputs(outputs[:, None]))
         rows = _consecutive_rows(rows, time_min, self._structure.history)
         parameters = self._structure.parameters
         if len(rows.outputs) < ROWS_A_PARAMETER * parameters:
@@ -221,28 +223,28 @@ class ArxPredictor:
         if self._drift is not None and self._reference is not None:
             self._newest_drift = self._drift.update(self._rls.parameters - self._reference, regressor)
 
-    def buffer(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> None:
+    def buffer(self, time_ns: int, inputs: Sequence[float], value: float, *, follows: bool) -> None:
         """Buffer a row for a later update; arguments as for `update`."""
         if self._scaling is None:
-            self._learn_scaling(input_value, value)
+            self._learn_scaling(inputs, value)
             return
         if not follows:
             self._buffered.append(_BREAK)
-        self._buffered.append((time_ns, input_value, value))
+        self._buffered.append((time_ns, inputs, value))
         if len(self._buffered) >= MOST_BUFFERED:
             self.replay_buffer()
 
     def replay_buffer(self) -> None:
         """Update with the buffered rows."""
         rows, self._buffered = self._buffered, []
-        input_centre, input_spread, centre, spread = self._scales
+        centre, spread = self._output_scale
         buffer, learn_row = self._buffer, self._rls.update
-        for time_ns, input_value, value in rows:
+        for time_ns, inputs, value in rows:
             if time_ns == _BREAK[0]:
                 buffer.restart()
                 continue
             scaled = (value - centre) / spread
-            regressor = buffer.update(time_ns, [(input_value - input_centre) / input_spread], [scaled])
+            regressor = buffer.update(time_ns, self._scale_inputs(inputs), [scaled])
             if regressor is not None:
                 learn_row(regressor, scaled)
                 self._compare(regressor)
@@ -263,23 +265,23 @@ class ArxPredictor:
         snapshot.CopyFrom(self._reference_model)
         return snapshot
 
-    def _learn_scaling(self, input_value: float, value: float) -> None:
-        if not (isfinite(input_value) and isfinite(value)):
+    def _learn_scaling(self, inputs: Sequence[float], value: float) -> None:
+        row = (*inputs, value)
+        if not all(map(isfinite, row)):
             return
-        self._first_rows.append((input_value, value))
+        self._first_rows.append(row)
         if len(self._first_rows) == SCALING_ROWS:
             rows = np.array(self._first_rows)
-            self._scale(Scaling.of(rows[:, 0], rows[:, 1]))
+            self._scale(Scaling.of(rows[:, :-1], rows[:, -1]))
             self._first_rows.clear()
 
     def _scale(self, scaling: Scaling) -> None:
         self._scaling = scaling
-        self._scales = (
-            scaling.input_centres[0],
-            scaling.input_spreads[0],
-            scaling.output_centres[0],
-            scaling.output_spreads[0],
-        )
+        self._input_scales = list(zip(scaling.input_centres, scaling.input_spreads, strict=True))
+        self._output_scale = scaling.output_centres[0], scaling.output_spreads[0]
+
+    def _scale_inputs(self, inputs: Sequence[float]) -> list[float]:
+        return [(value - centre) / spread for value, (centre, spread) in zip(inputs, self._input_scales, strict=True)]
 
     def _snapshot(
         self, scaled: Array, scaled_covariance: Array, condition: float, rows: int, forgetting: float
@@ -303,14 +305,13 @@ class ArxPredictor:
         )
 
 
-def fewest_rows(order: int, delay: int) -> int:
-    """Least number of consecutive rows for a reference.
+def arx_structure(config: MonitorConfig) -> Structure:
+    """Structure of the identified models that the settings ask for."""
+    return Structure.of_order(config.order, config.delay, inputs=len(config.inputs))
 
-    Args:
-        order: order of the models.
-        delay: delay of the input in samples.
-    """
-    structure = Structure.of_order(order, delay)
+
+def fewest_rows(structure: Structure) -> int:
+    """Least number of consecutive rows for a reference of a structure."""
     return structure.history + ROWS_A_PARAMETER * structure.parameters
 
 

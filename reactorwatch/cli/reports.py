@@ -32,7 +32,7 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
         "trained_until_min": minutes(result.watching_since_ns),
         "expected_false_alarms": float(f"{result.expected_false_alarms:.3g}"),
         "signals": {
-            "inputs": [name for name in (result.input,) if name not in result.left_out],
+            "inputs": [name for name in result.inputs if name not in result.left_out],
             "outputs": [name for name in result.outputs if name not in result.left_out],
             "left_out": [{"signal": name, "why": why} for name, why in result.left_out.items()],
         },

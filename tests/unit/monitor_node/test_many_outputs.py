@@ -32,7 +32,7 @@ def config_of(
     outputs: int, training_rows: int, charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
 ) -> MonitorConfig:
     return MonitorConfig(
-        input="u",
+        inputs=("u",),
         outputs=tuple(f"y{number}" for number in range(outputs)),
         training_min=training_rows * 0.1,
         charts=charts,
@@ -45,7 +45,7 @@ def config_of(
 def watch(monitor: Monitor, values: Rows, first: int = 0, row_ns: int = ROW_NS) -> list[Publication]:
     """Let a monitor watch rows; what it says."""
     said: list[Publication] = []
-    names = (monitor.config.input, *monitor.config.outputs)
+    names = monitor.config.signals
     for row in range(first, values.shape[1]):
         for name, value in zip(names, values[:, row].tolist(), strict=True):
             if np.isnan(value):
