@@ -113,7 +113,7 @@ def _logged(out: np.ndarray[tuple[int, int], np.dtype[np.bool_]], times: list[in
     rises = (out & ~np.column_stack([np.zeros(len(out), bool), out[:, :-1]])).any(axis=0)
     return [
         LoggedRow(time_ns, bool(active), bool(raised))
-        for time_ns, active, raised in zip(times, out.any(axis=0), rises, strict=True)
+        for time_ns, active, raised in zip(times, np.any(out, axis=0).tolist(), rises.tolist(), strict=True)
     ]
 
 

@@ -25,7 +25,7 @@ def faulty_record(rows: int = 2000) -> Record:
         x[k] = 0.7 * x[k - 1] - 0.3 * (u[k - 1] - 100.0)
     fault = np.where((np.arange(rows) >= 1500) & (np.arange(rows) < 1700), 1.5, 0.0)
     columns = {"u": u, "y": 50.0 + x + fault + rng.normal(0, 0.2, rows), "z": 7.0 - x + rng.normal(0, 0.2, rows)}
-    return Record(np.arange(rows) * 0.1, columns, "made")
+    return Record(np.linspace(0.0, 0.1 * (rows - 1), rows), columns, "made")
 
 
 def test_alarms_are_the_runs_of_rows_that_are_out() -> None:
