@@ -221,7 +221,8 @@ def run(
         if bus is None:
             return
         try:
-            log.info("listening", plant=config.plant, training_min=config.training_min)
+            length = config.training_length
+            log.info("listening", plant=config.plant, training_min=length.minutes, training_rows=length.rows or None)
             on_publish = metrics.observe(node.alarms.all_alarms) if metrics is not None else None
             loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
             # All samples published since the state was stored, however long ago; the node skips those it knows.

@@ -59,6 +59,7 @@ class Monitor:
         last_ns: time of the last row; None before the first.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
         received: number of messages so far.
+        on_row_end: called after each row with its time and the publications because of it; None: not called.
         stats: statistics by receive time, which a restart resets.
     """
 
@@ -95,6 +96,7 @@ class Monitor:
         self._watching_since_ns: int | None = None
         self.received = 0
         self.stats = ReceiveStats(start_ns, start_ns)
+        self.on_row_end: Callable[[int, list[Publication]], None] | None = None
         self._published = 0
         self._snapshot_due_ns: int | None = None
         self._snapshot_ns = int(config.snapshot_min * MINUTE_NS)
@@ -470,7 +472,7 @@ class Monitor:
         return publications
 
     def _on_row(self, row: Row, publications: list[Publication]) -> None:
-        time_ns, due_ns = row.time_ns, self._snapshot_due_ns
+        time_ns, due_ns, before = row.time_ns, self._snapshot_due_ns, len(publications)
         if self.first_ns is None or time_ns < self.first_ns:
             self.first_ns = time_ns
         if self.last_ns is not None and not row.restarted:
@@ -487,6 +489,8 @@ class Monitor:
             self._snapshot_due_ns = time_ns + self._snapshot_ns
             if due_ns is not None:
                 publications.extend(self._snapshots(time_ns))
+        if self.on_row_end is not None:
+            self.on_row_end(time_ns, publications[before:])
 
     def _snapshots(self, time_ns: int) -> list[Publication]:
         try:

@@ -31,7 +31,7 @@ from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.health import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
-from monitor_node.ingest.sampling import SamplingPeriod
+from monitor_node.ingest.sampling import SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.signal_checks.stage import SignalChecks
@@ -87,6 +87,7 @@ class PlantPipeline:
         is_normal: True if the compiled step may take the next row, see `row_step`.
         left_out: signals that are not monitored, with the reason, after the training.
         signals: signal checks.
+        training_rows: number of rows of the training, after its end.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class PlantPipeline:
         self._board = board
         self._points = points
         self.model = _model(config, model)
-        self._is_process = self._is_process_given = model is not None or config.reference == "process"
+        self._is_process = self._is_process_given = model is not None or config.reference == "equations"
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
         self._numbers: Records = np.zeros(1, numbers_type(config))
@@ -131,9 +132,11 @@ class PlantPipeline:
         self._evaluated = [True] * len(config.outputs)
         self._start_training(None)
         self._promise_checked = False
+        self._is_training_open = False
         self.notes: list[str] = []
         self.rows_watched = 0
         self.is_normal = False
+        self.training_rows = 0
         self.left_out: dict[str, str] = {}
         self._noted: set[str] = set()
 
@@ -270,7 +273,7 @@ class PlantPipeline:
             return 1.0
         if self._began_ns is None or last_ns is None:
             return 0.0
-        return min(max((last_ns - self._began_ns) / MINUTE_NS / self._config.training_min, 0.0), 1.0)
+        return max(self._config.training_length.share((last_ns - self._began_ns) / MINUTE_NS, self._training.rows), 0.0)
 
     @property
     def refused_trainings(self) -> int:
@@ -342,6 +345,44 @@ class PlantPipeline:
 
     # --- training --------------------------------------------------------------------------------------------
 
+    def open_training(self) -> None:
+        """Train until `end_training`, on all rows until then."""
+        self._is_training_open = True
+        self._training.keep_all_rows()
+
+    def end_training(self, time_ns: int) -> None:
+        """End the training with the rows so far; the next row is the first of another run of the plant.
+
+        Args:
+            time_ns: time of the last row.
+
+        Raises:
+            InputError: there are too few rows to learn from, or no output can be watched.
+        """
+        if not self._training.is_enough([False] * len(self._config.outputs)):
+            raise InputError(
+                f"must have at least {self._training.fewest_rows} rows with a value of each output to learn from, got "
+                f"{self._training.rows} rows"
+            )
+        rows, self.training_rows = self._training.state, self._training.rows
+        trained = self._training.finish(last_chance=True)
+        if trained.refused:
+            raise InputError(f"there is no output to watch: {trained.refused}")
+        self._start(trained)
+        self._start_diagnosis(rows)
+        self._change_model(time_ns, [])
+
+    def start_run(self) -> None:
+        """Expect the first row of another run of the plant, whose times are unrelated to those of the training."""
+        self._sampling.state = SamplingState(period_ns=self._sampling.state.period_ns)
+        if self._reference is not None:
+            self._reference.restart()
+        self._quarantined = (False,) * len(self._config.outputs)
+        for whitener in self._whiteners:
+            whitener.restart()
+        self.signals.restart()
+        self.signals.reset()
+
     def _start_training(self, time_ns: int | None) -> None:
         config = self._config
         self._began_ns = time_ns
@@ -357,11 +398,10 @@ class PlantPipeline:
             self._promise_checked = True
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
-        trained_min = (time_ns - self._began_ns) / MINUTE_NS
-        if trained_min >= config.training_min and self._training.is_enough(
-            self.signals.silence.silent[len(config.inputs) :]
-        ):
-            rows = self._training.state
+        share = config.training_length.share((time_ns - self._began_ns) / MINUTE_NS, self._training.rows)
+        timed_out = self.signals.silence.silent[len(config.inputs) :]
+        if share >= 1.0 and not self._is_training_open and self._training.is_enough(timed_out):
+            rows, self.training_rows = self._training.state, self._training.rows
             trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
             if trained.refused:
                 self._refusals += 1
@@ -674,8 +714,9 @@ def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | 
     if config.reference == "auto" and not given:
         return None
     raise InputError(
-        f"reference 'process' needs the signals of {model.name}, inputs {', '.join(model.input_names)} and outputs of "
-        f"{', '.join(model.output_names)}, got {', '.join(config.inputs) or 'none'} and {', '.join(config.outputs)}; "
+        f"reference 'equations' needs the signals of {model.name}, inputs {', '.join(model.input_names)} and outputs "
+        f"of {', '.join(model.output_names)}, got {', '.join(config.inputs) or 'none'} and "
+        f"{', '.join(config.outputs)}; "
         'set reference = "arx"'
     )
 

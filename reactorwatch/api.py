@@ -38,7 +38,7 @@ from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.identify import Identification, ModelForm
 from reactorwatch.identification.identify import identify as identify_model
-from reactorwatch.process import MODELS, effects_of
+from reactorwatch.process import MODELS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
@@ -65,7 +65,7 @@ def effects(process: ProcessLike = "cstr") -> tuple[Effect, ...]:
     >>> effects("tanks")[0].name
     'pump_gain'
     """
-    return find_process(process).effects
+    return find_process(process).causes
 
 
 def read_record(
@@ -162,10 +162,12 @@ class DiagnosisResult(Diagnosis):
     Attributes:
         record: the measured record.
         model: the simulation before it was extended.
+        effects: possible causes.
     """
 
     record: Record = field(kw_only=True, repr=False, compare=False)
     model: ProcessModel = field(kw_only=True, repr=False, compare=False)
+    effects: tuple[Effect, ...] = field(kw_only=True, repr=False, compare=False)
 
     @property
     def extended(self) -> ProcessModel:
@@ -185,7 +187,7 @@ class DiagnosisResult(Diagnosis):
         from reactorwatch.diagnosis.report.page import as_page
 
         names = (self.record.name, "extended.json", "experiment.csv")
-        page = as_page(self, self.model, effects_of(self.model), *names, on_the_bus=False)
+        page = as_page(self, self.model, self.effects, *names, on_the_bus=False)
         with atomic_write(Path(file)) as temporary:
             temporary.write_text(page, encoding="utf-8")
 
@@ -195,6 +197,7 @@ def diagnose(
     process: ProcessLike = "cstr",
     *,
     effects: tuple[Effect, ...] | None = None,
+    without: Sequence[str] = (),
     uncertain: Mapping[str, float] | None = None,
     tolerance: Mapping[str, float] | None = None,
     limits: Mapping[str, tuple[float, float]] | None = None,
@@ -205,6 +208,7 @@ def diagnose(
         record: with the inputs and outputs of the process.
         process: the simulation.
         effects: causes to search; None: those of the process.
+        without: names of causes of the process that are left out.
         uncertain: standard deviations of parameters that are known only roughly, by name.
         tolerance: differences that do not matter in practice, by output.
         limits: smallest and largest value of signals that a proposed experiment may reach.
@@ -212,13 +216,13 @@ def diagnose(
     Raises:
         InputError: the record cannot be diagnosed, or an argument is outside its range.
     """
-    model = _model_of(process, record)
+    described, model = find_process(process, record.zero_ns), _model_of(process, record)
     make_run(record, model)
-    found = find_causes(
-        record, model, effects, dict(tolerance or {}) or None, dict(uncertain or {}), dict(limits or {}) or None
-    )
+    causes = described.select_causes(without) if effects is None else effects
+    known = described.uncertain | dict(uncertain or {})
+    found = find_causes(record, model, causes, dict(tolerance or {}) or None, known, dict(limits or {}) or None)
     values = {item.name: getattr(found, item.name) for item in fields(found)}
-    return DiagnosisResult(**values, record=record, model=model)
+    return DiagnosisResult(**values, record=record, model=model, effects=causes)
 
 
 class Suspect(msgspec.Struct, frozen=True):

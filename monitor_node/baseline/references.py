@@ -367,7 +367,7 @@ def output_indices(model: ProcessModel, outputs: tuple[str, ...]) -> list[int]:
     for output in outputs:
         if output not in model.output_names:
             raise InputError(
-                f"reference 'process' needs outputs of the reactor, {', '.join(model.output_names)}, got {output!r}; "
+                f"reference 'equations' needs outputs of the process, {', '.join(model.output_names)}, got {output!r}; "
                 f'set reference = "arx"'
             )
     return [model.output_names.index(output) for output in outputs]

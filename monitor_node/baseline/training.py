@@ -120,7 +120,8 @@ class Training:
         self._counts = [0] * len(config.outputs)
         of_one_input = replace(structure := arx_structure(config), inputs=min(structure.inputs, 1))
         of_identified = max(fewest_rows(of_one_input), FEWEST_ROWS)
-        self._fewest_rows = FEWEST_ROWS if model is not None else of_identified
+        self.fewest_rows = FEWEST_ROWS if model is not None else of_identified
+        """Least number of values of each output that a training needs."""
 
     @property
     def state(self) -> TrainingState:
@@ -138,6 +139,8 @@ class Training:
         times_ns, rows = unpack_times(state.times_ns), unpack_numbers(state.rows, inputs + outputs).tolist()
         if len(times_ns) != len(rows) or len(state.known) != outputs:
             raise ValueError(f"a training must have a time a row and {outputs} counts, got {len(times_ns)} times")
+        if len(times_ns) > MOST_ROWS:
+            self.keep_all_rows()
         self._rows.extend(
             (time_ns, tuple(row[:inputs]), row[inputs:]) for time_ns, row in zip(times_ns, rows, strict=True)
         )
@@ -158,6 +161,15 @@ class Training:
         for index, value in enumerate(values):
             self._counts[index] += isfinite(value)
 
+    @property
+    def rows(self) -> int:
+        """Number of rows so far."""
+        return len(self._rows)
+
+    def keep_all_rows(self) -> None:
+        """Use all rows of the training, however many they are."""
+        self._rows = deque(self._rows)
+
     def is_enough(self, timed_out: list[bool]) -> bool:
         """True if there are enough rows, without regard to outputs whose data timeout is active.
 
@@ -165,7 +177,7 @@ class Training:
             timed_out: one flag an output.
         """
         counts = [count for count, is_out in zip(self._counts, timed_out, strict=True) if not is_out]
-        return min(counts, default=0) >= self._fewest_rows
+        return min(counts, default=0) >= self.fewest_rows
 
     def finish(self, *, last_chance: bool) -> TrainingResult:
         """Learn from the rows, and drop them.
@@ -260,7 +272,7 @@ class Training:
 
         z, process_screenings = _refit_without_outliers(innovations, outputs)
         residuals = z * np.array(process[-1].typical_sd)
-        if self._config.reference == "process" or _predicts_as_well(residuals, identified):
+        if self._config.reference == "equations" or _predicts_as_well(residuals, identified):
             return process[-1], z, process_screenings
         return self._arx_reference(given_inputs), identified, screenings
 
@@ -269,7 +281,7 @@ class Training:
         columns, ranges = np.column_stack([inputs, measured]), signal_ranges(self._model, self._config.signals)
         lower, upper = np.array([(item.lower, item.upper) for item in ranges]).T
         out = np.isfinite(columns) & ((columns < lower) | (columns > upper))
-        if self._config.reference != "process" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):
+        if self._config.reference != "equations" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):
             return None
         columns = np.where(out, np.nan, columns)
         return columns[:, : inputs.shape[1]], columns[:, inputs.shape[1] :]

@@ -1,4 +1,4 @@
-"""Layout 3 of a monitor's state: a plant had one input."""
+"""Layout 3 of a monitor's state: a plant had one input, and the equations were called `process`."""
 
 from typing import Any
 
@@ -13,7 +13,9 @@ def upgrade(body: bytes) -> bytes:
     """
     try:
         fields: dict[str, Any] = msgspec.msgpack.decode(body, type=dict[str, Any])
-        fields["settings"]["inputs"] = [fields["settings"].pop("input")]
+        settings = fields["settings"]
+        settings["inputs"] = [settings.pop("input")]
+        settings["reference"] = {"process": "equations"}.get(settings["reference"], settings["reference"])
         watched = fields["watch"]["watched"]
         if watched is not None:
             _upgrade_reference(watched["reference"], len(fields["settings"]["outputs"]))

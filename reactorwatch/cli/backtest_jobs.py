@@ -104,7 +104,7 @@ def run_job(job: Job) -> JobResult:
 def _units(settings: MonitorConfig) -> dict[str, str] | None:
     """Units of the signals; None if the settings name no process."""
     model = read_model_on_bus_clock(settings.model)
-    if model is None and settings.reference == "process":
+    if model is None and settings.reference == "equations":
         model = cstr()
     return None if model is None else model.units
 

@@ -15,7 +15,8 @@ from typing import Any, Generic, TypeVar
 import msgspec
 import typer
 
-from reactorwatch.cli.printing import print_lines, print_text
+from reactorwatch.cli.display import print_report
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.read_record import expand_folder
 from reactorwatch.errors import InputError
@@ -123,7 +124,7 @@ def run_jobs(
     if len(jobs) == 1 and scheduler is None:
         with task(f"{kind.doing} {files[0].name}"):
             result = kind.work(jobs[0])
-        print_text(result.text)
+        print_report(result.text, as_json=as_json)
         write_remark(files[0], result.remark)
         if result.not_written:
             raise InputError(result.not_written)
@@ -135,14 +136,14 @@ def run_jobs(
             print_lines(f"reactorwatch: {file}: {reason}", err=True)
             rows.append({"file": str(file), **dict.fromkeys(kind.columns), "error": reason})
         else:
-            print_text(outcome.text)
+            print_report(outcome.text, as_json=as_json)
             write_remark(file, outcome.remark)
             if outcome.not_written:
                 print_lines(f"reactorwatch: {file}: {outcome.not_written}", err=True)
             rows.append(outcome.row)
     failed = sum(bool(row["error"]) for row in rows)
     if len(rows) > 1 and not as_json:
-        print_text(f"\n{kind.summary(rows)}")
+        print_report(f"\n{kind.summary(rows)}")
     if len(rows) > 1 and out is not None and failed < len(rows):
         write_summary(out, rows)
     if failed:

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from reactorwatch.cli.display import print_report
 from reactorwatch.cli.options import (
     Columns,
     Force,
@@ -58,9 +59,9 @@ def identify(
         int, typer.Option(help="Held-out rows that may set the state of the free run, and are left out of fits.")
     ] = 0,
     recursive: Annotated[bool, typer.Option("--recursive", help="Learn row by row, as the monitor does.")] = False,
-    report_rows: Annotated[
-        bool, typer.Option("--report-rows", help="Fit every 6th row from the 100th on, as the original report did.")
-    ] = False,
+    scheme: Annotated[
+        str, typer.Option(help="least-squares, or report: as the original report fits (arx and oe).")
+    ] = "least-squares",
     compare: Annotated[
         bool, typer.Option("--compare", help="Compare ARX and OE of orders 1 to --order, and choose.")
     ] = False,
@@ -79,10 +80,9 @@ def identify(
     from reactorwatch.cli.read_record import record
     from reactorwatch.cli.unit_remarks import unit_remark
     from reactorwatch.identification.identify import ModelForm
-    from reactorwatch.identification.structure import ALL_ROWS, REPORT_ROWS
 
     described, outputs = identification.choose_outputs(process, split_names(inputs), split_names(output))
-    form = ModelForm(model, order, delay, recursive=recursive, choice=REPORT_ROWS if report_rows else ALL_ROWS)
+    form = ModelForm(model, order, delay, recursive=recursive, scheme=scheme)
     if compare and (validate is not None or settle):
         raise InputError("--compare chooses by the second half of FILE: leave --validate and --settle out")
     measured, held_out = (
@@ -98,7 +98,7 @@ def identify(
         else:
             validation = identification.Validation(held_out, settle)
             text = identification.fit(measured, described.inputs, outputs, form, validation, as_json=as_json)
-    print_text(text)
+    print_report(text, as_json=as_json)
     write_remark(file, remark)
 
 
@@ -116,12 +116,10 @@ def linearise(
 def reproduce(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for study.md and its pictures.", show_default=False)],
     seed: Annotated[int, typer.Option(help="Of every simulated record.", min=0)] = 1,
-    only: Annotated[str | None, typer.Option(help="Figures, such as 7,12 [4 to 20].", show_default=False)] = None,
+    only: Annotated[str | None, typer.Option(help="Figures by number, such as 7,12 [all].", show_default=False)] = None,
     file: Annotated[
         Path | None,
-        typer.Option(
-            "--record", help="A record that figures 14 to 17 learn from, not a simulated one.", show_default=False
-        ),
+        typer.Option("--record", help="A record that figures 5, 6, 11 to 16 learn from.", show_default=False),
     ] = None,
     plant: Plant = None,
     column: Columns = None,

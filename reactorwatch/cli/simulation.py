@@ -10,7 +10,7 @@ from plant_node.initial_state import complete_state
 from reactorwatch.diagnosis.impossible_values import check_values
 from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
-from reactorwatch.process import effects_of
+from reactorwatch.process import named_effects
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
@@ -36,7 +36,7 @@ def simulate_along(measured: Record, model: ProcessModel, faults: list[str]) -> 
 def _simulate_run(measured: Record, model: ProcessModel, faults: list[str], *, alone: bool) -> Record:
     """Simulate along one run of a record; a single row among other runs is returned unchanged."""
     for text in faults:
-        model = parse_fault(text, effects_of(model)).extend(model, end_min=float(measured.time_min[-1]))
+        model = parse_fault(text, named_effects(model)).extend(model, end_min=float(measured.time_min[-1]))
     wrong = find_wrong_unit(model, measured.columns, measured.time_min)
     if wrong is not None and not wrong.of_times:  # it may be short, and its rows far apart
         raise InputError(f"{measured.name}: {wrong.text}")

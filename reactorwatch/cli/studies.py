@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from reactorwatch.cli.display import print_report
 from reactorwatch.cli.options import (
     Columns,
     Files,
@@ -22,8 +23,8 @@ from reactorwatch.cli.options import (
     parse_columns,
     parse_limits,
     parse_tolerances,
+    split_names,
 )
-from reactorwatch.cli.printing import print_text
 from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS, FileFormat
@@ -56,23 +57,24 @@ def simulate(
     They start from its first row and run freely, driven by its inputs.
     """
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.read_record import record
+    from reactorwatch.cli.read_record import described_process, process_on_clock, record
     from reactorwatch.cli.simulation import report, simulate_along
     from reactorwatch.description.choice import ProcessChoice
     from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
 
     choice = ProcessChoice(process)
     out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
-    measured = record(check_recording(file), plant, parse_columns(column), choice.load(), stated=stated)
-    model = choice.load_model(measured.zero_ns)
+    described = described_process(check_recording(file), plant, choice)
+    measured = record(file, plant, parse_columns(column), described, stated=stated)
+    model = process_on_clock(choice, described, measured.zero_ns).require_model()
     with task(f"simulating {file.name}"):
         simulated = simulate_along(measured, model, fault or [])
         try:
             write_table(out, simulated)
         except InputError:
-            print_text(report(measured, simulated, model, None, as_json=as_json))
+            print_report(report(measured, simulated, model, None, as_json=as_json), as_json=as_json)
             raise
-    print_text(report(measured, simulated, model, out, as_json=as_json))
+    print_report(report(measured, simulated, model, out, as_json=as_json), as_json=as_json)
 
 
 def backtest(
@@ -144,6 +146,12 @@ def diagnose(
         ),
     ] = None,
     process: Process = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--without", help="A cause that is left out (repeatable); nothing takes its place.", show_default=False
+        ),
+    ] = None,
     plant: Plant = None,
     column: Columns = None,
     jobs: Processes = None,
@@ -169,6 +177,7 @@ def diagnose(
         parse_tolerances(tolerance),
         parse_limits(limit),
         stated=stated,
+        without=split_names(without),
     )
     todo = make_jobs(named, out, asked, as_json=as_json, elsewhere=scheduler is not None)
     run_jobs(DIAGNOSIS, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)

@@ -7,7 +7,6 @@ from reactorwatch.description.catalogue import Catalogue, check_process
 from reactorwatch.description.process import Process, describe_model
 from reactorwatch.description.toml_file import parse_process
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.process import effects_of
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.input_file import wrap_read_errors
@@ -37,7 +36,7 @@ def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS,
     if isinstance(process, Process):
         return process
     if isinstance(process, ProcessModel):
-        return describe_model(process, effects_of(process))
+        return describe_model(process)
     path = Path(process)
     kind = path.suffix.lower()
     if kind not in FILE_KINDS:
@@ -55,7 +54,7 @@ def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS,
             return check_process(_call_function(path), f"{FUNCTION}()")
         extended = parse_extended_model(content)
         model = (extended.rebase(zero_ns) if zero_ns else extended).build()
-        return describe_model(model, effects_of(model))
+        return describe_model(model)
     except InputError as error:
         raise InputError(f"process file {path}: {error}") from error
 

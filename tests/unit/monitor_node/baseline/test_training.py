@@ -103,5 +103,5 @@ def test_the_process_model_of_another_plant_is_refused_in_one_line(setting: dict
     from monitor_node.core import Monitor
     from reactorwatch.errors import InputError
 
-    with pytest.raises(InputError, match="reference 'process' needs the signals of cstr"):
+    with pytest.raises(InputError, match="reference 'equations' needs the signals of cstr"):
         Monitor(MonitorConfig(**setting), 0)  # type: ignore[arg-type]
