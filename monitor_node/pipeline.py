@@ -138,6 +138,7 @@ class PlantPipeline:
         self.is_normal = False
         self.training_rows = 0
         self.left_out: dict[str, str] = {}
+        self._noted: set[str] = set()
 
     # --- state -----------------------------------------------------------------------------------------------
 
@@ -215,7 +216,7 @@ class PlantPipeline:
 
     def _restore_reference(self, state: ProcessReferenceState | ArxReferenceState) -> Reference:
         if isinstance(state, ArxReferenceState):
-            return ArxReference.from_state(state)
+            return ArxReference(state)
         if self.equations is None:
             raise ValueError("the state must be of a plant without a process model")
         return ProcessReference.from_state(state, self.equations, self._config.outputs)
@@ -634,6 +635,8 @@ class PlantPipeline:
             for whitener in self._whiteners:
                 whitener.restart()
         predictions, sds = reference.update(time_ns, row.inputs, values, self._quarantined, row.interval.missing)
+        if isinstance(reference, ArxReference):
+            self._note_inputs_beyond(reference, row.inputs)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
@@ -653,6 +656,16 @@ class PlantPipeline:
             publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
             publications.extend(self._search_causes(row, stuck))
+
+    def _note_inputs_beyond(self, reference: ArxReference, inputs: Sequence[float]) -> None:
+        """Note once each input that leaves its range in the training, as rows are not judged then."""
+        for name in (self._config.inputs[i] for i in reference.find_beyond(inputs)):
+            if name not in self._noted:
+                self._noted.add(name)
+                self.notes.append(
+                    f"rows are not judged while {name} is beyond its range in the training: the identified model does "
+                    "not hold there"
+                )
 
     def _note_late_signals(self, inputs: Sequence[float], values: list[float]) -> None:
         """Note once each signal whose first value arrives after the training."""
