@@ -703,8 +703,7 @@ def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | 
     raise InputError(
         f"reference 'equations' needs the signals of {model.name}, inputs {', '.join(model.input_names)} and outputs "
         f"of {', '.join(model.output_names)}, got {', '.join(config.inputs) or 'none'} and "
-        f"{', '.join(config.outputs)}; "
-        'set reference = "arx"'
+        f'{", ".join(config.outputs)}; set reference = "arx"'
     )
 
 

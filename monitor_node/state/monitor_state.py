@@ -27,7 +27,7 @@ UPGRADES = {2: lambda body: version_3.upgrade(version_2.upgrade(body)), 3: versi
 SEAL = Seal(MAGIC, 4, "state of a monitor", UPGRADES)
 
 NOT_LEARNED_BY = frozenset(
-    {"model", "alarm_state_file", "state_file", "state_every_s", "health_period_s", "diagnose_training"}
+    {"process", "alarm_state_file", "state_file", "state_every_s", "health_period_s", "diagnose_training"}
 )
 """Settings that do not change what was learned; the model is identified by its equations, not by its file."""
 
@@ -89,6 +89,8 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
     for name in TRAINING:
         if fields[name] is None:
             del fields[name]
+    if model is not None:
+        del fields["units"]  # the equations have their own
     fields |= {"points": points, "equations": fingerprint(model)}
     settings: dict[str, Any] = msgspec.msgpack.decode(msgspec.msgpack.encode(fields))  # as they are read back
     return settings

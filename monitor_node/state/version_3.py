@@ -15,6 +15,8 @@ def upgrade(body: bytes) -> bytes:
         fields: dict[str, Any] = msgspec.msgpack.decode(body, type=dict[str, Any])
         settings = fields["settings"]
         settings["inputs"] = [settings.pop("input")]
+        if not settings["equations"]:
+            settings["units"] = {}
         settings["reference"] = {"process": "equations"}.get(settings["reference"], settings["reference"])
         watched = fields["watch"]["watched"]
         if watched is not None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
+from reactorwatch.api.files import messages
 from reactorwatch.cli.bus_settings import (
     VIEWER,
     load_bus_settings,
@@ -22,7 +23,6 @@ from reactorwatch.cli.bus_settings import (
 from reactorwatch.cli.printing import print_lines, print_text
 from reactorwatch.cli.processes import Processes, settings_text
 from reactorwatch.cli.progress import bar, task
-from reactorwatch.cli.read_record import messages
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.contract.codec import Encoded, decode

@@ -9,8 +9,8 @@ from typing import TypeAlias
 import msgspec
 import numpy as np
 
+from reactorwatch.api.files import described_process, process_on_clock, record
 from reactorwatch.cli.options import check_recording
-from reactorwatch.cli.read_record import described_process, process_on_clock, record
 from reactorwatch.cli.report_origin import report_origin
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose

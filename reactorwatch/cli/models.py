@@ -74,10 +74,10 @@ def identify(
     stated: FileFormat = GUESS,
 ) -> None:
     """Fit models of the outputs to one half, validate them on the other."""
+    from reactorwatch.api.files import record
     from reactorwatch.cli import identification
     from reactorwatch.cli.batch import write_remark
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.read_record import record
     from reactorwatch.cli.unit_remarks import unit_remark
     from reactorwatch.identification.identify import ModelForm
 
@@ -128,7 +128,7 @@ def reproduce(
     force: Force = False,
 ) -> None:
     """Draw every figure of the original report (source tree, reactorwatch[pictures])."""
-    from reactorwatch.cli.read_record import record
+    from reactorwatch.api.files import record
 
     try:
         from benchmarks.study_figures.reproduce import check_out

@@ -14,17 +14,19 @@ from reactorwatch.cli.options import (
     Endpoint,
     Inputs,
     Json,
-    Model,
     Outputs,
     Plant,
     Process,
+    Reference,
     Settings,
-    check_input,
+    TrainingMin,
+    TrainingRows,
     check_recording,
     choose_process,
     parse_columns,
     parse_pace,
     parse_span_ns,
+    training_flags,
 )
 from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.table_options import take_table_options
@@ -107,10 +109,10 @@ def monitor(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    training: Annotated[
-        float | None, typer.Option("--training", help="Minutes of plant time to learn from [100].", show_default=False)
-    ] = None,
-    model: Model = None,
+    training: TrainingMin = None,
+    training_rows: TrainingRows = None,
+    process: Process = None,
+    reference: Reference = None,
     diagnose: Diagnose = None,
     state: Annotated[
         Path | None,
@@ -143,7 +145,8 @@ def monitor(
     from reactorwatch.runtime.config import LogConfig, section
 
     tables, bus = _settings(config, endpoint)
-    flags = {"plant": name, "training_min": training, "model": str(check_input(model)) if model is not None else None}
+    flags: dict[str, Any] = {"plant": name, "process": process, "reference": reference}
+    flags |= training_flags(tables, training, training_rows)
     of_fleet = {"plants": plants, "shard": shard, "state": str(state) if state is not None else None}
     fleet = section(FleetConfig, "fleet", tables, of_fleet)
     if state is not None and fleet.plants is None:

@@ -24,15 +24,14 @@ from reactorwatch.cli.bus_settings import (
     write_node_settings,
 )
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
+from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.output import check_folder_name
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import stop_on_signals
 from reactorwatch.runtime.logs import configure
-from reactorwatch.runtime.model_file import read_extended_model
 from recorder.__main__ import first_file
 from recorder.config import RecorderConfig
 from recorder.policy.file_names import ENDING
@@ -118,7 +117,7 @@ def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig
     Raises:
         InputError: invalid settings, or a folder that is a file.
     """
-    of_monitor = {"plant": monitor.plant, **({"model": monitor.model} if monitor.model else {})}
+    of_monitor = {"plant": monitor.plant, **({"model": monitor.process} if monitor.process else {})}
     tables = {"diagnosis": {**of_monitor, **tables.get("diagnosis", {})}}
     settings = section(DiagnosisConfig, "diagnosis", tables, {"out": str(out) if out is not None else None})
     if settings.out is not None:
@@ -134,7 +133,7 @@ def check_against_model(config: DiagnosisConfig) -> None:
     Raises:
         InputError: there is no such model, or a tolerance is for none of its outputs.
     """
-    model = cstr() if config.model is None else read_extended_model(Path(config.model)).build()
+    model = find_process(config.model or DEFAULT_PROCESS).require_model()
     try:
         check_tolerance(model, config.tolerance)
     except InputError as error:

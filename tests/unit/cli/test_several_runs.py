@@ -12,9 +12,9 @@ from monitor_node.replay.backtest import run as watch
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import HeldRecord
+from reactorwatch.api.backtest_report import backtest_object, backtest_text
+from reactorwatch.api.simulation import report, simulate_along
 from reactorwatch.cli import identification
-from reactorwatch.cli.reports import backtest_object, backtest_text
-from reactorwatch.cli.simulation import report, simulate_along
 from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
