@@ -63,10 +63,11 @@ POINT = 5
 Records: TypeAlias = NDArray[np.void]
 
 
-def row_type(outputs: int, alarms: int) -> np.dtype[Any]:
+def row_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
     """Type of the numbers of a plant's stages, composed of the stages' own; the filter has its belief elsewhere.
 
     Args:
+        inputs: number of inputs.
         outputs: number of monitored outputs.
         alarms: number of alarms that the charts can raise.
     """
@@ -75,8 +76,8 @@ def row_type(outputs: int, alarms: int) -> np.dtype[Any]:
             ("last_ns", "i8"),  # time of the newest row
             ("period_ns", "f8"),  # sampling period
             ("time_min", "f8"),  # time of the filter's newest row
-            ("input", "f8"),  # input of that row
-            ("timeouts", TIMEOUT, (2 + outputs,)),  # of the plant, the input and each output
+            ("inputs", "f8", (inputs,)),  # inputs of that row
+            ("timeouts", TIMEOUT, (1 + inputs + outputs,)),  # of the plant, each input and each output
             ("whiteners", WHITENER, (outputs,)),
             ("stuck", STUCK, (outputs,)),
             ("spike_limits", "f8", (outputs,)),
@@ -90,17 +91,18 @@ def row_type(outputs: int, alarms: int) -> np.dtype[Any]:
     )
 
 
-def work_type(outputs: int, alarms: int) -> np.dtype[Any]:
+def work_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
     """Type of the results of a step.
 
     Args:
+        inputs: number of inputs.
         outputs: number of monitored outputs.
         alarms: number of alarms that the charts can raise.
     """
     rows = SETTINGS + max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
     return np.dtype(
         [
-            ("new", "f8", (5 + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
+            ("new", "f8", (3 + 2 * inputs + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
             ("outputs", "f8", (5 * outputs + 1,)),  # its results
             ("expected", "f8", (outputs,)),  # expected values of the prewhitening filters
             ("e", "f8", (outputs,)),  # prewhitened residuals
@@ -111,17 +113,18 @@ def work_type(outputs: int, alarms: int) -> np.dtype[Any]:
     )
 
 
-def settings_type(outputs: int, alarms: int) -> np.dtype[Any]:
+def settings_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
     """Type of the constants of a step.
 
     Args:
+        inputs: number of inputs.
         outputs: number of monitored outputs.
         alarms: number of alarms that the charts can raise.
     """
     return np.dtype(
         [
             ("filter_address", "i8"),  # address of the filter's machine code
-            ("ranges", "f8", (1 + outputs, 2)),  # smallest and largest value of each signal
+            ("ranges", "f8", (inputs + outputs, 2)),  # smallest and largest value of each signal
             ("silence_limit", "f8"),  # see `DataTimeout`
             ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
             ("rules", "i8", (max(alarms, 1), 2)),  # violating points that raise each alarm, mask of its window
@@ -157,13 +160,17 @@ def _predict(
     values: Array,
 ) -> bool:
     """Filter a row that is at most two integration steps after the one before; returns True if all went well."""
-    count, new = values.size - 1, work.new
+    inputs, new = p.inputs.size, work.new
+    count = values.size - inputs
     step = 0.5 * (time_min - p.time_min)
     if not (step > 0.0 and 2.0 * step <= LONGEST_ROW_MIN):
         return False
-    new[0], new[1], new[2], new[3], new[4] = p.input, values[0], time_min, step, step
+    for i in range(inputs):
+        new[i], new[inputs + i] = p.inputs[i], values[i]
+    row = 2 * inputs
+    new[row], new[row + 1], new[row + 2] = time_min, step, step
     for i in range(count):
-        new[5 + i], new[5 + count + i] = values[1 + i], GATE
+        new[row + 3 + i], new[row + 3 + count + i] = values[inputs + i], GATE
     first = parameters.size - variances.size
     for i in range(variances.size):
         parameters[first + i] = variances[i]
@@ -260,7 +267,7 @@ def step(
         plant: index of the plant.
         time_ns: time of the row.
         time_min: the same in minutes.
-        values: values of the row, the input first.
+        values: values of the row, the inputs first.
     """
     scratch[0] = numbers[plant]
     p, work, settings = scratch[0], works[0], constants[0]
@@ -276,9 +283,10 @@ def step(
     for i in range(p.timeouts.size):
         if update_timeout(p.timeouts[i], time_ns, True, settings.silence_limit, -1)[0]:
             return EVENT
-    outputs = values.size - 1
+    inputs = p.inputs.size
+    outputs = values.size - inputs
     for i in range(outputs):
-        value, whitener = values[1 + i], p.whiteners[i]
+        value, whitener = values[inputs + i], p.whiteners[i]
         take_reading(p.stuck[i], value)
         if is_stuck(p.stuck[i]):
             return EVENT
@@ -289,7 +297,9 @@ def step(
     verdict = _update_charts(p, work, settings)
     if verdict == EVENT:
         return EVENT
-    p.last_ns, p.time_min, p.input = time_ns, time_min, values[0]
+    p.last_ns, p.time_min = time_ns, time_min
+    for i in range(inputs):
+        p.inputs[i] = values[i]
     for i in range(belief.size):
         belief[i] = after[i]
     numbers[plant] = scratch[0]
@@ -297,8 +307,8 @@ def step(
 
 
 @lru_cache
-def step_entry(outputs: int, alarms: int) -> Entry:
-    """Machine code of the step for the types of these numbers of outputs and alarms."""
+def step_entry(inputs: int, outputs: int, alarms: int) -> Entry:
+    """Machine code of the step for the types of these numbers of inputs, outputs and alarms."""
     return Entry(step)
 
 
@@ -308,7 +318,7 @@ class RowStep:
     Args:
         config: settings of the plants' monitors.
         model: model by which the plants are judged.
-        ranges: ranges of the input and of each output.
+        ranges: ranges of each input and of each output.
 
     Attributes:
         numbers_type: type of the numbers of a plant's stages.
@@ -323,10 +333,11 @@ class RowStep:
     def __init__(self, config: MonitorConfig, model: ProcessModel, ranges: Sequence[SignalRange]) -> None:
         outputs, states = len(config.outputs), len(model.states)
         kinds = [chart for chart, _ in alarm_names(config)]
-        self._filter, self._step = compiled_filter(model), step_entry(outputs, len(kinds))
+        sizes = len(config.inputs), outputs, len(kinds)
+        self._filter, self._step = compiled_filter(model), step_entry(*sizes)
         self.numbers_type = numbers_type(config)
         self.filter_sizes = states + states**2, outputs + states
-        self.settings = np.zeros(1, settings_type(outputs, len(kinds)))
+        self.settings = np.zeros(1, settings_type(*sizes))
         p = self.settings[0]
         p["filter_address"], p["silence_limit"] = self._filter.address, config.silence_periods
         p["ranges"] = [[item.lower, item.upper] for item in ranges]
@@ -334,7 +345,7 @@ class RowStep:
         for i, kind in enumerate(kinds):
             p["rules"][i] = (1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1)
         p["reach"], p["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
-        self.work = np.zeros(1, work_type(outputs, len(kinds)))
+        self.work = np.zeros(1, work_type(*sizes))
         self.scratch = np.zeros(1, self.numbers_type)
         self.after: Array = np.empty(self.filter_sizes[0])
         self.parameters: Array = np.concatenate([model.values(), np.empty(outputs + states)])
@@ -348,15 +359,17 @@ class RowStep:
         Args:
             config: settings of the plants' monitors.
             model: model by which the plants are judged; None: there is none.
-            ranges: ranges of the input and of each output; None: those of the model.
+            ranges: ranges of each input and of each output; None: those of the model.
         """
-        if model is None or model.breakpoints or len(model.input_names) != 1 or model.output_names != config.outputs:
+        if model is None or model.breakpoints or not config.inputs:
+            return None
+        if (model.input_names, model.output_names) != (config.inputs, config.outputs):
             return None
         if {check.name for check in CHECKS} != CHECKED or not set(config.charts) <= set(CHARTS):
             return None
         if len(config.outputs) < 2 and Mewma.name in config.charts:
             return None
-        return RowStep(config, model, ranges or signal_ranges(model, (config.input, *config.outputs)))
+        return RowStep(config, model, ranges or signal_ranges(model, config.signals))
 
     def update(self, numbers: Records, kalman: FilterNumbers, time_ns: int, time_min: float, values: Array) -> int:
         """Take a row of one plant through all stages; returns the verdict."""
@@ -367,7 +380,7 @@ class RowStep:
 
 def numbers_type(config: MonitorConfig) -> np.dtype[Any]:
     """Type of the numbers of the stages of a plant with these settings."""
-    return row_type(len(config.outputs), len(alarm_names(config)))
+    return row_type(len(config.inputs), len(config.outputs), len(alarm_names(config)))
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
