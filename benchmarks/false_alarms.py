@@ -14,6 +14,7 @@ from scipy.signal import lfilter
 
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
+from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import encode
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
@@ -53,7 +54,7 @@ def count_false_alarms(runs: int, per_30_days: float, *, diagnose_training: bool
     simulator, raised, promised = Simulator(cstr()), Counter[str](), 0.0
     config = MonitorConfig(false_alarms_per_30_days=per_30_days, isolation=False, diagnose_training=diagnose_training)
     rows = round(SPAN_MIN / PERIOD_MIN)
-    time_min = np.arange(rows) * PERIOD_MIN
+    time_min: Array = np.arange(rows, dtype=np.float64) * PERIOD_MIN
     for seed in range(runs):
         random = np.random.default_rng(seed)
         qc = np.repeat(random.uniform(90, 111, rows // 10), 10)
