@@ -60,10 +60,12 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
     """
     if config.reference == "equations":
         process.require_model()
-    changed: dict[str, object] = {"units": process.units}
-    if config.signals == DEFAULT_SIGNALS:
-        changed |= signal_settings(process)
-    for signal in () if "inputs" in changed else config.signals:
+    signals = signal_settings(process)
+    changed: dict[str, object] = {
+        "units": process.units,
+        **{key: names for key, names in signals.items() if getattr(config, key) == DEFAULT_SIGNALS[key]},
+    }
+    for signal in (name for key in DEFAULT_SIGNALS if key not in changed for name in getattr(config, key)):
         if signal not in (*process.inputs, *process.outputs):
             raise InputError(describe_unknown("signal", signal, (*process.inputs, *process.outputs)))
     if process.model is None and config.reference == "auto":
