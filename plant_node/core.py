@@ -106,7 +106,7 @@ class Plant:
         self.units = {name: signals[name].unit or unit for name, unit in model.units.items()}
         self.trouble: str | None = None
         self._scales = {name: to_model_unit(signals[name], model) for name in model.units}
-        self._effects = process.effects
+        self._effects = process.faults
         self._config = config
         self._base = model
         self._scenarios = [scenarios[name] for name in model.input_names]

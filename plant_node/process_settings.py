@@ -68,7 +68,7 @@ def fit_settings(config: PlantConfig, process: Process) -> ProcessSettings:
             {item.name: settings for item, settings in _scenarios(config, process, model)},
             controllers,
             model,
-            tuple(parse_fault(text, process.effects).with_defaults(0.0, config.duration_min) for text in config.faults),
+            tuple(parse_fault(text, process.faults).with_defaults(0.0, config.duration_min) for text in config.faults),
             _actuators(config, process, model),
             _by_signal("noise_sd", config.noise_sd, process.operation.noise_sd, model),
             _by_signal("resolution", config.resolution, _resolutions(process), model),

@@ -62,7 +62,8 @@ def find_process(
             extended = replace(extended, zero_ns=extended.zero_ns or zero_ns).rebase(0)
         elif zero_ns:
             extended = extended.rebase(zero_ns)
-        return describe_model(extended.build())
+        model = extended.build()
+        return describe_model(model)
     except InputError as error:
         raise InputError(f"process file {path}: {error}") from error
 

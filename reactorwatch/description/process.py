@@ -156,6 +156,14 @@ class Process:
             return generic_effects(self.model)
         return add_generic(self.model, tuple(self.effects)) if self.generic else self.effects
 
+    @cached_property
+    def faults(self) -> tuple[Effect, ...]:
+        """Effects that can be injected: its own, and those made from its equations under other names."""
+        if self.model is None:
+            return ()
+        names = {effect.name for effect in self.effects}
+        return (*self.effects, *(effect for effect in generic_effects(self.model) if effect.name not in names))
+
     def select_causes(self, without: Sequence[str] = ()) -> tuple[Effect, ...]:
         """Causes but for some, by name; none is replaced by a generic one that does the same.
 
