@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from monitor_node.alarms.on_off_delay import DELAY, add_point, is_normal, raises
 from monitor_node.baseline.references import GATE
-from monitor_node.baseline.signal_range import SignalRange, signal_ranges
+from monitor_node.baseline.resolution import quantise
+from monitor_node.baseline.signal_range import SignalRange, possible_ranges
 from monitor_node.chart_stage import alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import WHOLE
@@ -124,6 +125,7 @@ def settings_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
     return np.dtype(
         [
             ("filter_address", "i8"),  # address of the filter's machine code
+            ("resolutions", "f8", (outputs,)),  # stated resolution of each output; 0 where it is learned
             ("ranges", "f8", (inputs + outputs, 2)),  # smallest and largest value of each signal
             ("silence_limit", "f8"),  # see `DataTimeout`
             ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
@@ -287,7 +289,7 @@ def step(
     outputs = values.size - inputs
     for i in range(outputs):
         value, whitener = values[inputs + i], p.whiteners[i]
-        take_reading(p.stuck[i], value)
+        take_reading(p.stuck[i], quantise(value, settings.resolutions[i]))
         if is_stuck(p.stuck[i]):
             return EVENT
         work.expected[i] = expected_value(whitener)
@@ -340,6 +342,7 @@ class RowStep:
         self.settings = np.zeros(1, settings_type(*sizes))
         p = self.settings[0]
         p["filter_address"], p["silence_limit"] = self._filter.address, config.silence_periods
+        p["resolutions"] = [config.resolution.get(name, 0.0) for name in config.outputs]
         p["ranges"] = [[item.lower, item.upper] for item in ranges]
         p["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
         for i, kind in enumerate(kinds):
@@ -369,7 +372,7 @@ class RowStep:
             return None
         if len(config.outputs) < 2 and Mewma.name in config.charts:
             return None
-        return RowStep(config, model, ranges or signal_ranges(model, config.signals))
+        return RowStep(config, model, ranges or possible_ranges(config, model))
 
     def update(self, numbers: Records, kalman: FilterNumbers, time_ns: int, time_min: float, values: Array) -> int:
         """Take a row of one plant through all stages; returns the verdict."""

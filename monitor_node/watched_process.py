@@ -1,6 +1,6 @@
 """Process that a monitor watches: its signals and equations in the settings of the monitor."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -60,10 +60,10 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
     """
     if config.reference == "equations":
         process.require_model()
-    changed: dict[str, object] = {"units": process.units}
-    if config.signals == DEFAULT_SIGNALS:
-        changed |= signal_settings(process)
-    for signal in () if "inputs" in changed else config.signals:
+    described = signal_settings(process)
+    is_named = config.signals != DEFAULT_SIGNALS
+    changed: dict[str, object] = {"units": process.units} | (_restrict(described, config) if is_named else described)
+    for signal in config.signals if is_named else ():
         if signal not in (*process.inputs, *process.outputs):
             raise InputError(describe_unknown("signal", signal, (*process.inputs, *process.outputs)))
     if process.model is None and config.reference == "auto":
@@ -77,6 +77,18 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
             changed["training_rows"] = DEFAULT_TRAINING_ROWS
     changed_config = msgspec.structs.replace(config, **changed)
     return WatchedProcess(limit_training(changed_config, rows, is_stated=_states_training(config)), process.model)
+
+
+def _restrict(described: dict[str, Any], config: MonitorConfig) -> dict[str, Any]:
+    """Settings of the signals of a process, for the inputs and outputs that the settings name."""
+    others = [name for name in (*described["inputs"], *described["outputs"]) if name not in config.signals]
+    return {
+        "setpoints": described["setpoints"],
+        "modes": described["modes"],
+        "labels": (*described["labels"], *others),
+        "bounds": {name: bounds for name, bounds in described["bounds"].items() if name in config.signals},
+        "resolution": {name: step for name, step in described["resolution"].items() if name in config.outputs},
+    }
 
 
 def limit_training(config: MonitorConfig, rows: int | None, *, is_stated: bool | None = None) -> MonitorConfig:
