@@ -15,6 +15,7 @@ import typer
 from reactorwatch import __version__
 from reactorwatch.cli import (
     alarm,
+    causes,
     charts,
     compilation,
     files,
@@ -46,7 +47,21 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (runs, nodes, view, site, playback, alarm, files, recordings, studies, models, charts, compilation):
+for group in (
+    runs,
+    nodes,
+    view,
+    site,
+    playback,
+    alarm,
+    files,
+    recordings,
+    studies,
+    causes,
+    models,
+    charts,
+    compilation,
+):
     group.register_commands(app)
 
 
