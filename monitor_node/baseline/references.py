@@ -1,13 +1,14 @@
-"""Reference that predicts rows; residuals are taken against it. It is frozen when the training ends.
+"""Reference that predicts rows; residuals are taken against it.
 
 `ProcessReference` is the extended Kalman filter of the process model: it is nonlinear, so inputs beyond the training
-and irregular rows are no problem. `ArxReference` is the identified linear model: it serves any plant, but only within
-the inputs of its training; other rows are not evaluated.
+and irregular rows are no problem. `ArxReference` is the identified linear model, frozen when the training ends: it
+serves any plant, but only within the inputs of its training; other rows are not evaluated. A black box of few signals:
+`black_box_reference`.
 """
 
 from collections.abc import Sequence
 from math import isfinite, nan
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +85,7 @@ class Reference(Protocol):
     """Predicts rows.
 
     Attributes:
-        kind: `equations` or `arx`, as published.
+        kind: `equations`, `black-box` or `arx`, as published.
     """
 
     kind: str
@@ -106,8 +107,8 @@ class Reference(Protocol):
         """Restart with the next row: the plant's clock was set, or there was a gap."""
 
     @property
-    def state(self) -> ProcessReferenceState | ArxReferenceState:
-        """The state, without the model."""
+    def state(self) -> Any:
+        """The state, without the equations."""
 
 
 class ProcessReference:

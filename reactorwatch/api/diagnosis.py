@@ -102,4 +102,5 @@ def diagnose(
     known = described.uncertain | dict(uncertain or {})
     found = find_causes(record, model, causes, dict(tolerance or {}) or None, known, dict(limits or {}) or None)
     values = {item.name: getattr(found, item.name) for item in fields(found)}
-    return DiagnosisResult(**values, record=record, model=model, effects=causes, seconds=time.monotonic() - started)
+    seconds = time.monotonic() - started
+    return DiagnosisResult(**values, record=record, model=model, effects=causes, seconds=seconds)

@@ -97,6 +97,9 @@ def backtest(
     training: TrainingMin = None,
     training_rows: TrainingRows = None,
     reference: Reference = None,
+    scheme: Annotated[
+        str, typer.Option(help="monitor, or report: watch as the original report does, mean +- 3 sigma of OE(3,3).")
+    ] = "monitor",
     column: Columns = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for a summary of several files.", show_default=False)
@@ -128,6 +131,8 @@ def backtest(
         rows = check_output(rows, ".csv", sources, force=force)
     if train is not None and (training is not None or training_rows is not None):
         raise InputError(f"--train {train}: all of it is the training; leave --training and --training-rows out")
+    if train is not None and scheme == "report":
+        raise InputError(f"--train {train}: the report's scheme learns from the first rows of each file; leave it out")
     tables = read_settings(config)
     flags: dict[str, Any] = {"plant": plant or DEFAULT_PLANT, "reference": reference}
     if choice.outputs:
@@ -135,7 +140,14 @@ def backtest(
     flags |= training_flags(tables, training, training_rows)
     settings = section(MonitorConfig, "monitor", tables, flags)
     asked = BacktestOptions(
-        settings, plant, parse_columns(column), choice, stated, as_json=as_json, log_rows=rows is not None
+        settings,
+        plant,
+        parse_columns(column),
+        choice,
+        stated,
+        as_json=as_json,
+        log_rows=rows is not None,
+        scheme=scheme,
     )
     trained = None
     if train is not None:

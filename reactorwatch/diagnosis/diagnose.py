@@ -180,7 +180,7 @@ def _is_unknown(
         run: the record.
         log_p: minus the decimal logarithm of the p-value that its innovations are white.
     """
-    better = unknown_input is not None and unknown_input.bic < bic_on(best, unknown_input.used, run) - MARGIN
+    better = unknown_input is not None and unknown_input.bic < bic_on(best, unknown_input.used) - MARGIN
     if log_p < WHITE:
         return better and bool(best.label)
     if not best.label or log_p >= (MUCH_RESIDUAL if len(best.label) == 1 else MUCH_RESIDUAL_OF_TWO):

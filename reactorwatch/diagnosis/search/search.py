@@ -343,8 +343,8 @@ class Search:
         """Return true if a candidate with the best's cause and profile starts far from its fit."""
         if not candidate.profile.nonlinear_parameters:
             return False
-        parameters = best.fit.parameters[0]
-        apart = np.abs(candidate.parameters - parameters)[candidate.profile.n_linear :]
+        shape = slice(candidate.profile.n_linear, candidate.profile.n_shape)
+        apart = np.abs(candidate.parameters[shape] - best.fit.parameters[0][shape])
         return bool(np.any(apart > _NEAR * candidate.profile.difference_steps))
 
     def refit(self, fitted: FittedHypothesis) -> FittedHypothesis:
@@ -369,7 +369,8 @@ class Search:
 
     def score_fit(self, hypothesis: Hypothesis, fit: Fit) -> FittedHypothesis:
         """BIC of an existing fit."""
-        bic = 2.0 * fit.loss + hypothesis.n_parameters * log(self.run.values)
+        charged = hypothesis.n_parameters - len(hypothesis.constant_indices)
+        bic = 2.0 * fit.loss + charged * log(self.run.values) + hypothesis.constants_evidence(self.run, fit)
         return FittedHypothesis(hypothesis, fit, bic + self.prior.cost(hypothesis))
 
 

@@ -107,7 +107,7 @@ def fit_black_box(
     y, u = (outputs - centres[:count]) / spreads[:count], (inputs - centres[count:]) / spreads[count:]
     smallest = np.square(smallest_sd / spreads[:count])
     shapes = largest_shapes(count, inputs.shape[1], int(np.isfinite(outputs).all(axis=1).sum()), delay)
-    best: tuple[float, Shape, _Fit, Array, Array, int] | None = None
+    best: tuple[float, BlackBoxModel] | None = None
     for shape in shapes:
         lagged = lagged_inputs(shape, u)
         rows = Rows(y, lagged, row_kinds(shape, y, lagged, follows), smallest)
@@ -118,17 +118,19 @@ def fit_black_box(
         r, q, likelihood = _fit_variances(shape, rows, fitted)
         effective = shape.parameters - float(np.sum(np.diag(fitted.covariance) / prior_variances(shape)))
         score = likelihood - 0.5 * effective * np.log(measured)
-        inflation = measured / max(measured - effective / count, 0.1 * measured)
         if best is None or score > best[0]:
-            best = (score, shape, fitted, r * inflation, q * inflation, measured)
+            share = effective / count
+            inflation = measured / max(measured - share, 0.1 * measured)
+            variances = r * inflation, q * inflation
+            scaling, parameters = (centres, spreads), (fitted.theta, fitted.covariance)
+            best = score, BlackBoxModel.of(shape, measured, share, fitted.gain, scaling, variances, *parameters)
     if best is None:
         raise InputError(
             f"a model of {count} outputs and {inputs.shape[1]} inputs needs at least "
             f"{ROWS_A_PARAMETER * (1 + count + inputs.shape[1])} complete rows in succession and at most "
             f"{MOST_PARAMETERS} parameters, got {len(y)} rows"
         )
-    _, shape, fitted, r, q, measured = best
-    return BlackBoxModel.of(shape, measured, fitted.gain, (centres, spreads), (r, q), fitted.theta, fitted.covariance)
+    return best[1]
 
 
 def row_kinds(shape: Shape, y: Array, lagged: Array, follows: NDArray[np.bool_]) -> NDArray[np.int64]:

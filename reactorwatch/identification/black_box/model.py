@@ -20,6 +20,7 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
         degree: largest degree of the polynomial.
         delay: delay of the inputs in rows.
         rows: number of rows of the fit.
+        effective: number of parameters of an output that the rows determine, not the prior.
         gain: gain of the fit: 0, simulation errors; 1, errors of the next row.
         centres: means of the outputs, then of the inputs, in the signals' units.
         spreads: standard deviations of the same.
@@ -34,6 +35,7 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
     degree: int
     delay: int
     rows: int
+    effective: float
     gain: float
     centres: tuple[float, ...]
     spreads: tuple[float, ...]
@@ -46,6 +48,7 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
         cls,
         shape: Shape,
         rows: int,
+        effective: float,
         gain: float,
         scaling: tuple[Array, Array],
         variances: tuple[Array, Array],
@@ -57,6 +60,7 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
         Args:
             shape: shape of the map.
             rows: number of rows of the fit.
+            effective: see the attributes.
             gain: gain of the fit.
             scaling: centres and spreads.
             variances: r and q.
@@ -67,7 +71,7 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
         centres, spreads, r, q = (tuple(item.tolist()) for item in (*scaling, *variances))
         numbers = pack_numbers(np.concatenate([theta.ravel(), lower]))
         sizes = (shape.outputs, shape.inputs, shape.lags, shape.degree, shape.delay)
-        return cls(*sizes, rows, gain, centres, spreads, r, q, numbers)
+        return cls(*sizes, rows, effective, gain, centres, spreads, r, q, numbers)
 
     @property
     def shape(self) -> Shape:
@@ -91,6 +95,11 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
     def error_sd(self) -> Array:
         """Standard deviation of each output's one-step error with known parameters and state, in its unit."""
         return np.asarray(np.sqrt(np.add(self.r, self.q)) * np.array(self.spreads[: self.outputs]))
+
+    @property
+    def out_of_sample(self) -> float:
+        """Ratio of the size of residuals out of the fit to that of residuals in it."""
+        return float(np.sqrt(self.rows / max(self.rows - self.effective, 0.1 * self.rows)))
 
     @property
     def dynamics_sd(self) -> float:
