@@ -51,8 +51,8 @@ SMALLEST_SD = {"C": 2e-4, "T": 0.05}
 """Defaults for the reactor's outputs; other outputs have none."""
 
 
-DEFAULT_SIGNALS = ("qc", "C", "T")
-"""Signals of the default process, the input first."""
+DEFAULT_SIGNALS = {"inputs": ("qc",), "outputs": ("C", "T")}
+"""Signals of the default process, by key."""
 
 
 class TrainingLength(NamedTuple):
@@ -126,8 +126,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     """
 
     plant: str = "cstr"
-    inputs: tuple[str, ...] = ("qc",)
-    outputs: tuple[str, ...] = ("C", "T")
+    inputs: tuple[str, ...] = DEFAULT_SIGNALS["inputs"]
+    outputs: tuple[str, ...] = DEFAULT_SIGNALS["outputs"]
     setpoints: tuple[str, ...] = ()
     modes: tuple[str, ...] = ()
     labels: tuple[str, ...] = ()
@@ -188,8 +188,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             )
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
-        if self.process is not None and self.signals == DEFAULT_SIGNALS:
-            return  # the signals are those of the process, which `watched_process` sets
+        if self.process is not None and self.outputs == DEFAULT_SIGNALS["outputs"]:
+            return  # the outputs are those of the process, which `watched_process` sets
         for signal, (lower, upper) in self.bounds.items():
             if signal not in self.signals:
                 raise ValueError(f"bounds are by input and output, {self.signals}, got {signal!r}")
@@ -224,7 +224,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     @property
     def is_reactor(self) -> bool:
         """True if the signals are those of the default process."""
-        return self.inputs == ("qc",) and set(self.outputs) <= {"C", "T"}
+        return self.inputs == DEFAULT_SIGNALS["inputs"] and set(self.outputs) <= set(DEFAULT_SIGNALS["outputs"])
 
     @property
     def signals(self) -> tuple[str, ...]:

@@ -61,13 +61,11 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
     if config.reference == "equations":
         process.require_model()
     described = signal_settings(process)
-    is_named = config.signals != DEFAULT_SIGNALS
-    changed: dict[str, object] = {"units": process.units} | (_restrict(described, config) if is_named else described)
-    for signal in config.signals if is_named else ():
+    named = {key: getattr(config, key) for key, names in DEFAULT_SIGNALS.items() if getattr(config, key) != names}
+    changed: dict[str, object] = {"units": process.units} | _restrict(described, described | named)
+    for signal in (name for names in named.values() for name in names):
         if signal not in (*process.inputs, *process.outputs):
             raise InputError(describe_unknown("signal", signal, (*process.inputs, *process.outputs)))
-    if process.model is None and config.reference == "auto":
-        changed["reference"] = "arx"
     if process.name != REACTOR:
         if config.smallest_sd == SMALLEST_SD:
             changed["smallest_sd"] = {}
@@ -76,18 +74,24 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
         if config.training_min is None and config.training_rows is None:
             changed["training_rows"] = DEFAULT_TRAINING_ROWS
     changed_config = msgspec.structs.replace(config, **changed)
+    if process.model is None and changed_config.reference == "auto" and changed_config.is_reactor:
+        # Signals of these names would be judged by the reactor's equations.
+        changed_config = msgspec.structs.replace(changed_config, reference="black-box")
     return WatchedProcess(limit_training(changed_config, rows, is_stated=_states_training(config)), process.model)
 
 
-def _restrict(described: dict[str, Any], config: MonitorConfig) -> dict[str, Any]:
-    """Settings of the signals of a process, for the inputs and outputs that the settings name."""
-    others = [name for name in (*described["inputs"], *described["outputs"]) if name not in config.signals]
+def _restrict(described: dict[str, Any], chosen: dict[str, Any]) -> dict[str, Any]:
+    """Settings of the signals of a process, for the inputs and outputs that are watched."""
+    inputs, outputs = chosen["inputs"], chosen["outputs"]
+    others = [name for key in ("inputs", "outputs") for name in described[key] if name not in (*inputs, *outputs)]
     return {
+        "inputs": inputs,
+        "outputs": outputs,
         "setpoints": described["setpoints"],
         "modes": described["modes"],
         "labels": (*described["labels"], *others),
-        "bounds": {name: bounds for name, bounds in described["bounds"].items() if name in config.signals},
-        "resolution": {name: step for name, step in described["resolution"].items() if name in config.outputs},
+        "bounds": {name: bounds for name, bounds in described["bounds"].items() if name in (*inputs, *outputs)},
+        "resolution": {name: step for name, step in described["resolution"].items() if name in outputs},
     }
 
 
