@@ -13,6 +13,7 @@ from math import isfinite, nan
 import numpy as np
 
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.baseline.black_box_reference import BlackBoxReference, BlackBoxReferenceState
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.predictor import ArxPredictor, arx_structure
 from monitor_node.baseline.references import (
@@ -26,7 +27,7 @@ from monitor_node.baseline.signal_range import signal_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
 from monitor_node.chart_stage import ChartWatch, alarm_names
-from monitor_node.config import MonitorConfig
+from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.health import NODE
@@ -138,6 +139,7 @@ class PlantPipeline:
         self.is_normal = False
         self.training_rows = 0
         self.left_out: dict[str, str] = {}
+        self._noted: set[str] = set()
 
     # --- state -----------------------------------------------------------------------------------------------
 
@@ -213,9 +215,13 @@ class PlantPipeline:
             self._suspicion.restore(watched.suspicion)
         self._quarantined, self.rows_watched = tuple(watched.withheld), watched.rows_watched
 
-    def _restore_reference(self, state: ProcessReferenceState | ArxReferenceState) -> Reference:
+    def _restore_reference(
+        self, state: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
+    ) -> Reference:
         if isinstance(state, ArxReferenceState):
-            return ArxReference.from_state(state)
+            return ArxReference(state)
+        if isinstance(state, BlackBoxReferenceState):
+            return BlackBoxReference.from_state(state)
         if self.equations is None:
             raise ValueError("the state must be of a plant without a process model")
         return ProcessReference.from_state(state, self.equations, self._config.outputs)
@@ -258,7 +264,7 @@ class PlantPipeline:
 
     @property
     def reference(self) -> str:
-        """Kind of the reference: `equations` or `arx`; empty before there is one."""
+        """Kind of the reference: `equations`, `black-box` or `arx`; empty before there is one."""
         return "" if self._reference is None else self._reference.kind
 
     @property
@@ -514,8 +520,12 @@ class PlantPipeline:
         self._is_process = self._is_process_given or isinstance(reference, ProcessReference)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
-        self._step, self._kalman = RowStep.of(self._config, self._reference_model, self._ranges), None
-        if self._step is not None and isinstance(reference, ProcessReference):
+        self._kalman = None
+        if isinstance(reference, BlackBoxReference):
+            self._step = RowStep.of_black_box(self._config, reference, self._ranges)
+        else:
+            self._step = RowStep.of(self._config, self._reference_model, self._ranges)
+        if self._step is not None and isinstance(reference, ProcessReference | BlackBoxReference):
             belief, variances = reference.numbers
             self._kalman = FilterNumbers(belief[None], variances[None])
 
@@ -552,7 +562,7 @@ class PlantPipeline:
         reference, sampling, time_min = self._reference, self._sampling.state, time_ns / MINUTE_NS
         if self._step is None or self._board.has_unexplained or not self._charts.is_normal:
             return False
-        assert isinstance(reference, ProcessReference)
+        assert isinstance(reference, ProcessReference | BlackBoxReference)
         if self.left_out or True in self._quarantined or sampling.period_ns is None or sampling.spacing_ns is None:
             return False
         if not (self.signals.is_normal and reference.is_normal(time_min)):
@@ -575,7 +585,7 @@ class PlantPipeline:
         """Process a row by the compiled step; returns False if it is an event, for which nothing has changed."""
         assert self._step is not None
         assert self._kalman is not None
-        assert isinstance(self._reference, ProcessReference)
+        assert isinstance(self._reference, ProcessReference | BlackBoxReference)
         time_ns, time_min = row.time_ns, row.time_ns / MINUTE_NS
         count = len(row.inputs)
         self._row[:count], self._row[count:] = row.inputs, row.values
@@ -634,6 +644,8 @@ class PlantPipeline:
             for whitener in self._whiteners:
                 whitener.restart()
         predictions, sds = reference.update(time_ns, row.inputs, values, self._quarantined, row.interval.missing)
+        if isinstance(reference, ArxReference):
+            self._note_inputs_beyond(reference, row.inputs)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
@@ -653,6 +665,18 @@ class PlantPipeline:
             publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
             publications.extend(self._search_causes(row, stuck))
+        if isinstance(reference, BlackBoxReference):
+            reference.set_learning(not self._board.has_unexplained)
+
+    def _note_inputs_beyond(self, reference: ArxReference, inputs: Sequence[float]) -> None:
+        """Note once each input that leaves its range in the training, as rows are not judged then."""
+        for name in (self._config.inputs[i] for i in reference.find_beyond(inputs)):
+            if name not in self._noted:
+                self._noted.add(name)
+                self.notes.append(
+                    f"rows are not judged while {name} is beyond its range in the training: the identified model does "
+                    "not hold there"
+                )
 
     def _note_late_signals(self, inputs: Sequence[float], values: list[float]) -> None:
         """Note once each signal whose first value arrives after the training."""
@@ -692,7 +716,7 @@ def _filter_snapshot(reference: ProcessReference, output: str) -> ModelSnapshot:
 
 def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:
     """Process model for the plant, as the settings ask for it."""
-    if config.reference == "arx":
+    if config.reference in ("black-box", "arx") or (model is None and config.process == WITHOUT_EQUATIONS):
         return None
     given, model = model is not None, model or cstr()
     fits = config.inputs == model.input_names and set(config.outputs) <= set(model.output_names)
@@ -703,7 +727,8 @@ def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | 
     raise InputError(
         f"reference 'equations' needs the signals of {model.name}, inputs {', '.join(model.input_names)} and outputs "
         f"of {', '.join(model.output_names)}, got {', '.join(config.inputs) or 'none'} and "
-        f'{", ".join(config.outputs)}; set reference = "arx"'
+        f"{', '.join(config.outputs)}; "
+        'set reference = "arx"'
     )
 
 

@@ -19,17 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.alarms.on_off_delay import DELAY, add_point, is_normal, raises
+from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.references import GATE
 from monitor_node.baseline.signal_range import SignalRange, signal_ranges
 from monitor_node.chart_stage import alarm_names
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.sampling import WHOLE
+from monitor_node.ingest.sampling import TOLERANCE, WHOLE
 from monitor_node.signal_checks.catalogue import CHECKS
 from monitor_node.signal_checks.stuck import STUCK, is_stuck, take_reading
 from monitor_node.signal_checks.timeout import TIMEOUT, update_timeout
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.codegen.numba_kernel import Entry, call_at, jit
+from reactorwatch.identification.black_box.filter import JUDGED, filter_row
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, row_function
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import ProcessModel
@@ -123,7 +125,8 @@ def settings_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
     """
     return np.dtype(
         [
-            ("filter_address", "i8"),  # address of the filter's machine code
+            ("filter_address", "i8"),  # address of the filter's machine code; 0: a black box
+            ("spacing_min", "f8", (2,)),  # shortest and longest time between two rows
             ("ranges", "f8", (inputs + outputs, 2)),  # smallest and largest value of each signal
             ("silence_limit", "f8"),  # see `DataTimeout`
             ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
@@ -139,8 +142,9 @@ class FilterNumbers(NamedTuple):
     """Numbers of the filters of some plants.
 
     Attributes:
-        belief: state and covariance, shape (plants, states + states^2).
-        variances: variances of the sensors and of the process, shape (plants, outputs + states).
+        belief: state and covariance, shape (plants, states + states^2); of a black box see `BlackBoxFilter`.
+        variances: variances of the sensors and of the process, shape (plants, outputs + states); of a black box all
+            its constants.
     """
 
     belief: Array
@@ -155,16 +159,17 @@ def _predict(
     parameters: Array,
     after: Array,
     work: Any,
-    filter_address: int,
+    settings: Any,
     time_min: float,
     values: Array,
 ) -> bool:
-    """Filter a row that is at most two integration steps after the one before; returns True if all went well."""
+    """Filter a row that is not too far from the one before; returns True if all went well."""
     inputs, new = p.inputs.size, work.new
     count = values.size - inputs
-    step = 0.5 * (time_min - p.time_min)
-    if not (step > 0.0 and 2.0 * step <= LONGEST_ROW_MIN):
+    spacing_min = time_min - p.time_min
+    if not settings.spacing_min[0] < spacing_min <= settings.spacing_min[1]:
         return False
+    step = 0.5 * spacing_min
     for i in range(inputs):
         new[i], new[inputs + i] = p.inputs[i], values[i]
     row = 2 * inputs
@@ -174,8 +179,10 @@ def _predict(
     first = parameters.size - variances.size
     for i in range(variances.size):
         parameters[first + i] = variances[i]
+    if settings.filter_address == 0:
+        return filter_row(belief, new, parameters, after, work.outputs) == JUDGED
     before, given, constants = belief.ctypes.data, new.ctypes.data, parameters.ctypes.data
-    call_at(filter_address, (1, before, given, constants, after.ctypes.data, work.outputs.ctypes.data))
+    call_at(settings.filter_address, (1, before, given, constants, after.ctypes.data, work.outputs.ctypes.data))
     return bool(work.outputs[work.outputs.size - 1] != 0.0)
 
 
@@ -277,8 +284,8 @@ def step(
     for i in range(values.size):
         if not settings.ranges[i, 0] <= values[i] <= settings.ranges[i, 1]:
             return EVENT
-    belief, address = beliefs[plant], settings.filter_address
-    if not _predict(p, belief, variances[plant], parameters, after, work, address, time_min, values):
+    belief = beliefs[plant]
+    if not _predict(p, belief, variances[plant], parameters, after, work, settings, time_min, values):
         return EVENT
     for i in range(p.timeouts.size):
         if update_timeout(p.timeouts[i], time_ns, True, settings.silence_limit, -1)[0]:
@@ -312,12 +319,32 @@ def step_entry(inputs: int, outputs: int, alarms: int) -> Entry:
     return Entry(step)
 
 
+class RowFilter(NamedTuple):
+    """Filter of a step.
+
+    Attributes:
+        address: address of its machine code; 0: a black box.
+        belief: size of its belief.
+        parameters: parameters of the equations; none for a black box, whose constants are those of a plant.
+        constants: number of the other constants, see `FilterNumbers.variances`.
+        spacing_min: shortest and longest time between two rows, in minutes.
+        code: owner of the machine code.
+    """
+
+    address: int
+    belief: int
+    parameters: Array
+    constants: int
+    spacing_min: tuple[float, float]
+    code: CompiledFunction | None = None
+
+
 class RowStep:
     """The step for plants with certain settings.
 
     Args:
         config: settings of the plants' monitors.
-        model: model by which the plants are judged.
+        row_filter: filter of the plants.
         ranges: ranges of each input and of each output.
 
     Attributes:
@@ -330,16 +357,16 @@ class RowStep:
         after: belief of a filter, to work in.
     """
 
-    def __init__(self, config: MonitorConfig, model: ProcessModel, ranges: Sequence[SignalRange]) -> None:
-        outputs, states = len(config.outputs), len(model.states)
+    def __init__(self, config: MonitorConfig, row_filter: RowFilter, ranges: Sequence[SignalRange]) -> None:
         kinds = [chart for chart, _ in alarm_names(config)]
-        sizes = len(config.inputs), outputs, len(kinds)
-        self._filter, self._step = compiled_filter(model), step_entry(*sizes)
+        sizes = len(config.inputs), len(config.outputs), len(kinds)
+        self._code, self._step = row_filter.code, step_entry(*sizes)
         self.numbers_type = numbers_type(config)
-        self.filter_sizes = states + states**2, outputs + states
+        self.filter_sizes = row_filter.belief, row_filter.constants
         self.settings = np.zeros(1, settings_type(*sizes))
         p = self.settings[0]
-        p["filter_address"], p["silence_limit"] = self._filter.address, config.silence_periods
+        p["filter_address"], p["spacing_min"] = row_filter.address, row_filter.spacing_min
+        p["silence_limit"] = config.silence_periods
         p["ranges"] = [[item.lower, item.upper] for item in ranges]
         p["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
         for i, kind in enumerate(kinds):
@@ -347,8 +374,8 @@ class RowStep:
         p["reach"], p["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
         self.work = np.zeros(1, work_type(*sizes))
         self.scratch = np.zeros(1, self.numbers_type)
-        self.after: Array = np.empty(self.filter_sizes[0])
-        self.parameters: Array = np.concatenate([model.values(), np.empty(outputs + states)])
+        self.after: Array = np.empty(row_filter.belief)
+        self.parameters: Array = np.concatenate([row_filter.parameters, np.empty(row_filter.constants)])
 
     @staticmethod
     def of(
@@ -361,21 +388,45 @@ class RowStep:
             model: model by which the plants are judged; None: there is none.
             ranges: ranges of each input and of each output; None: those of the model.
         """
-        if model is None or model.breakpoints or not config.inputs:
+        if model is None or model.breakpoints or not has_step(config):
             return None
         if (model.input_names, model.output_names) != (config.inputs, config.outputs):
             return None
-        if {check.name for check in CHECKS} != CHECKED or not set(config.charts) <= set(CHARTS):
+        outputs, states = len(config.outputs), len(model.states)
+        belief, spacing_min = states + states**2, (0.0, LONGEST_ROW_MIN)
+        code = compiled_filter(model)
+        row_filter = RowFilter(code.address, belief, model.values(), outputs + states, spacing_min, code)
+        return RowStep(config, row_filter, ranges or signal_ranges(model, config.signals))
+
+    @staticmethod
+    def of_black_box(
+        config: MonitorConfig, reference: BlackBoxReference, ranges: Sequence[SignalRange]
+    ) -> "RowStep | None":
+        """The step for a plant with a black box; None if its rows are not such that it could take them.
+
+        Args:
+            config: settings of the plant's monitor.
+            reference: reference of the plant.
+            ranges: ranges of each input and of each output.
+        """
+        if not has_step(config):
             return None
-        if len(config.outputs) < 2 and Mewma.name in config.charts:
-            return None
-        return RowStep(config, model, ranges or signal_ranges(model, config.signals))
+        belief, constants = reference.numbers
+        shortest, longest = ((1.0 + sign * TOLERANCE) * reference.period_min for sign in (-1.0, 1.0))
+        return RowStep(config, RowFilter(0, belief.size, np.empty(0), constants.size, (shortest, longest)), ranges)
 
     def update(self, numbers: Records, kalman: FilterNumbers, time_ns: int, time_min: float, values: Array) -> int:
         """Take a row of one plant through all stages; returns the verdict."""
         own = (self.scratch, self.work, self.settings, *kalman, self.parameters, self.after)
         verdict: int = self._step.call(numbers, *own, 0, time_ns, time_min, values)
         return verdict
+
+
+def has_step(config: MonitorConfig) -> bool:
+    """True if the step has the charts and checks of these settings."""
+    if not config.inputs or {check.name for check in CHECKS} != CHECKED or not set(config.charts) <= set(CHARTS):
+        return False
+    return len(config.outputs) > 1 or Mewma.name not in config.charts
 
 
 def numbers_type(config: MonitorConfig) -> np.dtype[Any]:

@@ -10,6 +10,7 @@ from monitor_node.config import (
     DEFAULT_TRAINING_ROWS,
     REACTOR,
     SMALLEST_SD,
+    WITHOUT_EQUATIONS,
     MonitorConfig,
 )
 from monitor_node.process_settings import signal_settings
@@ -42,7 +43,7 @@ def load_process(config: MonitorConfig, zero_ns: int = 0, rows: int | None = Non
     Raises:
         InputError: the process cannot be found or read, or does not fit the settings.
     """
-    if config.process is None:
+    if not config.process:
         return WatchedProcess(limit_training(config, rows), None)
     return watch_process(config, find_process(config.process, zero_ns, on_bus=True), rows)
 
@@ -68,8 +69,8 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
     for signal in (name for key in DEFAULT_SIGNALS if key not in changed for name in getattr(config, key)):
         if signal not in (*process.inputs, *process.outputs):
             raise InputError(describe_unknown("signal", signal, (*process.inputs, *process.outputs)))
-    if process.model is None and config.reference == "auto":
-        changed["reference"] = "arx"
+    if process.model is None:
+        changed["process"] = WITHOUT_EQUATIONS
     if process.name != REACTOR:
         if config.smallest_sd == SMALLEST_SD:
             changed["smallest_sd"] = {}

@@ -10,11 +10,11 @@ from scipy.optimize import brentq
 from benchmarks.study_figures.canvas import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, label, legend_below, panels
 from benchmarks.study_figures.figure import Finding
 from benchmarks.study_figures.study import NAMES, Study
-from plant_node.config import NoiseSd, PlantConfig
-from plant_node.controllers import GAIN, TemperatureControl
+from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.process.level_control import GAIN as LEVEL_GAIN
-from reactorwatch.process.level_control import with_level_control
+from reactorwatch.process.library.cstr.controllers import GAIN, TemperatureControl
+from reactorwatch.process.library.cstr.level_control import GAIN as LEVEL_GAIN
+from reactorwatch.process.library.cstr.level_control import with_level_control
 from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, OPERATING_STATE
 from reactorwatch.process.simulate import Simulator
 
@@ -37,7 +37,7 @@ def temperature(study: Study, drawing: Drawing) -> Finding:
     for gain, colour, style in _GAINS:
         config = PlantConfig(
             seed=study.seed,
-            noise_sd=NoiseSd(C=0.0, T=0.0),
+            noise_sd={"C": 0.0, "T": 0.0},
             temperature_control=TemperatureControl(set_point_K=steps, gain_l_min_K=gain),
         )
         record = simulate_record(config, round(_END_MIN / config.period_min) + 1)

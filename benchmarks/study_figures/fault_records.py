@@ -15,13 +15,14 @@ from benchmarks.study_figures.figure import Finding, Verdict
 from benchmarks.study_figures.study import NAMES, OUTPUTS, TRAINING_ROWS, Study
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
-from plant_node.config import NoiseSd, PlantConfig
-from plant_node.presets import ONSET_MIN, PRESETS, Preset
+from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import encode
 from reactorwatch.identification.report_scheme import WIDTH, ReportChart, chart_output
 from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr.operation import ONSET_MIN, OPERATION
+from reactorwatch.process.operation import Preset
 from reactorwatch.records.record import Record, to_minutes
 from recorder.tools.player import samples_of
 
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 _PLANT = "cstr"
 UNITS = cstr().units
-PRESET_OF = dict(zip(("17", "18", "19", "20"), PRESETS, strict=True))
+PRESET_OF = dict(zip(("17", "18", "19", "20"), OPERATION.presets, strict=True))
 _SEEDS = 5
 _EXPECTED = 0.27  # % of independent normal residuals are outside mean +- 3 sigma
 
@@ -60,9 +61,9 @@ class Watch:
 
 
 @cache
-def watch(study: Study, preset: Preset) -> Watch:
-    """Watch a fault record by both."""
-    record = study.fault_record(preset.name)
+def watch(study: Study, name: str) -> Watch:
+    """Watch the fault record of a preset by both."""
+    record = study.fault_record(name)
     since = record.time_min >= ONSET_MIN
     watched = np.arange(record.rows) >= TRAINING_ROWS
     charts = {
@@ -76,7 +77,7 @@ def watch(study: Study, preset: Preset) -> Watch:
     either = np.any([chart.out for chart in charts.values()], axis=0)
     late = record.time_min[either & since]
     alarms = _monitor_alarms(record)
-    faulty = bool(preset.faults)
+    faulty = name != OPERATION.presets[0].name
     true = [item for item in alarms if faulty and item[0] >= ONSET_MIN]
     return Watch(
         charts,
@@ -100,7 +101,7 @@ def draw_record(key: str) -> Callable[[Study, Drawing], Finding]:
 
 
 def _draw(study: Study, drawing: Drawing, preset: Preset) -> Finding:
-    record, found = study.fault_record(preset.name), watch(study, preset)
+    record, found = study.fault_record(preset.name), watch(study, preset.name)
     over, under = panels(drawing, 2, 1, sharex=True)
     chart, C, t = found.charts["C"], record.columns["C"], record.time_min
     over.plot(t, C, ".", color=GREY, markersize=1.5, label="measured")
@@ -108,13 +109,13 @@ def _draw(study: Study, drawing: Drawing, preset: Preset) -> Finding:
     label(over, "", NAMES["C"], f"{preset.name}: {preset.meaning}")
     draw_residuals(under, t, chart)
     label(under, "time, min", f"residual, {UNITS['C']}")
-    if preset.faults:
+    faulty = bool(preset.settings["faults"])
+    if faulty:
         for one in (over, under):
             one.axvline(ONSET_MIN, color=ORANGE, linewidth=1.6)
     over.set_ylim(*np.nanpercentile(C, [0, 100]) + np.array([-0.01, 0.01]))
     legend_below(drawing, over, 2)
     before, after = found.out["C"]
-    faulty = bool(preset.faults)
     mean, sd = chart.mean, chart.sd
     text = (
         f"Model and limits, {mean:.2e} +- {WIDTH:g} times {sd:.4f} mol/l, from the first {t[TRAINING_ROWS]:g} min. "
@@ -143,11 +144,11 @@ def _draw(study: Study, drawing: Drawing, preset: Preset) -> Finding:
 def _sound_shares(study: Study) -> str:
     """Shares of the rows of sound records that are out by the report's scheme, with noise and without, as a table."""
     lines = []
-    for name, noise in (("noise of 0.002 mol/l and 0.3 K", None), ("no noise", NoiseSd(C=0.0, T=0.0))):
+    for name, noise in (("noise of 0.002 mol/l and 0.3 K", None), ("no noise", {"C": 0.0, "T": 0.0})):
         for model in ("arx", "oe"):
             shares = []
             for seed in range(study.seed, study.seed + _SEEDS):
-                settings = {"seed": seed, **PRESETS[0].settings}
+                settings = {"seed": seed, **OPERATION.presets[0].settings}
                 config = msgspec.convert(settings, PlantConfig)
                 record = simulate_record(config if noise is None else msgspec.structs.replace(config, noise_sd=noise))
                 u, t = record.columns["qc"], record.time_min
@@ -174,9 +175,9 @@ def draw_residuals(axes: Axes, time_min: Array, chart: ReportChart) -> None:
 
 def compare(study: Study, drawing: Drawing) -> Finding:
     """The report's scheme beside the monitor: detection, delay, false alarms and cause."""
-    found = {preset: watch(study, preset) for preset in PRESETS}
+    found = [(preset, watch(study, preset.name)) for preset in OPERATION.presets]
     (axes,) = panels(drawing, 1, 1)
-    for row, (preset, item) in enumerate(found.items()):
+    for row, (preset, item) in enumerate(found):
         record = study.fault_record(preset.name)
         for offset, output, colour in ((0.16, "C", VERMILION), (0.0, "T", ORANGE)):
             out = item.charts[output].out & (np.arange(record.rows) >= TRAINING_ROWS)
@@ -198,28 +199,30 @@ def compare(study: Study, drawing: Drawing) -> Finding:
                 label="monitor's first alarm" if row == 1 else "_",
             )
     axes.axvline(ONSET_MIN, color=BLACK, linewidth=1, linestyle="--")
-    axes.set_yticks([-row for row in range(len(found))], [preset.name for preset in found])
+    axes.set_yticks([-row for row in range(len(found))], [preset.name for preset, _ in found])
     axes.set_ylim(-len(found) + 0.5, 0.6)
     label(axes, "time, min", "")
     legend_below(drawing, axes, 3)
     rows = []
-    for preset, item in found.items():
+    for preset, item in found:
         report = (
             ""
-            if not preset.faults
+            if not preset.settings["faults"]
             else ("not seen" if item.first_min is None else f"{item.first_min - ONSET_MIN:.1f} min")
         )
         monitor = (
             ""
-            if not preset.faults
+            if not preset.settings["faults"]
             else ("not seen" if item.monitor_min is None else f"{item.monitor_min - ONSET_MIN:.1f} min")
         )
-        missed = "" if not preset.faults else f"{100 - item.out['C'][1]:.1f} / {100 - item.out['T'][1]:.1f} %"
+        missed = (
+            "" if not preset.settings["faults"] else f"{100 - item.out['C'][1]:.1f} / {100 - item.out['T'][1]:.1f} %"
+        )
         rows.append(
             f"| `{preset.name}` | {report} | {missed} | {item.false_points} | {monitor} | {item.monitor_false} | "
             f"{item.cause or 'none'} |"
         )
-    false = sum(item.false_points for item in found.values())
+    false = sum(item.false_points for _, item in found)
     text = (
         "The first point out after the onset counts as the report's detection, though chance alone gives one soon; its "
         "false alarms are the points that are out before the onset.\n\n"
@@ -228,7 +231,7 @@ def compare(study: Study, drawing: Drawing) -> Finding:
         f"The report's scheme sees the faults, with {false} false points in these four records, and names no cause. "
         "Its abstract announces detection, isolation and reconstruction; its text shows detection."
     )
-    seen = all(item.first_min is not None for preset, item in found.items() if preset.faults)
+    seen = all(item.first_min is not None for preset, item in found if preset.settings["faults"])
     return Finding(text, Verdict.IN_PART if seen else Verdict.DISAGREES)
 
 

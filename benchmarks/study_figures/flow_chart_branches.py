@@ -11,11 +11,11 @@ from benchmarks.study_figures.figure import Finding, Verdict
 from benchmarks.study_figures.flow_chart import Conclusion, follow
 from benchmarks.study_figures.study import FAST_PERIOD_MIN, TRAINING_ROWS, Study, levels, row_times
 from plant_node.config import PlantConfig
-from plant_node.presets import PRESETS
 from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps
 from reactorwatch.identification.report_scheme import ORDER
 from reactorwatch.identification.structure import Structure
+from reactorwatch.process.library.cstr.operation import OPERATION
 from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:
@@ -32,8 +32,8 @@ _WATCHED_ROWS = 2000
 def draw(study: Study, drawing: Drawing) -> Finding:
     """A row for each record: the answers, and where the chart ended."""
     ends = {
-        preset.name: (_follow(study.fault_record(preset.name), TRAINING_ROWS), bool(preset.faults))
-        for preset in PRESETS
+        preset.name: (_follow(study.fault_record(preset.name), TRAINING_ROWS), bool(preset.settings["faults"]))
+        for preset in OPERATION.presets
     }
     fast = study.fast(noise=False)
     extra = {
@@ -77,7 +77,7 @@ def _small_then_large(study: Study, small: float, rows: int) -> Record:
     """A plant without a fault, driven by small random steps about 100 l/min for some rows, then by large ones."""
     time_min = row_times(rows + _WATCHED_ROWS, _PERIOD_MIN)
     parts = [
-        levels(RandomSteps(100.0 - size, 100.0 + size), times, study.seed)
+        levels(RandomSteps(100.0 - size, 100.0 + size, 1.0), times, study.seed)
         for size, times in ((small, time_min[:rows]), (10.0, time_min[rows:]))
     ]
     driver = Record(time_min, {"qc": np.concatenate(parts)}, "random steps")

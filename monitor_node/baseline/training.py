@@ -11,20 +11,24 @@ without the inputs that are left out.
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from itertools import compress
 from math import isfinite, log10
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
-from monitor_node.baseline.predictor import ArxPredictor, arx_structure, fewest_rows
+from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_structure, fewest_rows
 from monitor_node.baseline.references import ArxReference, ProcessReference, Reference, estimate_training_noise
 from monitor_node.baseline.resolution import resolution_sd
 from monitor_node.baseline.signal_range import signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals
 from reactorwatch.contract.messages_pb2 import Check
+from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.prewhitening import Prewhitening, learn
@@ -114,9 +118,11 @@ class Training:
         self._config = config
         self._model = model
         self._predictors = predictors
+        self._without_black_box = ""
         self._rows: deque[tuple[int, Sequence[float], list[float]]] = deque(maxlen=MOST_ROWS)
         self._counts = [0] * len(config.outputs)
-        of_identified = max(fewest_rows(arx_structure(config)), FEWEST_ROWS)
+        of_one_input = replace(structure := arx_structure(config), inputs=min(structure.inputs, 1))
+        of_identified = max(fewest_rows(of_one_input), FEWEST_ROWS)
         self.fewest_rows = FEWEST_ROWS if model is not None else of_identified
         """Least number of values of each output that a training needs."""
 
@@ -195,7 +201,7 @@ class Training:
         left_out = _too_few_values(outputs, measured) | self._constant_outputs(measured, steps)
         measured[:, [name in left_out for name in outputs]] = np.nan
         reference, z, screenings = self._reference(time_min, inputs, measured, smallest, steps)
-        if isinstance(reference, ArxReference):
+        if not isinstance(reference, ProcessReference):
             left_out |= _too_few_values(self._config.inputs, inputs)
         left_out |= _too_few_residuals(outputs, z, time_min, inputs, left_out)
         evaluated = [name not in left_out for name in outputs]
@@ -206,7 +212,7 @@ class Training:
             refused, screenings = "", [Screening(np.isfinite(column), [], [], 0) for column in z.T]
         usable = np.column_stack([item.usable for item in screenings]) & np.array(evaluated)
         z = np.where(usable, z, np.nan)
-        if isinstance(reference, ProcessReference):
+        if isinstance(reference, ProcessReference | BlackBoxReference):
             smallest = [sd / typical for sd, typical in zip(smallest, reference.typical_sd, strict=True)]
         learned = [
             learn(column, sd) if is_evaluated else NOTHING_LEARNED
@@ -218,8 +224,25 @@ class Training:
                 name="training", result=refused or _screening_summary(outputs, time_min, screenings, evaluated) or "ok"
             )
         ]
+        if isinstance(reference, ArxReference):
+            checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
+        if isinstance(reference, BlackBoxReference) and reference.weakness:
+            checks.append(Check(name=reference.kind, result=reference.weakness))
+        if self._without_black_box:
+            checks.append(Check(name=BlackBoxReference.kind, result=f"the ARX models judge: {self._without_black_box}"))
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
         return TrainingResult(reference, learned, e, np.where(usable, measured, np.nan), checks, refused, left_out)
+
+    def _simplifications(self, evaluated: list[bool]) -> list[str]:
+        """Terms that the identified models lack, each with the outputs."""
+        outputs: dict[str, list[str]] = {}
+        for name, predictor in compress(zip(self._config.outputs, self._predictors, strict=True), evaluated):
+            outputs.setdefault(predictor.simplification, []).append(name)
+        return [
+            f"{', '.join(names)}: predicted with {text}, as there are fewer than {ROWS_A_PARAMETER} rows a parameter"
+            for text, names in outputs.items()
+            if text
+        ]
 
     def _constant_outputs(self, measured: Array, steps: list[float]) -> dict[str, str]:
         """Outputs that never vary, and have no smallest relevant deviation in the settings, with the reason."""
@@ -237,35 +260,59 @@ class Training:
         has_values = np.count_nonzero(np.isfinite(inputs), axis=0) >= FEWEST_ROWS
         given_inputs = np.where(has_values, inputs, 0.0)
         if not has_values.all():
-            self._predict_again(time_min, given_inputs, measured)
+            for predictor, column in zip(self._predictors, measured.T, strict=True):
+                predictor.learn_again(time_min, given_inputs, column)
         identified, screenings = _refit_without_outliers(
             lambda rows: (self._arx_residuals(time_min, given_inputs, rows), minor), measured
         )
         has_equations = self._model is not None and bool(has_values.all())
         possible = self._mask_impossible(inputs, measured) if has_equations else None
-        if possible is None:
-            return ArxReference(given_inputs), identified, screenings
-        possible_inputs, outputs = possible
+        if possible is not None:
+            reference, z, judged = self._equations(time_min, *possible, smallest, steps)
+            residuals = z * np.array(reference.typical_sd)
+            if self._config.reference == "equations" or _predicts_as_well(residuals, identified):
+                return reference, z, judged
+        black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
+        if black_box is not None:
+            residuals = black_box[1] * np.array(black_box[0].typical_sd)
+            if self._config.reference == "black-box" or _predicts_as_well(residuals, identified):
+                return black_box
+        return self._arx_reference(given_inputs), identified, screenings
+
+    def _equations(
+        self, time_min: Array, inputs: Array, outputs: Array, smallest: list[float], steps: list[float]
+    ) -> tuple[ProcessReference, Array, list[Screening]]:
+        """Equations as reference, with its normalised residuals and their screening."""
         process: list[ProcessReference] = []
 
         def innovations(rows: Array) -> Residuals:
-            process.append(self._process_reference(time_min, possible_inputs, rows, smallest))
-            z = process[-1].run(time_min, possible_inputs, outputs)[1]
-            return z, [max(MINOR, step / sd) for step, sd in zip(steps, process[-1].typical_sd, strict=True)]
+            process.append(self._process_reference(time_min, inputs, rows, smallest))
+            z = process[-1].run(time_min, inputs, outputs)[1]
+            return z, _minor(steps, process[-1].typical_sd)
 
-        z, process_screenings = _refit_without_outliers(innovations, outputs)
-        residuals = z * np.array(process[-1].typical_sd)
-        if self._config.reference == "equations" or _predicts_as_well(residuals, identified):
-            return process[-1], z, process_screenings
-        return ArxReference(given_inputs), identified, screenings
+        z, screenings = _refit_without_outliers(innovations, outputs)
+        return process[-1], z, screenings
 
-    def _predict_again(self, time_min: Array, inputs: Array, measured: Array) -> None:
-        """Update the identified models with the rows once more, with other inputs."""
-        follows = [False, *regular_intervals(time_min).tolist()]
-        times_ns = [round(minutes * MINUTE_NS) for minutes in time_min.tolist()]
-        for predictor, column in zip(self._predictors, measured.T.tolist(), strict=True):
-            for time_ns, values, value, is_next in zip(times_ns, inputs.tolist(), column, follows, strict=True):
-                predictor.buffer(time_ns, values, value, follows=is_next)
+    def _black_box(
+        self, time_min: Array, inputs: Array, outputs: Array, smallest: list[float], steps: list[float]
+    ) -> tuple[BlackBoxReference, Array, list[Screening]] | None:
+        """Black box as reference; None if the settings exclude it, or the signals are too many or the rows too few."""
+        self._without_black_box = ""
+        if self._config.reference not in ("auto", "black-box"):
+            return None
+        learned: list[BlackBoxReference] = []
+
+        def innovations(rows: Array) -> Residuals:
+            reference, z = BlackBoxReference.learn(time_min, inputs, rows, outputs, smallest, self._config.delay)
+            learned.append(reference)
+            return z, _minor(steps, reference.typical_sd)
+
+        try:
+            z, screenings = _refit_without_outliers(innovations, outputs)
+        except InputError as error:
+            self._without_black_box = str(error)
+            return None
+        return learned[-1], z, screenings
 
     def _mask_impossible(self, inputs: Array, measured: Array) -> tuple[Array, Array] | None:
         """Inputs and outputs with NaN for impossible values; None if there are too many: the process is another one."""
@@ -276,6 +323,9 @@ class Training:
             return None
         columns = np.where(out, np.nan, columns)
         return columns[:, : inputs.shape[1]], columns[:, inputs.shape[1] :]
+
+    def _arx_reference(self, inputs: Array) -> ArxReference:
+        return ArxReference.of_training(inputs, [predictor.uses_inputs for predictor in self._predictors])
 
     def _arx_residuals(self, time_min: Array, inputs: Array, measured: Array) -> Array:
         """Fit the identified models; returns their residuals, shape (n, outputs)."""
@@ -305,6 +355,11 @@ def _refit_without_outliers(residuals: Callable[[Array], Residuals], measured: A
         return z, screenings
     kept = np.column_stack([item.usable for item in screenings]) | ~np.isfinite(z)
     return residuals(np.where(kept, measured, np.nan))[0], screenings
+
+
+def _minor(steps: list[float], sds: list[float]) -> list[float]:
+    """Largest normalised deviation of each output that does not matter."""
+    return [max(MINOR, step / sd) for step, sd in zip(steps, sds, strict=True)]
 
 
 def _prewhiten(z: Array, learned: Prewhitening) -> Array:

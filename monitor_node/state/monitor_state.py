@@ -17,7 +17,7 @@ from monitor_node.state import version_2, version_3
 from monitor_node.state.pipeline_state import PipelineState
 from monitor_node.state.seal import DIGEST_BYTES, Seal
 from reactorwatch.errors import InputError
-from reactorwatch.process import effects_of
+from reactorwatch.process import EFFECTS_OF
 from reactorwatch.process.extended_model import extended_model_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import StoredState
@@ -111,7 +111,7 @@ def fingerprint(model: ProcessModel | None) -> str:
 
 def equations_text(model: ProcessModel | None) -> str:
     """JSON of a model as `diagnose` writes it; empty if the catalogue does not have the model, or no causes for it."""
-    if model is None or not effects_of(model):
+    if model is None or model.name not in EFFECTS_OF:
         return ""
     extended = extended_model_of(model)
     if fingerprint(extended.build()) != fingerprint(model):

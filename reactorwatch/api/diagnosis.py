@@ -1,19 +1,19 @@
 """Diagnose a record from Python."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from reactorwatch.api.records import ProcessLike, model_of
+from reactorwatch.api.records import ProcessLike, check_signals, process_of
+from reactorwatch.description.find import find_process
 from reactorwatch.diagnosis.diagnose import diagnose as find_causes
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import report_object
 from reactorwatch.diagnosis.result import Diagnosis
-from reactorwatch.process import effects_of
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
@@ -28,11 +28,13 @@ class DiagnosisResult(Diagnosis):
     Attributes:
         record: the measured record.
         model: the simulation before it was extended.
+        effects: possible causes.
         seconds: duration of the diagnosis.
     """
 
     record: Record = field(kw_only=True, repr=False, compare=False)
     model: ProcessModel = field(kw_only=True, repr=False, compare=False)
+    effects: tuple[Effect, ...] = field(kw_only=True, repr=False, compare=False)
     seconds: float = field(kw_only=True, repr=False, compare=False)
 
     @property
@@ -63,7 +65,7 @@ class DiagnosisResult(Diagnosis):
         from reactorwatch.diagnosis.report.page import as_page
 
         names = (self.record.name, "extended.json", "experiment.csv")
-        page = as_page(self, self.model, effects_of(self.model), *names, on_the_bus=False)
+        page = as_page(self, self.model, self.effects, *names, on_the_bus=False)
         with atomic_write(Path(file)) as temporary:
             temporary.write_text(page, encoding="utf-8")
 
@@ -73,6 +75,7 @@ def diagnose(
     process: ProcessLike | None = None,
     *,
     effects: tuple[Effect, ...] | None = None,
+    without: Sequence[str] = (),
     uncertain: Mapping[str, float] | None = None,
     tolerance: Mapping[str, float] | None = None,
     limits: Mapping[str, tuple[float, float]] | None = None,
@@ -83,6 +86,7 @@ def diagnose(
         record: with the inputs and outputs of the process.
         process: the simulation; None: the process of the record.
         effects: causes to search; None: those of the process.
+        without: names of causes of the process that are left out.
         uncertain: standard deviations of parameters that are known only roughly, by name.
         tolerance: differences that do not matter in practice, by output.
         limits: smallest and largest value of signals that a proposed experiment may reach.
@@ -91,10 +95,13 @@ def diagnose(
         InputError: the record cannot be diagnosed, or an argument is outside its range.
     """
     started = time.monotonic()
-    model = model_of(record, process)
+    described = find_process(process_of(record, process), record.zero_ns)
+    model = described.require_model()
+    check_signals(record, model)
     make_run(record, model)
-    found = find_causes(
-        record, model, effects, dict(tolerance or {}) or None, dict(uncertain or {}), dict(limits or {}) or None
-    )
+    causes = described.select_causes(without) if effects is None else effects
+    known = described.uncertain | dict(uncertain or {})
+    found = find_causes(record, model, causes, dict(tolerance or {}) or None, known, dict(limits or {}) or None)
     values = {item.name: getattr(found, item.name) for item in fields(found)}
-    return DiagnosisResult(**values, record=record, model=model, seconds=time.monotonic() - started)
+    seconds = time.monotonic() - started
+    return DiagnosisResult(**values, record=record, model=model, effects=causes, seconds=seconds)

@@ -55,6 +55,35 @@ def record(
     return read_process_table(path, described, columns, stated)
 
 
+def described_process(path: Path, plant: str | None = None, choice: ProcessChoice = DEFAULT_CHOICE) -> "Process":
+    """Process of a file: the chosen one; else the one that a recording describes; else the reactor.
+
+    Args:
+        path: a table, an .mcap or a folder of recordings.
+        plant: plant in a recording.
+        choice: the choice.
+
+    Raises:
+        InputError: as `ProcessChoice.load`, or the recording is damaged.
+    """
+    if not choice.is_default or file_kind(path) == "table":
+        return choice.load()
+    from recorder.tools.mcap_file import recorded_process
+
+    return recorded_process(path, plant) or choice.load()
+
+
+def process_on_clock(choice: ProcessChoice, described: "Process", zero_ns: int) -> "Process":
+    """A described process on the clock of a record.
+
+    Args:
+        choice: the choice by which it was described.
+        described: see `described_process`.
+        zero_ns: zero of the record's minutes, from which those of a chosen extended model are counted.
+    """
+    return described if choice.is_default else choice.load(zero_ns)
+
+
 class MessageSource(NamedTuple):
     """Messages of a file.
 

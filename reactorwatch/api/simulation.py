@@ -13,7 +13,7 @@ from reactorwatch.api.records import ProcessLike, Record, measured_fields, model
 from reactorwatch.diagnosis.impossible_values import check_values
 from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
-from reactorwatch.process import effects_of
+from reactorwatch.process import named_effects
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
@@ -97,7 +97,7 @@ def simulate_along(measured: MeasuredRecord, model: ProcessModel, faults: list[s
 def _simulate_run(measured: MeasuredRecord, model: ProcessModel, faults: list[str], *, alone: bool) -> MeasuredRecord:
     """Simulate along one run of a record; a single row among other runs is returned unchanged."""
     for text in faults:
-        model = parse_fault(text, effects_of(model)).extend(model, end_min=float(measured.time_min[-1]))
+        model = parse_fault(text, named_effects(model)).extend(model, end_min=float(measured.time_min[-1]))
     wrong = find_wrong_unit(model, measured.columns, measured.time_min)
     if wrong is not None and not wrong.of_times:  # it may be short, and its rows far apart
         raise InputError(f"{measured.name}: {wrong.text}")

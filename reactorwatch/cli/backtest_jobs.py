@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from monitor_node.config import DEFAULT_TRAINING_ROWS, MonitorConfig
 from monitor_node.replay.backtest import Backtest, TrainedPlant, run, train
 from monitor_node.replay.record_checks import check_training_record
+from monitor_node.replay.report_watch import watch
 from monitor_node.replay.row_log import LoggedRow, RowLog, rows_of_file
 from monitor_node.watched_process import WatchedProcess, limit_training, load_process, watch_process
 from reactorwatch.api.backtest_report import backtest_object, backtest_text
-from reactorwatch.api.files import MessageSource, open_messages, resolve_plant
+from reactorwatch.api.files import MessageSource, open_messages, record, resolve_plant
 from reactorwatch.cli.batch import JobKind, JobResult, Row, as_table
 from reactorwatch.cli.options import check_recording
 from reactorwatch.cli.unit_remarks import FirstSamples
@@ -24,7 +26,7 @@ from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.description.find import DEFAULT_PROCESS
 from reactorwatch.description.process import Process
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.file_format import GUESS, FileFormat
@@ -32,6 +34,8 @@ from reactorwatch.records.record import to_minutes, to_time_ns
 
 ROWS_FOR_TRAINING = 3 * DEFAULT_TRAINING_ROWS
 """Rows that are counted to find a third of a record; of a longer one the training is not limited."""
+
+SCHEMES = MONITOR_SCHEME, REPORT_SCHEME = ("monitor", "report")
 
 LOG_COLUMNS = ("file", "row", "time_min", "in_alarm", "raised")
 
@@ -48,6 +52,7 @@ class BacktestOptions:
         stated: statements about the form of a table.
         as_json: format the result as JSON.
         log_rows: return the rows with their alarms.
+        scheme: `monitor`, or `report` for the scheme of the original report.
     """
 
     settings: MonitorConfig
@@ -57,6 +62,11 @@ class BacktestOptions:
     stated: FileFormat = GUESS
     as_json: bool = False
     log_rows: bool = False
+    scheme: str = MONITOR_SCHEME
+
+    def __post_init__(self) -> None:
+        if self.scheme not in SCHEMES:
+            raise InputError(f"--scheme: {describe_unknown('scheme', self.scheme, SCHEMES)}")
 
     def absolute(self) -> "BacktestOptions":
         """Copy with the absolute path of the process, for workers with another working folder."""
@@ -163,7 +173,10 @@ def run_job(job: Job) -> JobResult:
     opened = _open(job.at, job.asked, learns=job.trained is None)
     source, (config, model) = opened.source, opened.watched
     first, log = FirstSamples(config.plant), RowLog() if job.asked.log_rows else None
-    result = run(first.collect_samples(source.messages), config, source.zero_ns or 0, model, job.trained, log)
+    if job.asked.scheme == REPORT_SCHEME:
+        result = _watch_by_report(job, opened, log)
+    else:
+        result = run(first.collect_samples(source.messages), config, source.zero_ns or 0, model, job.trained, log)
     result.left_out = opened.still | result.left_out
     _check_watched(job.at, result)
     zero_ns = result.first_ns if source.zero_ns is None else source.zero_ns
@@ -177,6 +190,17 @@ def run_job(job: Job) -> JobResult:
         remarks += filter(None, [first.unit_remark(model or cstr())])
     logged = None if log is None else RowsOfFile(job.file, _logged_rows(log, source, zero_ns), zero_ns)
     return JobResult(text, _row(job.file, found), remark="; ".join(remarks), extra=logged)
+
+
+def _watch_by_report(job: Job, opened: _Opened, log: RowLog | None) -> Backtest:
+    """Watch a file by the scheme of the original report."""
+    config = opened.watched[0]
+    measured = record(job.at, job.asked.plant, job.asked.columns, opened.process, job.asked.stated)
+    if measured.runs is not None:
+        raise InputError(f"{job.at}: the report's scheme needs one run, {measured.describe_runs()}; cut one out of it")
+    length, minutes = config.training_length, measured.time_min
+    rows = length.rows or int(np.searchsorted(minutes, minutes[0] + (length.minutes or 0.0) - 1e-9))
+    return watch(measured, config.inputs, config.outputs, rows, measured.zero_ns, log)
 
 
 def _check_watched(file: Path, result: Backtest) -> None:

@@ -16,7 +16,8 @@ import msgspec
 import typer
 
 from reactorwatch.api.files import expand_folder
-from reactorwatch.cli.printing import print_lines, print_text
+from reactorwatch.cli.display import print_report
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
@@ -127,7 +128,7 @@ def run_jobs(
     if len(jobs) == 1 and scheduler is None:
         with task(f"{kind.doing} {files[0].name}"):
             result = kind.work(jobs[0])
-        print_text(result.text)
+        print_report(result.text, as_json=as_json)
         write_remark(files[0], result.remark)
         if result.not_written:
             raise InputError(result.not_written)
@@ -142,7 +143,7 @@ def run_jobs(
             print_lines(f"reactorwatch: {file}: {reason}", err=True)
             rows.append({"file": str(file), **dict.fromkeys(kind.columns), "error": reason})
         else:
-            print_text(outcome.text)
+            print_report(outcome.text, as_json=as_json)
             write_remark(file, outcome.remark)
             if outcome.not_written:
                 print_lines(f"reactorwatch: {file}: {outcome.not_written}", err=True)
@@ -150,7 +151,7 @@ def run_jobs(
             extras.append(outcome.extra)
     failed = sum(bool(row["error"]) for row in rows)
     if len(rows) > 1 and not as_json:
-        print_text(f"\n{kind.summary(rows)}")
+        print_report(f"\n{kind.summary(rows)}")
     if len(rows) > 1 and out is not None and failed < len(rows):
         write_summary(out, rows)
     if on_end is not None and extras:

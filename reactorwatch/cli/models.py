@@ -5,12 +5,14 @@ from typing import Annotated
 
 import typer
 
+from reactorwatch.cli.display import print_report
 from reactorwatch.cli.options import (
     Columns,
     Force,
     Inputs,
     Json,
     Plant,
+    Process,
     Processes,
     Scheduler,
     check_recording,
@@ -97,19 +99,29 @@ def identify(
         else:
             validation = identification.Validation(held_out, settle)
             text = identification.fit(measured, described.inputs, outputs, form, validation, as_json=as_json)
-    print_text(text)
+    print_report(text, as_json=as_json)
     write_remark(file, remark)
 
 
 def linearise(
-    qc: Annotated[float, typer.Argument(help="The coolant flow, l/min.", show_default=False)],
-    step: Annotated[float, typer.Option(help="Of qc, by which linear model and plant are compared, l/min.")] = 1.0,
+    levels: Annotated[
+        list[float], typer.Argument(help="Level of each input, in its order and unit (qc of cstr).", show_default=False)
+    ],
+    process: Process = None,
+    step: Annotated[
+        float | None,
+        typer.Option(
+            help="Of each input, by which linear model and plant are compared [a tenth of its scale; qc: 1 l/min].",
+            show_default=False,
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """The linear models at all steady states of a coolant flow."""
+    """The linear models at all steady states of constant inputs."""
     from reactorwatch.cli.linear_models import describe
+    from reactorwatch.description.choice import ProcessChoice
 
-    print_text(describe(qc, step, as_json=as_json))
+    print_text(describe(ProcessChoice(process).load_model(), levels, step, as_json=as_json))
 
 
 def reproduce(

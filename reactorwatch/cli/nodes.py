@@ -14,7 +14,6 @@ from reactorwatch.cli.options import (
     Endpoint,
     Inputs,
     Json,
-    Model,
     Outputs,
     Plant,
     Process,
@@ -22,7 +21,6 @@ from reactorwatch.cli.options import (
     Settings,
     TrainingMin,
     TrainingRows,
-    check_input,
     check_recording,
     choose_process,
     parse_columns,
@@ -79,7 +77,7 @@ def plant(
     scenario: Annotated[
         str | None,
         typer.Option(
-            help="The input: random-steps, sines, square, constant or a .csv record [random-steps].",
+            help="The inputs: random-steps, sines, square, constant or a record [random-steps].",
             show_default=False,
         ),
     ] = None,
@@ -87,12 +85,11 @@ def plant(
         list[str] | None,
         typer.Option(help="A fault, as cause:profile:size@onset: coolant_flow:step:-0.05@30min. Repeatable."),
     ] = None,
-    model: Model = None,
+    process: Process = None,
 ) -> None:
-    """Simulate the reactor and publish its sensors' samples."""
+    """Simulate a process with equations and publish its sensors' samples."""
     from plant_node.__main__ import run
-    from plant_node.config import PlantConfig
-    from reactorwatch.runtime.config import section
+    from reactorwatch.cli.plant_settings import load_plant_settings
 
     tables, bus = _settings(config, endpoint)
     flags = {
@@ -103,9 +100,9 @@ def plant(
         "seed": seed,
         "scenario": scenario,
         "faults": fault or None,
-        "model": str(check_input(model)) if model is not None else None,
+        "process": process,
     }
-    run(section(PlantConfig, "plant", tables, flags), bus, _metrics(tables))
+    run(load_plant_settings(tables, flags), bus, _metrics(tables))
 
 
 def monitor(

@@ -100,14 +100,14 @@ Scheduler = Annotated[
 ]
 
 
-def check_encodable(text: str) -> str:
+def check_encodable(text: str | None) -> str | None:
     """Check that a text can be sent in a message; returns it.
 
     Raises:
         BadParameter: the terminal sent bytes that are no UTF-8.
     """
     try:
-        text.encode()
+        (text or "").encode()
     except UnicodeEncodeError as error:
         raise typer.BadParameter(f"must be UTF-8, got {text!r}") from error
     return text

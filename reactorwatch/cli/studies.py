@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from reactorwatch.cli.display import print_report
 from reactorwatch.cli.options import (
     Columns,
     Files,
@@ -27,9 +28,9 @@ from reactorwatch.cli.options import (
     parse_columns,
     parse_limits,
     parse_tolerances,
+    split_names,
     training_flags,
 )
-from reactorwatch.cli.printing import print_text
 from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS, FileFormat
@@ -61,7 +62,7 @@ def simulate(
 
     They start from its first row and run freely, driven by its inputs.
     """
-    from reactorwatch.api.files import record
+    from reactorwatch.api.files import described_process, process_on_clock, record
     from reactorwatch.api.simulation import report, simulate_along
     from reactorwatch.cli.progress import task
     from reactorwatch.description.choice import ProcessChoice
@@ -69,16 +70,17 @@ def simulate(
 
     choice = ProcessChoice(process)
     out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
-    measured = record(check_recording(file), plant, parse_columns(column), choice.load(), stated=stated)
-    model = choice.load_model(measured.zero_ns)
+    described = described_process(check_recording(file), plant, choice)
+    measured = record(file, plant, parse_columns(column), described, stated=stated)
+    model = process_on_clock(choice, described, measured.zero_ns).require_model()
     with task(f"simulating {file.name}"):
         simulated = simulate_along(measured, model, fault or [])
         try:
             write_table(out, simulated)
         except InputError:
-            print_text(report(measured, simulated, model, None, as_json=as_json))
+            print_report(report(measured, simulated, model, None, as_json=as_json), as_json=as_json)
             raise
-    print_text(report(measured, simulated, model, out, as_json=as_json))
+    print_report(report(measured, simulated, model, out, as_json=as_json), as_json=as_json)
 
 
 def backtest(
@@ -95,6 +97,9 @@ def backtest(
     training: TrainingMin = None,
     training_rows: TrainingRows = None,
     reference: Reference = None,
+    scheme: Annotated[
+        str, typer.Option(help="monitor, or report: watch as the original report does, mean +- 3 sigma of OE(3,3).")
+    ] = "monitor",
     column: Columns = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for a summary of several files.", show_default=False)
@@ -126,6 +131,8 @@ def backtest(
         rows = check_output(rows, ".csv", sources, force=force)
     if train is not None and (training is not None or training_rows is not None):
         raise InputError(f"--train {train}: all of it is the training; leave --training and --training-rows out")
+    if train is not None and scheme == "report":
+        raise InputError(f"--train {train}: the report's scheme learns from the first rows of each file; leave it out")
     tables = read_settings(config)
     flags: dict[str, Any] = {"plant": plant or DEFAULT_PLANT, "reference": reference}
     if choice.outputs:
@@ -134,7 +141,14 @@ def backtest(
     flags |= training_flags(tables, training, training_rows)
     settings = section(MonitorConfig, "monitor", tables, flags)
     asked = BacktestOptions(
-        settings, plant, parse_columns(column), choice, stated, as_json=as_json, log_rows=rows is not None
+        settings,
+        plant,
+        parse_columns(column),
+        choice,
+        stated,
+        as_json=as_json,
+        log_rows=rows is not None,
+        scheme=scheme,
     )
     trained = None
     if train is not None:
@@ -181,6 +195,12 @@ def diagnose(
         ),
     ] = None,
     process: Process = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--without", help="A cause that is left out (repeatable); nothing takes its place.", show_default=False
+        ),
+    ] = None,
     plant: Plant = None,
     column: Columns = None,
     jobs: Processes = None,
@@ -206,6 +226,7 @@ def diagnose(
         parse_tolerances(tolerance),
         parse_limits(limit),
         stated=stated,
+        without=split_names(without),
     )
     todo = make_jobs(named, out, asked, as_json=as_json, elsewhere=scheduler is not None)
     run_jobs(DIAGNOSIS, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)

@@ -8,7 +8,6 @@ from reactorwatch.description.catalogue import Catalogue, check_process
 from reactorwatch.description.process import Process, describe_model
 from reactorwatch.description.toml_file import parse_process
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.process import effects_of
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.input_file import wrap_read_errors
@@ -42,7 +41,7 @@ def find_process(
     if isinstance(process, Process):
         return process
     if isinstance(process, ProcessModel):
-        return describe_model(process, effects_of(process))
+        return describe_model(process)
     path = Path(process)
     kind = path.suffix.lower()
     if kind not in FILE_KINDS:
@@ -64,7 +63,7 @@ def find_process(
         elif zero_ns:
             extended = extended.rebase(zero_ns)
         model = extended.build()
-        return describe_model(model, effects_of(model))
+        return describe_model(model)
     except InputError as error:
         raise InputError(f"process file {path}: {error}") from error
 

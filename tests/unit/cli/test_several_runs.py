@@ -93,4 +93,4 @@ def test_a_back_test_raises_the_same_alarms_after_the_clock_was_set_back(whole: 
 
 def test_several_runs_drive_no_plant(whole: Record) -> None:
     with pytest.raises(InputError, match=r"must be one run to drive the plant, .* 2 runs"):
-        HeldRecord.of(cut(whole, 60.0))
+        HeldRecord.of(cut(whole, 60.0), cstr().inputs[0])

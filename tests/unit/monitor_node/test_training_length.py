@@ -60,11 +60,9 @@ def test_a_state_learned_with_another_length_is_resumed_unless_a_length_is_state
         Monitor(stated(training_rows=200), 0, points=False).from_bytes(state)
 
 
-@pytest.mark.parametrize(("word", "meant"), [("process", "equations"), ("equations", "equations"), ("arx", "arx")])
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [("process", "equations"), ("equations", "equations"), ("black-box", "black-box"), ("arx", "arx")],
+)
 def test_the_words_for_references_are_the_same_everywhere_and_the_older_one_is_read(word: str, meant: str) -> None:
     assert section(MonitorConfig, "monitor", {"monitor": {"reference": word}}, {}).reference == meant
-
-
-def test_a_reference_that_this_version_lacks_is_refused() -> None:
-    with pytest.raises(InputError, match="'black-box' is not in this version; set 'auto', 'equations' or 'arx'"):
-        section(MonitorConfig, "monitor", {"monitor": {"reference": "black-box"}}, {})
