@@ -114,7 +114,8 @@ class FleetMonitor:
         self._presume_gone_ns: int | None = start_ns + PRESUME_GONE_NS
         self._registered: dict[str, None] = {}  # all plants, with any owner
         self._unverified = UnverifiedPlants()
-        self._signals = tuple(dict.fromkeys(signal for kind in all_kinds for signal in kind.config.signals))
+        configs = [kind.config for kind in all_kinds]
+        self._signals = tuple(dict.fromkeys(name for item in configs for name in (*item.signals, *item.carried)))
         self._plants: dict[str, str] = {}  # plants that are not quiet, by key of a sample
         self._handed_over, self._recent = HandedOverAlarms(self._watched.alarms), RecentlyAdopted()
         self._paused_messages: list[Encoded] | None = None  # buffered in a pause

@@ -49,7 +49,9 @@ def backtest_object(
                 "raised_min": minutes(alarm.raised_ns),
                 "cleared_min": minutes(cleared_ns),
                 "signals": [item.signal for item in alarm.contributions],
-                "suspect": [{"cause": item.cause, "probability": item.probability} for item in alarm.suspects],
+                "suspect": [
+                    {"cause": item.cause, "probability": item.probability, "text": item.text} for item in alarm.suspects
+                ],
             }
             for alarm, cleared_ns in result.raised_alarms
         ],
