@@ -1,5 +1,6 @@
 """State of a plant's pipeline, composed of its parts' states."""
 
+from monitor_node.baseline.black_box_reference import BlackBoxReferenceState
 from monitor_node.baseline.predictor import PredictorState
 from monitor_node.baseline.references import ArxReferenceState, ProcessReferenceState
 from monitor_node.baseline.training import TrainingState
@@ -28,7 +29,7 @@ class TrainedState(StoredState, frozen=True):
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
     """
 
-    reference: ProcessReferenceState | ArxReferenceState
+    reference: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
     checks: list[tuple[str, str]]
     left_out: dict[str, str]
     whiteners: list[PrewhitenerState]

@@ -18,6 +18,7 @@ from reactorwatch.cli import (
     causes,
     charts,
     compilation,
+    examples,
     files,
     models,
     nodes,
@@ -47,9 +48,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (
+GROUPS = (
     runs,
     nodes,
+    examples,
     view,
     site,
     playback,
@@ -61,7 +63,8 @@ for group in (
     models,
     charts,
     compilation,
-):
+)
+for group in GROUPS:
     group.register_commands(app)
 
 

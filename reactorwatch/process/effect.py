@@ -17,18 +17,6 @@ from reactorwatch.process.profiles import CONSTANT, Profile
 TIMING = "timing"
 """Location of a deviation in the timestamps of a record, not in the plant."""
 
-LOCATIONS = (
-    "mass_balance",
-    "energy_balance",
-    "reaction",
-    "feed",
-    "coolant",
-    "temperature_sensor",
-    "concentration_sensor",
-    TIMING,
-)
-"""Locations of effects on the reactor."""
-
 
 @dataclass(frozen=True)
 class EffectConstant:
@@ -61,7 +49,7 @@ class Effect(ABC):
     Attributes:
         name: name in the catalogue of causes.
         label: usual name of the effect in text.
-        location: part of the plant in which it acts; one of `LOCATIONS` for the reactor.
+        location: part of the plant in which it acts.
         unit: unit of its size.
         larger: meaning of a positive size, with `{}` for its amount: in the size's unit, or in % for a share.
         smaller: meaning of a negative size, like `larger`; empty: there is none.
@@ -149,6 +137,19 @@ class Effect(ABC):
             for item in self.constants
         )
         return replace(model, parameters=(*model.parameters, *added)), tuple(item.symbol for item in added)
+
+    def describe(self, size: float) -> str:
+        """Meaning of a size, rounded to two digits, for people.
+
+        Args:
+            size: the size, in the effect's unit.
+        """
+        text, amount = self.larger or f"{self.label}: {{}} {self.unit}".removesuffix(" 1"), size
+        if size < 0.0 and self.smaller:
+            text, amount = self.smaller, -size
+        if "{} %" in text:
+            amount *= 100.0
+        return text.format(f"{float(f'{amount:.2g}'):g}")
 
     def size_signal(self, clock: Clock, profile: Profile, symbols: dict[str, ca.SX]) -> ca.SX:
         """m(t) with a profile, as an expression of the clock and of the symbols of the profile's parameters."""
