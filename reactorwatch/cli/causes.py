@@ -30,10 +30,10 @@ def causes(
     stated: FileFormat = GUESS,
 ) -> None:
     """Show which causes the sensors distinguish, and from which size on each is seen."""
-    from reactorwatch.cli.causes_report import as_json_text, as_matrix
-    from reactorwatch.cli.progress import task
     from reactorwatch.api.files import described_process, process_on_clock
     from reactorwatch.api.files import record as read_record
+    from reactorwatch.cli.causes_report import as_json_text, as_matrix
+    from reactorwatch.cli.progress import task
     from reactorwatch.description.choice import ProcessChoice
     from reactorwatch.diagnosis.identifiability import identifiability
     from reactorwatch.diagnosis.record_checks import make_run
