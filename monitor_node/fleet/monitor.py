@@ -106,7 +106,7 @@ class FleetMonitor:
         self._presume_gone_ns: int | None = start_ns + PRESUME_GONE_NS
         self._registered: dict[str, None] = {}  # all plants, with any owner
         self._unverified = UnverifiedPlants()
-        self._signals = config.signals
+        self._signals = (*config.signals, *config.carried)
         self._plants: dict[str, str] = {}  # plants that are not quiet, by key of a sample
         self._handed_over, self._recent = HandedOverAlarms(self._watched.alarms), RecentlyAdopted()
         self._paused_messages: list[Encoded] | None = None  # buffered in a pause

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from monitor_node.replay.backtest import run as run_backtest
+from monitor_node.replay.record_checks import check_training_record
 from monitor_node.watched_process import WatchedProcess, limit_training, watch_process
 from reactorwatch.api.backtest_report import backtest_object, backtest_text
 from reactorwatch.api.monitor import Suspect, monitor_settings
@@ -124,15 +125,18 @@ def backtest(record: Record, process: ProcessLike | None = None, **settings: Any
     Raises:
         InputError: settings that do not fit together, or a record without a usable value.
     """
+    still: dict[str, str] = {}
     named = getattr(record, "process", None) if process is None else process
     config = monitor_settings(settings)
     if named is None:
         watched = WatchedProcess(limit_training(config, record.rows), None)
     else:
         watched = watch_process(config, find_process(named, record.zero_ns), record.rows)
+        still = check_training_record(record, *watched)
     zero_ns = replace(record, zero_ns=0).stored_zero_ns  # so that the minutes of a model are those of the record
     publications = samples_of(record, config.plant, zero_ns)
     result = run_backtest((encode(item) for item in publications), watched.config, zero_ns, watched.model)
+    result.left_out = still | result.left_out
     if not result.rows:
         raise InputError(f"{record.name}: holds no sample that can be used")
     found = backtest_object(result, zero_ns, record.zero)

@@ -225,9 +225,17 @@ def model_of(record: MeasuredRecord, process: ProcessLike | None) -> ProcessMode
     """Equations of the process of a record, their clock that of the record.
 
     Raises:
-        InputError: there is no such process, the file cannot be read, or the process has no equations.
+        InputError: there is no such process, its file cannot be read, it has no equations, or the record lacks a signal
+            of them.
     """
-    return find_process(process_of(record, process), record.zero_ns).require_model()
+    model = find_process(process_of(record, process), record.zero_ns).require_model()
+    missing = [name for name in (*model.input_names, *model.output_names) if name not in record.columns]
+    if missing:
+        raise InputError(
+            f"{record.name}: must have the signals of {model.name}, {', '.join(missing)} missing, got "
+            f"{', '.join(record.columns) or 'none'}; read it with the process that it is of"
+        )
+    return model
 
 
 def effects(process: ProcessLike = DEFAULT_PROCESS) -> tuple[Effect, ...]:
