@@ -1,6 +1,6 @@
 """Process that a monitor watches: its signals and equations in the settings of the monitor."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -61,12 +61,10 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
     """
     if config.reference == "equations":
         process.require_model()
-    signals = signal_settings(process)
-    changed: dict[str, object] = {
-        "units": process.units,
-        **{key: names for key, names in signals.items() if getattr(config, key) == DEFAULT_SIGNALS[key]},
-    }
-    for signal in (name for key in DEFAULT_SIGNALS if key not in changed for name in getattr(config, key)):
+    described = signal_settings(process)
+    named = {key: getattr(config, key) for key, names in DEFAULT_SIGNALS.items() if getattr(config, key) != names}
+    changed: dict[str, object] = {"units": process.units} | _restrict(described, described | named)
+    for signal in (name for names in named.values() for name in names):
         if signal not in (*process.inputs, *process.outputs):
             raise InputError(describe_unknown("signal", signal, (*process.inputs, *process.outputs)))
     if process.model is None:
@@ -80,6 +78,21 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
             changed["training_rows"] = DEFAULT_TRAINING_ROWS
     changed_config = msgspec.structs.replace(config, **changed)
     return WatchedProcess(limit_training(changed_config, rows, is_stated=_states_training(config)), process.model)
+
+
+def _restrict(described: dict[str, Any], chosen: dict[str, Any]) -> dict[str, Any]:
+    """Settings of the signals of a process, for the inputs and outputs that are watched."""
+    inputs, outputs = chosen["inputs"], chosen["outputs"]
+    others = [name for key in ("inputs", "outputs") for name in described[key] if name not in (*inputs, *outputs)]
+    return {
+        "inputs": inputs,
+        "outputs": outputs,
+        "setpoints": described["setpoints"],
+        "modes": described["modes"],
+        "labels": (*described["labels"], *others),
+        "bounds": {name: bounds for name, bounds in described["bounds"].items() if name in (*inputs, *outputs)},
+        "resolution": {name: step for name, step in described["resolution"].items() if name in outputs},
+    }
 
 
 def limit_training(config: MonitorConfig, rows: int | None, *, is_stated: bool | None = None) -> MonitorConfig:

@@ -32,7 +32,7 @@ from reactorwatch.diagnosis.result import (
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.noise_masking import search_single_cause
 from reactorwatch.diagnosis.search.pairs import search_pairs
-from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult
+from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult, smallest_noise
 from reactorwatch.diagnosis.sensor_noise import estimate_sensor_noise
 from reactorwatch.diagnosis.unknown_input.localise import MARGIN, UnknownInput, bic_on, locate
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, minus_log10_p
@@ -58,9 +58,6 @@ NEARLY = 1.15
 """Ratio to the noise: a simulation with a smaller error explains what matters, even if its residual is not white."""
 
 KEPT_BYTES = 31_000_000
-
-SMALLEST_NOISE = 1e-3
-"""Lower bound of a sensor's noise as a fraction of the state's scale; files have so many digits."""
 
 
 def diagnose(
@@ -96,7 +93,7 @@ def diagnose(
     whole = make_run(record, model)
     bands = tolerances_of(whole, model, tolerance or {})
     plant = add_priors(model, uncertain or {})
-    search = Search(plant, effects, whole, _smallest_sd(model))
+    search = Search(plant, effects, whole, smallest_noise(model))
     run = search.run
     result = search_single_cause(search)
     if search.adopt_colored_noise(result.best):
@@ -288,8 +285,3 @@ def _describe_outliers(whole: Run, run: Run) -> list[str]:
         return []
     values = "1 value was" if count == 1 else f"{count} values were"
     return [f"{values} excluded as outliers"]
-
-
-def _smallest_sd(model: ProcessModel) -> list[float]:
-    scales = {state.name: state.scale for state in model.states}
-    return [SMALLEST_NOISE * scales.get(output.name, 1.0) for output in model.outputs]

@@ -48,6 +48,9 @@ other noise levels, too. A curve with twelve knots that needs only three costs n
 ROUGH = 1e-3
 """Minimum error of a predicted gain, as a fraction of it: the equations are not linear."""
 
+SMALLEST_NOISE = 1e-3
+"""Lower bound of a sensor's noise as a fraction of the state's scale; files have so many digits."""
+
 LEAST_SENSOR_GAIN = 10.0
 """Minimum gain in BIC of coloured sensor noise."""
 
@@ -398,3 +401,9 @@ def _least_score(candidate: Candidate) -> float:
 
 def _label(candidate: Candidate) -> Label:
     return ((candidate.effect.name, candidate.profile.name),)
+
+
+def smallest_noise(model: ProcessModel) -> list[float]:
+    """Lower bound of each sensor's noise."""
+    scales = {state.name: state.scale for state in model.states}
+    return [SMALLEST_NOISE * scales.get(output.name, 1.0) for output in model.outputs]
