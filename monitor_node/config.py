@@ -51,6 +51,10 @@ SMALLEST_SD = {"C": 2e-4, "T": 0.05}
 """Defaults for the reactor's outputs; other outputs have none."""
 
 
+DEFAULT_SIGNALS = ("qc", "C", "T")
+"""Signals of the default process, the input first."""
+
+
 class TrainingLength(NamedTuple):
     """Duration of a training.
 
@@ -79,6 +83,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         plant: name of the plant.
         inputs: signals that drive the plant; none, one or several.
         outputs: signals that are predicted and monitored.
+        units: unit by signal, as its process describes it: that of samples which name none, and, without equations,
+            the unit in which a signal is judged.
         order: order of the ARX models.
         delay: delay of the input in samples; with 1 it acts on the next sample.
         forgetting: forgetting factor of the adaptive model, in [0.5, 1]; with 1 it forgets nothing.
@@ -88,8 +94,10 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             the deviations that it had from the start.
         reference: model that predicts the rows: `equations`, the filter of the process's equations (older: `process`);
             `black-box`, a state map learned from the training, for few signals; `arx`, the identified model as fitted
-            to the training; `auto`, the first of these that predicts the training about as well as the last.
-        model: file of an extended model (`diagnose -o`) for the equations; None: the nominal reactor.
+            to the training; `auto`, the first of these that predicts the training about as well as the last (without
+            inputs no black box).
+        process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
+            nominal reactor where its signals are watched.
         charts: charts of the residuals.
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
             nearest number that the charts can keep for the number of alarms and the sampling period.
@@ -115,6 +123,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     plant: str = "cstr"
     inputs: tuple[str, ...] = ("qc",)
     outputs: tuple[str, ...] = ("C", "T")
+    units: dict[str, str] = msgspec.field(default_factory=dict)
     order: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
     delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
     forgetting: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.999
@@ -122,7 +131,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     training_rows: Annotated[int, msgspec.Meta(ge=1, le=10_000)] | None = None
     diagnose_training: bool = True
     reference: ReferenceName | Literal["process"] = "auto"
-    model: str | None = None
+    process: str | None = None
     charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
     false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None
     smallest_sd: dict[str, float] = msgspec.field(default_factory=SMALLEST_SD.copy)
@@ -144,7 +153,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     priorities: dict[str, PriorityName] = msgspec.field(default_factory=lambda: DEFAULT_PRIORITIES)
 
     older_keys: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = MappingProxyType(
-        {"input": ("inputs", lambda name: [name])}
+        {"input": ("inputs", lambda name: [name]), "model": ("process", lambda name: name)}
     )
     """Older names of keys, each with the present one and the function from a value of the older to one of it."""
 
@@ -165,6 +174,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             )
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
+        if self.process is not None and self.signals == DEFAULT_SIGNALS:
+            return  # the signals are those of the process, which `watched_process` sets
         for signal, sd in self.smallest_sd.items():
             if signal not in (*self.outputs, *SMALLEST_SD):
                 raise ValueError(f"smallest_sd is by output, {self.outputs}, got {signal!r}")

@@ -23,6 +23,7 @@ from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, ReceiveS
 from monitor_node.ingest.rejects import RejectCounter
 from monitor_node.ingest.replay_filter import ReplayFilter
 from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, reject_reason
+from monitor_node.ingest.sample_units import make_sample_units
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from monitor_node.pipeline import PlantPipeline
 from monitor_node.process_settings import order_inputs
@@ -87,6 +88,7 @@ class Monitor:
         self._replay_filter: ReplayFilter | None = None
         self.alarms = Annunciator(config)
         self.pipeline = self._new_pipeline(self.alarms)
+        self._sample_units = make_sample_units(config.units, None if model is None else model.units)
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -127,10 +129,16 @@ class Monitor:
 
     def on_sample(self, signal: str, sample: Sample, now_ns: int) -> list[Publication]:
         """Process a sample of one of the plant's signals; returns publications."""
-        quality, value = sample.quality, sample.value  # each access to the message costs as much as a line here
+        quality, value, unit = sample.quality, sample.value, sample.unit  # each access costs as much as a line here
         if quality not in USABLE or not abs(value) < LARGEST_VALUE:
             self.rejects.add(*reject_reason(signal, sample))
             return []
+        if self._sample_units is not None:
+            try:
+                value, unit = self._sample_units.convert(signal, unit, value)
+            except InputError as error:
+                self.rejects.add("unit", str(error))
+                return []
         if self._replay_filter is not None and self._replay_filter.is_duplicate(
             self._indices[signal], sample.time_ns, sample.sequence
         ):
@@ -140,14 +148,14 @@ class Monitor:
         time_ns, number = sample.time_ns, sample.sequence
         run, is_accepted = self._runs[self._indices[signal]], True
         if run.accept_next(number, time_ns):  # as nearly always
-            self._accept(signal, time_ns, number, value, sample.unit, publications)
+            self._accept(signal, time_ns, number, value, unit, publications)
         elif not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):
             self.rejects.add(
                 "out_of_range", f"{signal} number {number} at {time_ns} ns: no plant counts or lasts so far"
             )
             return []
         else:
-            accepted, rejected = run.update(HeldSample(time_ns, number, value, sample.unit), self.config.reorder_rows)
+            accepted, rejected = run.update(HeldSample(time_ns, number, value, unit), self.config.reorder_rows)
             is_accepted = bool(accepted)
             for item in rejected:
                 self._reject(signal, item, run)

@@ -139,6 +139,7 @@ class PlantPipeline:
         self.is_normal = False
         self.training_rows = 0
         self.left_out: dict[str, str] = {}
+        self._noted: set[str] = set()
 
     # --- state -----------------------------------------------------------------------------------------------
 
@@ -218,7 +219,7 @@ class PlantPipeline:
         self, state: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
     ) -> Reference:
         if isinstance(state, ArxReferenceState):
-            return ArxReference.from_state(state)
+            return ArxReference(state)
         if isinstance(state, BlackBoxReferenceState):
             return BlackBoxReference.from_state(state)
         if self.equations is None:
@@ -643,6 +644,8 @@ class PlantPipeline:
             for whitener in self._whiteners:
                 whitener.restart()
         predictions, sds = reference.update(time_ns, row.inputs, values, self._quarantined, row.interval.missing)
+        if isinstance(reference, ArxReference):
+            self._note_inputs_beyond(reference, row.inputs)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
@@ -664,6 +667,16 @@ class PlantPipeline:
             publications.extend(self._search_causes(row, stuck))
         if isinstance(reference, BlackBoxReference):
             reference.set_learning(not self._board.has_unexplained)
+
+    def _note_inputs_beyond(self, reference: ArxReference, inputs: Sequence[float]) -> None:
+        """Note once each input that leaves its range in the training, as rows are not judged then."""
+        for name in (self._config.inputs[i] for i in reference.find_beyond(inputs)):
+            if name not in self._noted:
+                self._noted.add(name)
+                self.notes.append(
+                    f"rows are not judged while {name} is beyond its range in the training: the identified model does "
+                    "not hold there"
+                )
 
     def _note_late_signals(self, inputs: Sequence[float], values: list[float]) -> None:
         """Note once each signal whose first value arrives after the training."""

@@ -23,7 +23,7 @@ from monitor_node.alarms.alarms import (
 from monitor_node.alarms.incidents import Incident, Incidents
 from monitor_node.alarms.kpis import AlarmStatus, KpiCounter, KpiState
 from monitor_node.alarms.on_off_delay import OnOffDelay
-from monitor_node.alarms.states import Event, State, is_consistent
+from monitor_node.alarms.states import UNACKNOWLEDGED_STATES, Event, State, is_consistent
 from monitor_node.config import MonitorConfig, PriorityName
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
@@ -220,6 +220,26 @@ class Annunciator:
         alarm, time_ns = self._find(name), self._now_ns()
         self._change_by(alarm, event, time_ns, by, comment)
         return [self._publication(alarm, event, time_ns), self._publish_kpis(time_ns)]
+
+    def acknowledge_incident(self, number: int, by: str, comment: str) -> list[Publication]:
+        """Acknowledge all alarms of an incident, one after the other.
+
+        Args:
+            number: number of the incident.
+            by: name of the operator.
+            comment: reason; empty: the last comment stays.
+
+        Raises:
+            InputError: no sample has come yet, or the incident has no alarm that is unacknowledged.
+        """
+        due = [
+            name
+            for name, alarm in self._alarms.items()
+            if alarm.memory.incident == number and alarm.memory.state in UNACKNOWLEDGED_STATES
+        ]
+        if not due:
+            raise InputError(f"incident {number} has no alarm to acknowledge (the latest incident is {self.incident})")
+        return [item for name in due for item in self.act(name, Event.ACKNOWLEDGE, by, comment)]
 
     def shelve(self, name: str, minutes: float, by: str, comment: str) -> list[Publication]:
         """Shelve an alarm, or change the time for which it is shelved.

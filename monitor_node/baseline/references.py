@@ -68,10 +68,17 @@ class ProcessReferenceState(StoredState, frozen=True, tag="process"):
 
 
 class ArxReferenceState(StoredState, frozen=True, tag="arx"):
-    """State of an `ArxReference`: the range in which it is valid, one an input."""
+    """State of an `ArxReference`.
+
+    Attributes:
+        low: lower end of the range in which the models hold, one an input.
+        high: upper end of it.
+        uses_inputs: one flag an output: its model has the inputs.
+    """
 
     low: list[float]
     high: list[float]
+    uses_inputs: list[bool]
 
 
 class Reference(Protocol):
@@ -304,42 +311,49 @@ class ArxReference:
     """Identified models, one an output; the caller sets their predictions.
 
     Args:
-        inputs: inputs of the training, shape (n, inputs).
+        state: the state.
     """
 
     kind = "arx"
 
-    def __init__(self, inputs: Array) -> None:
-        self._low: list[float] = []
-        self._high: list[float] = []
-        for column in inputs.T:
-            finite = column[np.isfinite(column)]
-            low, high = (float(finite.min()), float(finite.max())) if finite.size else (-np.inf, np.inf)
-            margin = MARGIN * (high - low)
-            self._low.append(low - margin)
-            self._high.append(high + margin)
+    def __init__(self, state: ArxReferenceState) -> None:
+        self.state = state
+        self._sds = [1.0] * len(state.uses_inputs)
         self.predictions: list[float] = []
         """Predictions of the next row, one an output."""
 
     @classmethod
-    def from_state(cls, state: ArxReferenceState) -> "ArxReference":
-        """Resume from a state."""
-        reference = cls(np.zeros((0, 0)))
-        reference._low, reference._high = list(state.low), list(state.high)
-        return reference
+    def of_training(cls, inputs: Array, uses_inputs: list[bool]) -> "ArxReference":
+        """Reference after a training.
 
-    @property
-    def state(self) -> ArxReferenceState:
-        """See `Reference`."""
-        return ArxReferenceState(list(self._low), list(self._high))
+        Args:
+            inputs: inputs of the training, shape (n, inputs).
+            uses_inputs: one flag an output: its model has the inputs.
+        """
+        lows, highs = [], []
+        for column in inputs.T:
+            finite = column[np.isfinite(column)]
+            low, high = (float(finite.min()), float(finite.max())) if finite.size else (-np.inf, np.inf)
+            margin = MARGIN * (high - low)
+            lows.append(low - margin)
+            highs.append(high + margin)
+        return cls(ArxReferenceState(lows, highs, uses_inputs))
 
     def update(
         self, time_ns: int, inputs: Sequence[float], values: list[float], accept: tuple[bool, ...], missing: int = 0
     ) -> RowPrediction:
         """See `Reference`. There is no prediction with an input beyond the training, nor after a missing row."""
-        if all(low <= value <= high for low, value, high in zip(self._low, inputs, self._high, strict=True)):
-            return RowPrediction(self.predictions, [1.0] * len(values))
-        return RowPrediction([nan] * len(values), [1.0] * len(values))
+        if not self.find_beyond(inputs):
+            return RowPrediction(self.predictions, self._sds)
+        pairs = zip(self.predictions, self.state.uses_inputs, strict=True)
+        return RowPrediction([nan if uses_inputs else prediction for prediction, uses_inputs in pairs], self._sds)
+
+    def find_beyond(self, inputs: Sequence[float]) -> list[int]:
+        """Indices of the inputs that are beyond the training, for models that have them."""
+        if True not in self.state.uses_inputs:
+            return []
+        ranges = zip(self.state.low, inputs, self.state.high, strict=True)
+        return [i for i, (low, value, high) in enumerate(ranges) if value < low or value > high]
 
     def restart(self) -> None:
         """Do nothing: the models restart by themselves."""

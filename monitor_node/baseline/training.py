@@ -11,15 +11,17 @@ without the inputs that are left out.
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from itertools import compress
 from math import isfinite, log10
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
-from monitor_node.baseline.predictor import ArxPredictor, arx_structure, fewest_rows
+from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_structure, fewest_rows
 from monitor_node.baseline.references import ArxReference, ProcessReference, Reference, estimate_training_noise
 from monitor_node.baseline.resolution import resolution_sd
 from monitor_node.baseline.signal_range import signal_ranges
@@ -119,7 +121,8 @@ class Training:
         self._without_black_box = ""
         self._rows: deque[tuple[int, Sequence[float], list[float]]] = deque(maxlen=MOST_ROWS)
         self._counts = [0] * len(config.outputs)
-        of_identified = max(fewest_rows(arx_structure(config)), FEWEST_ROWS)
+        of_one_input = replace(structure := arx_structure(config), inputs=min(structure.inputs, 1))
+        of_identified = max(fewest_rows(of_one_input), FEWEST_ROWS)
         self.fewest_rows = FEWEST_ROWS if model is not None else of_identified
         """Least number of values of each output that a training needs."""
 
@@ -225,8 +228,21 @@ class Training:
             checks.append(Check(name=reference.kind, result=reference.weakness))
         if self._without_black_box:
             checks.append(Check(name=BlackBoxReference.kind, result=f"the ARX models judge: {self._without_black_box}"))
+        if isinstance(reference, ArxReference):
+            checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
         return TrainingResult(reference, learned, e, np.where(usable, measured, np.nan), checks, refused, left_out)
+
+    def _simplifications(self, evaluated: list[bool]) -> list[str]:
+        """Terms that the identified models lack, each with the outputs."""
+        outputs: dict[str, list[str]] = {}
+        for name, predictor in compress(zip(self._config.outputs, self._predictors, strict=True), evaluated):
+            outputs.setdefault(predictor.simplification, []).append(name)
+        return [
+            f"{', '.join(names)}: predicted with {text}, as there are fewer than {ROWS_A_PARAMETER} rows a parameter"
+            for text, names in outputs.items()
+            if text
+        ]
 
     def _constant_outputs(self, measured: Array, steps: list[float]) -> dict[str, str]:
         """Outputs that never vary, and have no smallest relevant deviation in the settings, with the reason."""
@@ -244,7 +260,8 @@ class Training:
         has_values = np.count_nonzero(np.isfinite(inputs), axis=0) >= FEWEST_ROWS
         given_inputs = np.where(has_values, inputs, 0.0)
         if not has_values.all():
-            self._predict_again(time_min, given_inputs, measured)
+            for predictor, column in zip(self._predictors, measured.T, strict=True):
+                predictor.learn_again(time_min, given_inputs, column)
         identified, screenings = _refit_without_outliers(
             lambda rows: (self._arx_residuals(time_min, given_inputs, rows), minor), measured
         )
@@ -255,12 +272,15 @@ class Training:
             residuals = z * np.array(reference.typical_sd)
             if self._config.reference == "equations" or _predicts_as_well(residuals, identified):
                 return reference, z, judged
-        black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
+        black_box = None
+        is_driven = bool(inputs.shape[1] and has_values.all())  # without inputs there is nothing to simulate
+        if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven):
+            black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
         if black_box is not None:
             residuals = black_box[1] * np.array(black_box[0].typical_sd)
             if self._config.reference == "black-box" or _predicts_as_well(residuals, identified):
                 return black_box
-        return ArxReference(given_inputs), identified, screenings
+        return self._arx_reference(given_inputs), identified, screenings
 
     def _equations(
         self, time_min: Array, inputs: Array, outputs: Array, smallest: list[float], steps: list[float]
@@ -279,10 +299,8 @@ class Training:
     def _black_box(
         self, time_min: Array, inputs: Array, outputs: Array, smallest: list[float], steps: list[float]
     ) -> tuple[BlackBoxReference, Array, list[Screening]] | None:
-        """Black box as reference; None if the settings exclude it, or the signals are too many or the rows too few."""
+        """Black box as reference; None if the signals are too many or the rows too few."""
         self._without_black_box = ""
-        if self._config.reference not in ("auto", "black-box"):
-            return None
         learned: list[BlackBoxReference] = []
 
         def innovations(rows: Array) -> Residuals:
@@ -297,14 +315,6 @@ class Training:
             return None
         return learned[-1], z, screenings
 
-    def _predict_again(self, time_min: Array, inputs: Array, measured: Array) -> None:
-        """Update the identified models with the rows once more, with other inputs."""
-        follows = [False, *regular_intervals(time_min).tolist()]
-        times_ns = [round(minutes * MINUTE_NS) for minutes in time_min.tolist()]
-        for predictor, column in zip(self._predictors, measured.T.tolist(), strict=True):
-            for time_ns, values, value, is_next in zip(times_ns, inputs.tolist(), column, follows, strict=True):
-                predictor.buffer(time_ns, values, value, follows=is_next)
-
     def _mask_impossible(self, inputs: Array, measured: Array) -> tuple[Array, Array] | None:
         """Inputs and outputs with NaN for impossible values; None if there are too many: the process is another one."""
         columns, ranges = np.column_stack([inputs, measured]), signal_ranges(self._model, self._config.signals)
@@ -314,6 +324,9 @@ class Training:
             return None
         columns = np.where(out, np.nan, columns)
         return columns[:, : inputs.shape[1]], columns[:, inputs.shape[1] :]
+
+    def _arx_reference(self, inputs: Array) -> ArxReference:
+        return ArxReference.of_training(inputs, [predictor.uses_inputs for predictor in self._predictors])
 
     def _arx_residuals(self, time_min: Array, inputs: Array, measured: Array) -> Array:
         """Fit the identified models; returns their residuals, shape (n, outputs)."""

@@ -27,6 +27,7 @@ from monitor_node.state.seal import ForeignFileError
 from monitor_node.storage.fleet_states import FleetStates
 from monitor_node.storage.kept_aside import DAMAGED, OTHER_SETTINGS
 from monitor_node.storage.state_recovery import StateRecovery
+from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, Baseline, CommandReply
@@ -36,7 +37,6 @@ from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.metrics import FleetMetrics, serve_metrics
-from reactorwatch.runtime.model_file import read_model_on_bus_clock
 from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
 
 log = structlog.get_logger()
@@ -110,7 +110,7 @@ class FleetNode(FleetMonitor):
         name = f"{start_ns:020d}-{secrets.token_hex(4)}"
         self.shards = ShardGroup(self.expression, sharding.parse_shard(fleet.shard), name)
         self._others = OtherMonitors(self.shards.token, lambda: self.plants)
-        model = read_model_on_bus_clock(config.model)
+        config, model = load_process(config)
         super().__init__(
             config,
             start_ns,
@@ -368,7 +368,8 @@ def run(
         if getattr(config, setting) is not None:
             raise InputError(f"{setting} holds what is known of one plant; a fleet takes [fleet] state, a folder")
     # Inconsistent settings are refused here, and machine code is compiled before plants wait.
-    WatchedPlants(config, 0, read_model_on_bus_clock(config.model), points=fleet.points).prepare()
+    watched = load_process(config)
+    WatchedPlants(watched.config, 0, watched.model, points=fleet.points).prepare()
     states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
     with serve_metrics(metrics_config, FleetMetrics(NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop, uncached=UNCACHED, many_keys=True)

@@ -10,11 +10,11 @@ from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.replay.row_log import RowLog
 from monitor_node.state.pipeline_state import PipelineState
+from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Baseline
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.runtime.model_file import read_model_on_bus_clock
 
 RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
 
@@ -163,8 +163,8 @@ def run(
             first_ns = monitor.first_ns
     keep(monitor.finish())
     return Backtest(
-        inputs=config.inputs,
-        outputs=config.outputs,
+        inputs=monitor.config.inputs,
+        outputs=monitor.config.outputs,
         rows=monitor.rows,
         first_ns=(monitor.first_ns or 0) if first_ns is None else first_ns,
         last_ns=monitor.last_ns or 0,
@@ -185,7 +185,8 @@ def run(
 
 
 def _make_monitor(config: MonitorConfig, zero_ns: int, model: ProcessModel | None) -> Monitor:
-    model = model or read_model_on_bus_clock(config.model, zero_ns)
+    if model is None:
+        config, model = load_process(config, zero_ns)
     return Monitor(config, start_ns=0, points=False, model=model, diagnose=find_deviations)
 
 

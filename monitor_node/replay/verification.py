@@ -20,13 +20,13 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.replay.message_diff import MessageDiff
 from monitor_node.replay.recorded_sessions import Session, find_sessions, is_timeout
+from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.runtime.model_file import read_model_on_bus_clock
 
 COMPARED = frozenset(
     {keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.ALARM_KPIS, keys.RECONSTRUCTION, keys.BASELINE}
@@ -70,7 +70,7 @@ def verify(read: Callable[[], Iterable[Encoded]], config: MonitorConfig) -> Veri
         InputError: nothing in the recording can be verified, or the settings are inconsistent.
     """
     sessions = find_sessions(read(), config.plant)
-    model = read_model_on_bus_clock(config.model)
+    config, model = load_process(config)
     found = Verification(MessageDiff())
     stored: bytes | None = None
     verified = 0

@@ -17,7 +17,7 @@ from monitor_node.state import version_2, version_3
 from monitor_node.state.pipeline_state import PipelineState
 from monitor_node.state.seal import DIGEST_BYTES, Seal
 from reactorwatch.errors import InputError
-from reactorwatch.process import effects_of
+from reactorwatch.process import EFFECTS_OF
 from reactorwatch.process.extended_model import extended_model_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import StoredState
@@ -27,7 +27,7 @@ UPGRADES = {2: lambda body: version_3.upgrade(version_2.upgrade(body)), 3: versi
 SEAL = Seal(MAGIC, 4, "state of a monitor", UPGRADES)
 
 NOT_LEARNED_BY = frozenset(
-    {"model", "alarm_state_file", "state_file", "state_every_s", "health_period_s", "diagnose_training"}
+    {"process", "alarm_state_file", "state_file", "state_every_s", "health_period_s", "diagnose_training"}
 )
 """Settings that do not change what was learned; the model is identified by its equations, not by its file."""
 
@@ -89,6 +89,8 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
     for name in TRAINING:
         if fields[name] is None:
             del fields[name]
+    if model is not None:
+        del fields["units"]  # the equations have their own
     fields |= {"points": points, "equations": fingerprint(model)}
     settings: dict[str, Any] = msgspec.msgpack.decode(msgspec.msgpack.encode(fields))  # as they are read back
     return settings
@@ -109,7 +111,7 @@ def fingerprint(model: ProcessModel | None) -> str:
 
 def equations_text(model: ProcessModel | None) -> str:
     """JSON of a model as `diagnose` writes it; empty if the catalogue does not have the model, or no causes for it."""
-    if model is None or not effects_of(model):
+    if model is None or model.name not in EFFECTS_OF:
         return ""
     extended = extended_model_of(model)
     if fingerprint(extended.build()) != fingerprint(model):

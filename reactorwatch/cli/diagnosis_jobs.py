@@ -27,8 +27,8 @@ from reactorwatch.diagnosis.report.machine import as_object
 from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import Cause, Diagnosis
 from reactorwatch.errors import InputError
-from reactorwatch.process import effects_of
 from reactorwatch.records.output import check_output_folder
+from reactorwatch.records.source_text import is_table
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,8 @@ def make_jobs(
     Raises:
         InputError: invalid options.
     """
-    if len(files) > 1 or elsewhere:
+    describes_itself = asked.process.is_default and not all(map(is_table, files))
+    if not describes_itself and (len(files) > 1 or elsewhere):
         _check(asked)
     paths = list(files)
     if elsewhere:
@@ -115,7 +116,9 @@ def run_job(job: Job) -> JobResult:
 
 
 def _check(asked: DiagnosisOptions) -> None:
-    model = asked.process.load_model()
+    process = asked.process.load()
+    model = process.require_model()
+    process.select_causes(asked.without)
     if asked.uncertain is not None:
         parse_priors(asked.uncertain, model)
     check_limits(model, asked.limits)
@@ -125,7 +128,7 @@ def _check(asked: DiagnosisOptions) -> None:
 def _text(case: Case, diagnosis: Diagnosis, seconds: float, *, as_json: bool) -> str:
     if as_json:
         return msgspec.json.encode(as_object(diagnosis, str(case.file), seconds, case.measured.zero)).decode()
-    text = as_text(diagnosis, str(case.file), effects_of(case.model))
+    text = as_text(diagnosis, str(case.file), case.effects)
     if case.folder is None:
         return text
     if diagnosis.experiment is not None:

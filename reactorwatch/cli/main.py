@@ -17,6 +17,7 @@ from reactorwatch.cli import (
     alarm,
     charts,
     compilation,
+    examples,
     files,
     models,
     nodes,
@@ -46,7 +47,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (runs, nodes, view, site, playback, alarm, files, recordings, studies, models, charts, compilation):
+GROUPS = (runs, nodes, examples, view, site, playback, alarm, files, recordings, studies, models, charts, compilation)
+for group in GROUPS:
     group.register_commands(app)
 
 

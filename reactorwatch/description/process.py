@@ -1,13 +1,17 @@
 """A process: its signals with their roles and, if there are any, equations, effects and controllers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, get_args
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.process import CONTROLLERS_OF, EFFECTS_OF, OPERATIONS
 from reactorwatch.process.effect import Effect
+from reactorwatch.process.effect_twins import add_generic
+from reactorwatch.process.generic_effects import generic_effects
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.operation import Operation
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.units import conversion
 
@@ -81,9 +85,11 @@ class Process:
         signals: the signals, each name once; at least one of them an output.
         equations: the model, in the units of the equations; None: it is learned from data.
         effects: what can be named as a cause and injected as a fault.
-        controllers: controllers of its inputs, for a simulation.
+        controllers: controllers of its inputs, for a simulation (see `reactorwatch.process.controller`).
         parameters: constants of the equations that are given, by name: value, standard deviation and unit.
         file_format: statements on how to read its files; the rest is guessed for each file.
+        operation: levels of its inputs, noise of its sensors and named runs, for a simulation.
+        generic: whether effects made from its equations are possible causes beside its own (`causes`).
 
     Raises:
         InputError: a rule above is broken, or signals and equations do not fit.
@@ -96,16 +102,18 @@ class Process:
     controllers: tuple[object, ...] = ()
     parameters: Mapping[str, KnownParameter | tuple[float, float, str]] = field(default_factory=dict)
     file_format: FileFormat = field(default_factory=FileFormat)
+    operation: Operation = field(default_factory=Operation)
+    generic: bool = False
 
     def __post_init__(self) -> None:
         if not self.name:
             raise InputError("name of a process must be a text of at least one letter, got ''")
         self._check_signals()
         if self.equations is None:
-            if self.parameters or self.effects:
+            if self.parameters or self.effects or self.generic:
                 raise InputError(
-                    f"process {self.name!r}: parameters and effects need equations, got none; name them, "
-                    "or leave both out"
+                    f"process {self.name!r}: parameters and effects, generic ones too, need equations, got none; "
+                    "name them, or leave these out"
                 )
             return
         self._check_equations(self.equations)
@@ -136,9 +144,41 @@ class Process:
             return None
         return self.equations.with_values({name: item.value for name, item in self._parameters_in_model_units.items()})
 
+    @cached_property
+    def causes(self) -> tuple[Effect, ...]:
+        """Effects with which it is diagnosed: its own or, if there are none, those made from its equations.
+
+        With `generic`, its own, then those made from its equations that do not do the same.
+        """
+        if self.model is None:
+            return ()
+        if not self.effects:
+            return generic_effects(self.model)
+        return add_generic(self.model, tuple(self.effects)) if self.generic else self.effects
+
+    @cached_property
+    def faults(self) -> tuple[Effect, ...]:
+        """Effects that can be injected: its own, and those made from its equations under other names."""
+        if self.model is None:
+            return ()
+        names = {effect.name for effect in self.effects}
+        return (*self.effects, *(effect for effect in generic_effects(self.model) if effect.name not in names))
+
+    def select_causes(self, without: Sequence[str] = ()) -> tuple[Effect, ...]:
+        """Causes but for some, by name; none is replaced by a generic one that does the same.
+
+        Raises:
+            InputError: a name is no cause of this process.
+        """
+        names = [effect.name for effect in self.causes]
+        for name in without:
+            if name not in names:
+                raise InputError(f"process {self.name!r}: {describe_unknown('cause', name, names)}")
+        return tuple(effect for effect in self.causes if effect.name not in without)
+
     def without_equations(self) -> "Process":
         """Copy with the signals alone."""
-        return replace(self, equations=None, effects=(), controllers=(), parameters={})
+        return replace(self, equations=None, effects=(), controllers=(), parameters={}, generic=False)
 
     def require_model(self) -> ProcessModel:
         """The model.
@@ -217,13 +257,20 @@ class Process:
             raise InputError(f"process {self.name!r}: {error}") from error
 
 
-def describe_model(model: ProcessModel, effects: tuple[Effect, ...] = (), name: str | None = None) -> Process:
-    """Describe a model: each input and output is a signal of its name, with its unit."""
+def describe_model(model: ProcessModel) -> Process:
+    """Describe a model: each input and output is a signal of its name, with its unit; the rest is of the catalogue."""
     signals = (
         *(Signal(item.name, item.unit, "input") for item in model.inputs),
         *(Signal(item.name, item.unit, "output") for item in model.outputs),
     )
-    return Process(name or model.name, signals, model, effects)
+    return Process(
+        model.name,
+        signals,
+        model,
+        EFFECTS_OF.get(model.name, ()),
+        CONTROLLERS_OF.get(model.name, ()),
+        operation=OPERATIONS.get(model.name, Operation()),
+    )
 
 
 def _find_parameter(process: Process, name: str) -> str:

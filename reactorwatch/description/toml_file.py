@@ -92,19 +92,16 @@ def parse_process(content: bytes, find_equations: Callable[[str], Process]) -> P
         document = msgspec.convert(tables, _Document)
     except msgspec.ValidationError as error:
         raise InputError(_describe_error(str(error), tables)) from error
-    if document.generic:
-        raise InputError(
-            "generic must be false in this version, which has no effects made from any model; leave it out"
-        )
     described: dict[str, Any] = {}
     if document.equations is not None:
         named = find_equations(document.equations)
-        described = {"equations": named.equations, "effects": named.effects, "controllers": named.controllers}
+        described = {name: getattr(named, name) for name in ("equations", "effects", "controllers", "operation")}
     return Process(
         document.name,
         tuple(Signal(**msgspec.structs.asdict(item)) for item in document.signals),
         parameters={name: KnownParameter(item.value, item.sd, item.unit) for name, item in document.parameters.items()},
         file_format=_file_format(document),
+        generic=document.generic,
         **described,
     )
 

@@ -106,13 +106,15 @@ def diagnose(
     adequacy = minus_log10_p(best.fit.w, run.inputs)
     verdict = _decide_verdict(result, best)
     location = best.hypothesis.filter.effects[0].location if best.label else ""
+    if verdict == UNKNOWN:
+        best = result.nominal
     remarks = [*_describe_record(record), *_describe_outliers(whole, run)]
     unknown_input: UnknownInput | None = None
-    if np.any(adequacy >= DOUBTFUL) or (best.label and _seems_noisy(result, model)):
+    if verdict == UNKNOWN or np.any(adequacy >= DOUBTFUL) or (best.label and _seems_noisy(result, model)):
         offsets = result.nominal.hypothesis.offsets(result.nominal.fit)
         corrected = model.with_values({name: model.parameter(name).value + value for name, value in offsets.items()})
         unknown_input = locate(corrected, effects, run, result.nominal.fit, result.nominal_noise)
-        if _is_unknown(unknown_input, result, best, run, float(np.max(adequacy))):
+        if verdict == UNKNOWN or _is_unknown(unknown_input, result, best, run, float(np.max(adequacy))):
             verdict, best = UNKNOWN, result.nominal  # the model is not extended without a cause
             location = unknown_input.effect.location if unknown_input is not None else location
         elif np.any(adequacy >= WHITE):
@@ -211,10 +213,16 @@ def _keep_memory() -> None:
 def _decide_verdict(result: SearchResult, best: FittedHypothesis) -> str:
     if best is result.nominal:
         return NOMINAL
-    alternatives = [
-        item.bic - best.bic for item in result.hypotheses if item.hypothesis.causes != best.hypothesis.causes
-    ]
-    return AMBIGUOUS if alternatives and min(alternatives) < SURE else NAMED
+    others = [item for item in result.hypotheses if item.hypothesis.causes != best.hypothesis.causes]
+    close = [item for item in others if item.bic - best.bic < SURE]
+    if all(_is_source(item) for item in (best, *close)):
+        return UNKNOWN
+    return AMBIGUOUS if close else NAMED
+
+
+def _is_source(item: FittedHypothesis) -> bool:
+    """Return true if a hypothesis is an unmodelled source alone, which has a location and no name."""
+    return all(effect.is_source for effect in item.hypothesis.filter.effects)
 
 
 def _alternatives(result: SearchResult, best: FittedHypothesis) -> list[FittedHypothesis]:

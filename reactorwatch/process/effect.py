@@ -6,28 +6,39 @@ has the profile's parameters as further parameters, named `<effect>.size`, `<eff
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import casadi as ca
 
-from reactorwatch.process.model import Clock, Parameter, ProcessModel, Variable
+from reactorwatch.process.model import Clock, Parameter, ProcessModel, parameter
 from reactorwatch.process.profiles import CONSTANT, Profile
 
 TIMING = "timing"
 """Location of a deviation in the timestamps of a record, not in the plant."""
 
-LOCATIONS = (
-    "mass_balance",
-    "energy_balance",
-    "reaction",
-    "feed",
-    "coolant",
-    "temperature_sensor",
-    "concentration_sensor",
-    TIMING,
-)
-"""Locations of effects on the reactor."""
+
+@dataclass(frozen=True)
+class EffectConstant:
+    """A constant of an effect's own, which a record may determine beside the size.
+
+    Attributes:
+        name: name after that of the effect: `brim` of `overflow` is the parameter `overflow.brim`.
+        value: nominal value, and the mean of its prior.
+        sd: standard deviation of its prior.
+        unit: unit of its values.
+        lower: smallest value that makes physical sense.
+        upper: largest value that makes physical sense.
+        meaning: a short description.
+    """
+
+    name: str
+    value: float
+    sd: float
+    unit: str
+    lower: float
+    upper: float
+    meaning: str
 
 
 class Effect(ABC):
@@ -36,7 +47,7 @@ class Effect(ABC):
     Attributes:
         name: name in the catalogue of causes.
         label: usual name of the effect in text.
-        location: part of the plant in which it acts; one of `LOCATIONS` for the reactor.
+        location: part of the plant in which it acts.
         unit: unit of its size.
         larger: meaning of a positive size, with `{}` for its amount: in the size's unit, or in % for a share.
         smaller: meaning of a negative size, like `larger`; empty: there is none.
@@ -49,6 +60,8 @@ class Effect(ABC):
         labels: usual name with a given profile, by name of the profile, where it differs from `label`.
         is_discontinuous: whether the response jumps as the size changes, so that it has no derivative.
         delays_output: the output that the effect delays by m, if it does nothing else; None: no such effect.
+        is_source: whether it adds an unmodelled rate to a balance, which has a location but no physical meaning.
+        constants: constants of its own; `add_constants` adds them to a model.
     """
 
     name: ClassVar[str]
@@ -65,6 +78,8 @@ class Effect(ABC):
     labels: ClassVar[dict[str, str]] = {}
     is_discontinuous: ClassVar[bool] = False
     delays_output: ClassVar[str | None] = None
+    is_source: ClassVar[bool] = False
+    constants: ClassVar[tuple[EffectConstant, ...]] = ()
 
     @abstractmethod
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
@@ -111,6 +126,28 @@ class Effect(ABC):
                 *(f"{prefix}.{item.name}" for item in profile.parameters if item.breakpoint),
             ),
         )
+
+    def add_constants(self, model: ProcessModel) -> tuple[ProcessModel, tuple[ca.SX, ...]]:
+        """Add the constants of this effect to a model's parameters; returns the model and their symbols."""
+        prefix = self.prefix(model)
+        added = tuple(
+            parameter(f"{prefix}.{item.name}", item.value, item.unit, (item.lower, item.upper), item.meaning)
+            for item in self.constants
+        )
+        return replace(model, parameters=(*model.parameters, *added)), tuple(item.symbol for item in added)
+
+    def describe(self, size: float) -> str:
+        """Meaning of a size, rounded to two digits, for people.
+
+        Args:
+            size: the size, in the effect's unit.
+        """
+        text, amount = self.larger or f"{self.label}: {{}} {self.unit}".removesuffix(" 1"), size
+        if size < 0.0 and self.smaller:
+            text, amount = self.smaller, -size
+        if "{} %" in text:
+            amount *= 100.0
+        return text.format(f"{float(f'{amount:.2g}'):g}")
 
     def size_signal(self, clock: Clock, profile: Profile, symbols: dict[str, ca.SX]) -> ca.SX:
         """m(t) with a profile, as an expression of the clock and of the symbols of the profile's parameters."""
@@ -183,23 +220,3 @@ class ReadingEffect(SensorEffect):
     def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
         """See `SensorEffect`."""
         return model, self.reading(value, size)
-
-
-class BiasEffect(ReadingEffect):
-    """An effect that adds m to the reading of one sensor."""
-
-    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """See `ReadingEffect`."""
-        return value + size
-
-
-def coolant_flow_of(effect: Effect, model: ProcessModel) -> Variable:
-    """The commanded coolant flow, an input.
-
-    Raises:
-        ValueError: the model has no input qc.
-    """
-    for item in model.inputs:
-        if item.name == "qc":
-            return item
-    raise ValueError(f"{effect.name} needs a model with the input 'qc', {model.name} has {model.input_names}")

@@ -22,7 +22,7 @@ from typing import Any
 import msgspec
 
 from reactorwatch.errors import InputError
-from reactorwatch.process import EFFECTS_OF, MODELS, effects_of
+from reactorwatch.process import MODELS, named_effects
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.process.model import ProcessModel
@@ -109,7 +109,7 @@ def parse_extended_model(
     Args:
         text: content of the file.
         models: catalogue of models.
-        effects: catalogue of effects; None: that of the model.
+        effects: catalogue of effects; None: that of the model, and the generic ones.
 
     Raises:
         InputError: it is no such file, or a part of it is invalid.
@@ -123,8 +123,7 @@ def parse_extended_model(
     if file.format != FORMAT:
         raise InputError(f"format must be {FORMAT!r}, got {file.format!r}")
     if effects is None:
-        ExtendedModel(file.model).build(models)  # reports an unknown model before its effects
-        effects = EFFECTS_OF.get(file.model, ())
+        effects = named_effects(ExtendedModel(file.model).build(models))
     extended = ExtendedModel(
         file.model,
         tuple(parse_fault(item, effects).with_defaults() for item in file.effects),
@@ -145,11 +144,11 @@ def extended_model_of(
 
     Args:
         model: with or without effects.
-        effects: catalogue of effects; None: that of the model.
+        effects: catalogue of effects; None: that of the model, and the generic ones.
         models: catalogue of models; a model outside it counts as having nominal parameters.
         zero_ns: time from which the minutes of its effects are counted.
     """
-    effects = effects_of(model) if effects is None else effects
+    effects = named_effects(model) if effects is None else effects
     values = {item.name: item.value for item in model.parameters}
     found = []
     for name in values:

@@ -9,6 +9,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from plant_node.config import PlantConfig
+from plant_node.examples import make_example
 from plant_node.record import simulate_record
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
@@ -25,8 +26,8 @@ NARROW = {"kind": "random-steps", "low": 102.41, "high": 104.41}
 
 
 def _record(path: Path) -> None:
-    """A simulated plant whose coolant leaks."""
-    write_table(path, simulate_record(PlantConfig(seed=3, faults=(LEAK,)), 1500))
+    """The sample record `leak`."""
+    write_table(path, make_example("leak", 3)[0])
 
 
 def _renamed_record(path: Path) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from monitor_node.replay.verification import verify
-from reactorwatch.cli.read_record import messages
+from reactorwatch.api.files import messages
 
 from .live_run import PLANT, LiveRun
 

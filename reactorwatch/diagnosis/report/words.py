@@ -19,22 +19,11 @@ from reactorwatch.diagnosis.result import (
     Estimate,
     HeldOut,
 )
+from reactorwatch.process import LOCATION_PHRASES
 from reactorwatch.process.effect import Effect
 
 MOSTLY_NOISE, WORSE = 0.9, 1.2
 """Noise share above which no range is named; error of a range, relative to all rows, above which it is named."""
-
-PLACES = {
-    "mass_balance": "in the mass balance",
-    "energy_balance": "in the energy balance",
-    "reaction": "in the reaction",
-    "feed": "in the feed",
-    "coolant": "on the side of the coolant",
-    "temperature_sensor": "in the measurement of the temperature",
-    "concentration_sensor": "in the measurement of the concentration",
-    "timing": "in the times of the record",
-}
-"""Phrases of locations whose name is not enough."""
 
 
 def describe_verdict(diagnosis: Diagnosis) -> str:
@@ -76,7 +65,7 @@ def describe_place(location: str) -> str:
     >>> describe_place("upper_tank")
     'in the upper tank'
     """
-    return PLACES.get(location, f"in the {location.replace('_', ' ')}")
+    return LOCATION_PHRASES.get(location, f"in the {location.replace('_', ' ')}")
 
 
 def describe_timing(cause: Cause, curves: Curves | None = None) -> str:

@@ -189,7 +189,7 @@ class PairScreen:
         of_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
         for i, first in enumerate(blocks):
             for j in range(i + 1, len(blocks)):
-                if first.effect is not blocks[j].effect:
+                if can_be_together(first.effect, blocks[j].effect):
                     of_size.setdefault((places[i].size, places[j].size), []).append((i, j))
         price, scale = log(self._run.values), np.sqrt(np.maximum(np.diag(gram), 1e-300))
         scaled, scaled_by = gram / np.outer(scale, scale), by / scale
@@ -204,6 +204,13 @@ class PairScreen:
             for gain, (i, j) in zip(gains.tolist(), pairs, strict=True):
                 result.append((gain - price * (blocks[i].profile.n_parameters + blocks[j].profile.n_parameters), i, j))
         return sorted(result, reverse=True)
+
+
+def can_be_together(one: Effect, other: Effect) -> bool:
+    """Return true if two effects make a pair: a filter delays one output, and an unmodelled source is no cause."""
+    if one is other or one.is_source or other.is_source:
+        return False
+    return one.delays_output is None or other.delays_output is None
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.fault_filter import FilterEvaluation, huber_clip
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, PiecewiseLinear, Signal
-from reactorwatch.diagnosis.search.pair_screen import CandidatePair, DynamicSignature, PairScreen
+from reactorwatch.diagnosis.search.pair_screen import CandidatePair, DynamicSignature, PairScreen, can_be_together
 from reactorwatch.diagnosis.search.screen import KNOTS, Candidate
 from reactorwatch.diagnosis.search.search import IN_QUESTION, FittedHypothesis, Label, Search, SearchResult, keep_best
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p
@@ -146,11 +146,12 @@ class PairSearch:
     def _grow_from_single(self) -> FittedHypothesis | None:
         """Grow a pair from the best single cause with a simple profile; a curve takes what belongs to others."""
         search = self._search
-        simple = [item for item in self._result.hypotheses if not _has_curve(item)]
+        simple = [item for item in self._result.hypotheses if not _has_curve(item) and not _has_source(item)]
         if not simple:
             search.noise = self._result.nominal_noise
             nominal = self._result.nominal
-            candidates = self._select_simple(search.screen.candidates(nominal.hypothesis, nominal.fit))
+            candidates = search.screen.candidates(nominal.hypothesis, nominal.fit)
+            candidates = self._select_simple([item for item in candidates if not item.effect.is_source])
             simple = [self._fit([_part_of(candidate)], EXCHANGE_STEPS) for candidate in candidates]
         if not simple:
             return None
@@ -159,9 +160,9 @@ class PairSearch:
         first = search.refit(first)
         (part,) = _parts(first)
         candidates = search.screen.candidates(first.hypothesis, first.fit)
-        others = [effect for effect in search.screen.dynamic_effects if effect is not part.effect]
+        others = [effect for effect in search.screen.dynamic_effects if can_be_together(effect, part.effect)]
         candidates += search.dynamic_screen.candidates(first.fit, partial(self._evaluate_with, [part]), others)
-        candidates = self._select_simple([item for item in candidates if item.effect is not part.effect])
+        candidates = self._select_simple([item for item in candidates if can_be_together(item.effect, part.effect)])
         pairs = [self._fit([part, _part_of(candidate)], EXCHANGE_STEPS) for candidate in candidates]
         if not pairs:
             return None
@@ -266,9 +267,10 @@ class PairSearch:
             candidates += search.screen.candidates(pair.hypothesis, pair.fit, (index,), (effect,) if own else None)
         if effect in search.screen.dynamic_effects:
             reduced = search.evaluate(Hypothesis(search.filter((other.effect,)), (other.profile,)), (other.parameters,))
-            of = [effect] if own else [item for item in search.screen.dynamic_effects if item is not other.effect]
+            of = [item for item in search.screen.dynamic_effects if can_be_together(item, other.effect)]
+            of = [effect] if own else of
             candidates += search.dynamic_screen.candidates(reduced.fit, partial(self._evaluate_with, [other]), of)
-        candidates = [item for item in candidates if item.effect is not other.effect]
+        candidates = [item for item in candidates if can_be_together(item.effect, other.effect)]
         return sorted(candidates, key=lambda item: -item.score(self._run.values))
 
     def _evaluate_with(
@@ -301,6 +303,8 @@ class PairSearch:
                 starts = (max(mean, 0.1 * effect.typical),)
                 beside = [item for item in parts if item is not part]
                 before = about.hypothesis.innovations_without(self._run, about.fit, own[effect.name])
+            if effect.delays_output is not None and any(item.effect.delays_output is not None for item in beside):
+                continue  # a filter delays one output
             signals = [self._constant.signal(np.array([start])) for start in starts]
             for start, item in zip(starts, self._evaluate_with(beside, effect, signals), strict=True):
                 result.append(DynamicSignature(effect, start, huber_clip(before) - huber_clip(item.w)))
@@ -349,6 +353,11 @@ def _refine_knots(part: Part, knots: int) -> Part:
 def _has_curve(fitted: FittedHypothesis) -> bool:
     """Return true if one of the profiles is a curve."""
     return any(isinstance(profile, PiecewiseLinear) for profile in fitted.hypothesis.profiles)
+
+
+def _has_source(fitted: FittedHypothesis) -> bool:
+    """Return true if one of the causes is an unmodelled source."""
+    return any(effect.is_source for effect in fitted.hypothesis.filter.effects)
 
 
 def _bic(fitted: FittedHypothesis) -> float:

@@ -24,6 +24,7 @@ from reactorwatch.diagnosis.fitting.knot_selection import fine_grid, select_knot
 from reactorwatch.diagnosis.fitting.outliers import find_gross_outliers, find_outliers, remove_outliers
 from reactorwatch.diagnosis.fitting.profiles import PiecewiseLinear, Signal
 from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.cause_prior import CausePrior
 from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
 from reactorwatch.diagnosis.search.screen import Candidate, Screen
 from reactorwatch.process.effect import Effect
@@ -125,6 +126,7 @@ class Search:
         run: the record without its outliers.
         noise: noise levels with which all hypotheses are compared.
         screen: screen of the run.
+        prior: prior probabilities of the hypotheses.
     """
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run, smallest_sd: Sequence[float]) -> None:
@@ -137,6 +139,7 @@ class Search:
         self.noise = self._initial_noise()
         self.screen = Screen(model, effects, self.run)
         self.dynamic_screen = DynamicEffectsScreen(self.screen.dynamic_effects, self.run)
+        self.prior = CausePrior(len(effects))
 
     def search_single_causes(self) -> SearchResult:
         """Find the best hypotheses with one effect."""
@@ -366,7 +369,8 @@ class Search:
 
     def score_fit(self, hypothesis: Hypothesis, fit: Fit) -> FittedHypothesis:
         """BIC of an existing fit."""
-        return FittedHypothesis(hypothesis, fit, 2.0 * fit.loss + hypothesis.n_parameters * log(self.run.values))
+        bic = 2.0 * fit.loss + hypothesis.n_parameters * log(self.run.values)
+        return FittedHypothesis(hypothesis, fit, bic + self.prior.cost(hypothesis))
 
 
 def keep_best(by_label: dict[Label, FittedHypothesis], item: FittedHypothesis) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.replay.backtest import Backtest, run
-from reactorwatch.cli.reports import backtest_object, backtest_text
+from reactorwatch.api.backtest_report import backtest_object, backtest_text
 from tests.unit.monitor_node.samples import leaking_run, samples
 
 

@@ -143,7 +143,7 @@ def test_a_python_file_that_gives_no_process_is_refused_with_its_path(tmp_path: 
         ('decimal = ","', 'decimal = ";"', r"\[file\] decimal must be"),
         ('separator = ";"', 'separator = ","', r"\[file\] separator and \[file\] decimal must differ"),
         ('separator = ";"', 'separator = "::"', r"\[file\] separator must be one character"),
-        ('name = "exchanger"', 'name = "exchanger"\n    generic = true', "generic must be false in this version"),
+        ('name = "exchanger"', 'name = "exchanger"\n    generic = true', "generic ones too, need equations"),
         ('name = "exchanger"', "", "missing required field `name`"),
         ('name = "exchanger"', 'name = "exchanger"\n    equations = "three_tank"', r"did you mean 'three_tanks'\?"),
         ('name = "exchanger"', 'name = "exchanger"\n    equations = "tanks"', "need the input 'u'"),
@@ -168,3 +168,10 @@ def test_an_unknown_name_is_refused_with_the_valid_ones() -> None:
 def test_a_file_that_is_not_there_is_refused_with_its_path(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no such file"):
         find_process(tmp_path / "none.toml")
+
+
+def test_a_file_may_ask_for_the_generic_effects_beside_those_of_its_equations(tmp_path: Path) -> None:
+    own = find_process(write(tmp_path, TANKS)).causes
+    both = find_process(write(tmp_path, TANKS.replace("equations", "generic = true\n    equations", 1))).causes
+    assert both[: len(own)] == own
+    assert {"h1.lag", "g.deviation", "h3.source"} <= {effect.name for effect in both[len(own) :]}

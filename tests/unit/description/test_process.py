@@ -5,8 +5,10 @@ from typing import Any
 import pytest
 
 from reactorwatch.description.find import find_process
-from reactorwatch.description.process import KnownParameter, Process, Signal
+from reactorwatch.description.process import KnownParameter, Process, Signal, describe_model
 from reactorwatch.errors import InputError
+from reactorwatch.process import EFFECTS_OF
+from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.library.three_tanks.model import three_tanks
 
 Q = Signal("q", "l/s", "input")
@@ -103,3 +105,27 @@ def test_a_shipped_process_has_the_signals_of_its_equations_and_effects(name: st
     assert process.outputs == process.model.output_names
     assert process.units == process.model.units
     assert process.effects
+
+
+def test_a_process_is_diagnosed_with_its_own_effects_or_the_generic_ones() -> None:
+    equations, own = tanks(), EFFECTS_OF["tanks"]
+    signals = describe_model(equations).signals
+    named = [effect.name for effect in own]
+    assert [effect.name for effect in Process("rig", signals, equations, own).causes] == named
+    bare = [effect.name for effect in Process("rig", signals, equations).causes]
+    assert "x1.source" in bare
+    assert not set(named) & set(bare)
+    both = [effect.name for effect in Process("rig", signals, equations, own, generic=True).causes]
+    assert both[: len(named)] == named
+    assert {"x1.source", "x2.gain"} <= set(both)
+    assert not {"x2.bias", "u.gain"} & set(both)
+
+
+def test_a_cause_is_left_out_without_its_generic_twin_and_an_unknown_one_is_refused() -> None:
+    equations = tanks()
+    process = Process("rig", describe_model(equations).signals, equations, EFFECTS_OF["tanks"], generic=True)
+    left = {effect.name for effect in process.select_causes(("level_bias",))}
+    assert left == {effect.name for effect in process.causes} - {"level_bias"}
+    assert "x2.bias" not in left
+    with pytest.raises(InputError, match=r"process 'rig': unknown cause 'level_bais'; did you mean 'level_bias'"):
+        process.select_causes(("level_bais",))

@@ -129,10 +129,54 @@ def test_the_list_has_every_alarm_and_publishes_nothing(room: Room) -> None:
     assert room.said == []
 
 
+def test_one_command_acknowledges_every_alarm_of_an_incident(room: Room) -> None:
+    before = listed(room)
+    raised = [alarm.alarm for alarm in before.values() if alarm.incident == 1]
+    assert len(raised) >= 3
+    reply = room.ask("acknowledge", AlarmCommand(incident=1, by="Anna", comment="a leak"))
+    assert reply.text == f"incident 1: acknowledge by Anna, {len(raised)} alarms"
+    assert [alarm.alarm for alarm in reply.alarms] == raised
+    after = listed(room)
+    assert {after[name].state for name in raised} == {AlarmState.ALARM_STATE_ACKNOWLEDGED}
+    assert {(after[name].by, after[name].comment) for name in raised} == {("Anna", "a leak")}
+    assert all(after[name].state == before[name].state for name in after.keys() - set(raised))
+
+
+def test_an_incident_is_published_as_single_acknowledgements_of_its_alarms(room: Room, leak: list[Encoded]) -> None:
+    """So a recording of it is replayed from the alarms alone."""
+    room.ask("acknowledge", AlarmCommand(incident=1, by="Anna"))
+    names = [item.message.alarm for item in room.said if isinstance(item.message, Alarm)]
+    singly = Room(MonitorConfig(), leak)
+    published = []
+    for name in names:
+        singly.ask("acknowledge", by_anna(name))
+        published += singly.said
+    assert room.said == published
+
+
+def test_an_alarm_that_is_acknowledged_is_left_out_of_its_incident(room: Room) -> None:
+    room.ask("acknowledge", by_anna("shewhart/T"))
+    reply = room.ask("acknowledge", AlarmCommand(incident=1, by="Ben"))
+    assert reply.accepted
+    assert "shewhart/T" not in {alarm.alarm for alarm in reply.alarms}
+    assert listed(room)["shewhart/T"].by == "Anna"
+    again = room.ask("acknowledge", AlarmCommand(incident=1, by="Ben"))
+    assert again.text == "incident 1 has no alarm to acknowledge (the latest incident is 1)"
+
+
+def test_a_suspect_is_named_in_words(room: Room) -> None:
+    (leak, *_) = listed(room)["shewhart/T"].suspects
+    assert leak.cause == "coolant_flow"
+    assert leak.text == "10 % of the coolant lost"
+
+
 REFUSED: list[tuple[str, Message, str]] = [
     ("acknowledge", by_anna("shewhart/pH"), "there is no alarm 'shewhart/pH' (there are: shewhart/C, shewhart/T, "),
     ("acknowledge", AlarmCommand(alarm="shewhart/T"), "by must name the person, in 1 to 64 characters, got ''"),
     ("acknowledge", AlarmCommand(alarm="shewhart/T", by="   "), "by must name the person, in 1 to 64"),
+    ("acknowledge", AlarmCommand(incident=2, by="Anna"), "incident 2 has no alarm to acknowledge (the latest incident"),
+    ("acknowledge", AlarmCommand(alarm="ewma/T", incident=1, by="Anna"), "name an alarm or an incident, not both; got"),
+    ("suppress", AlarmCommand(incident=1, by="Anna"), "an incident can be acknowledged and nothing else, got suppress"),
     ("unshelve", by_anna(), "alarm shewhart/T is not shelved"),
     ("return_to_service", by_anna(), "alarm shewhart/T is in service"),
     ("comment", by_anna(comment="  "), "comment must say something, got ''"),

@@ -104,6 +104,8 @@ def to_version_3(fields: dict[str, Any]) -> None:
     for name in ("low", "high", "guessed", "reach") if reference else ():
         if name in reference:
             (reference[name],) = reference[name]
+    if reference:
+        reference.pop("uses_inputs", None)
     if reference and "last_inputs" in reference:
         (reference["last_input"],) = reference.pop("last_inputs")
 

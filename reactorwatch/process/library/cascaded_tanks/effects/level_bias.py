@@ -2,10 +2,10 @@
 
 from typing import ClassVar
 
-from reactorwatch.process.effect import BiasEffect
+from reactorwatch.process.output_effects import OutputBias
 
 
-class LevelBias(BiasEffect):
+class LevelBias(OutputBias):
     """The measured level is x2 + m."""
 
     name = "level_bias"

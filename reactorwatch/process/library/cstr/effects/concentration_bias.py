@@ -2,10 +2,10 @@
 
 from typing import ClassVar
 
-from reactorwatch.process.effect import BiasEffect
+from reactorwatch.process.output_effects import OutputBias
 
 
-class ConcentrationBias(BiasEffect):
+class ConcentrationBias(OutputBias):
     """The measured concentration is C + m."""
 
     name = "concentration_bias"

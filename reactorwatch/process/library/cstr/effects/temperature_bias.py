@@ -2,10 +2,10 @@
 
 from typing import ClassVar
 
-from reactorwatch.process.effect import BiasEffect
+from reactorwatch.process.output_effects import OutputBias
 
 
-class TemperatureBias(BiasEffect):
+class TemperatureBias(OutputBias):
     """The measured temperature is T + m."""
 
     name = "temperature_bias"

@@ -1,34 +1,15 @@
 """Deviation of a pump's flow."""
 
-from typing import ClassVar
-
-import casadi as ca
-
-from reactorwatch.process.effect import Effect
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.input_effects import InputOffset
 
 
-class PumpFlow(Effect):
+class PumpFlow(InputOffset):
     """The real flow of a pump is Q + m."""
 
     unit = "cm3/s"
     lower = -150.0
     upper = 150.0
     typical = 1.0
-    input: ClassVar[str]
-
-    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no such input.
-        """
-        if self.input not in model.input_names:
-            raise ValueError(
-                f"{self.name} needs a model with the input {self.input!r}, {model.name} has {model.input_names}"
-            )
-        flow = model.inputs[model.input_names.index(self.input)].symbol
-        return model.substitute(flow, flow + size)
 
 
 class Pump1(PumpFlow):

@@ -12,13 +12,16 @@ from reactorwatch.records.record import to_minutes
 from reactorwatch.terminal import printable_lines
 
 
-def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> dict[str, Any]:
+def backtest_object(
+    result: Backtest, zero_ns: int, zero: str | None = None, *, is_trained: bool = False
+) -> dict[str, Any]:
     """The object that `backtest --json` prints.
 
     Args:
         result: result of the back-test.
         zero_ns: time from which the file's minutes are counted.
         zero: the same time as ISO 8601; None: unknown.
+        is_trained: True if the training was on another file.
     """
 
     def minutes(time_ns: int | None) -> float | None:
@@ -29,7 +32,7 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
         "zero": zero,
         "span_min": to_minutes(result.span_ns),
         "runs": result.runs,
-        "trained_until_min": minutes(result.watching_since_ns),
+        "trained_until_min": 0.0 if is_trained else minutes(result.watching_since_ns),
         "expected_false_alarms": float(f"{result.expected_false_alarms:.3g}"),
         "signals": {
             "inputs": [name for name in result.inputs if name not in result.left_out],
@@ -62,9 +65,9 @@ def _baseline(result: Backtest, minutes: Callable[[int], float | None]) -> dict[
     return {"what": change.what, "from_min": minutes(change.time_ns), "why": change.why, "extended_model": model}
 
 
-def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
-    """Format the result of `backtest` for people."""
-    report = backtest_object(result, zero_ns)
+def backtest_text(result: Backtest, zero_ns: int, file: Path, *, is_trained: bool = False) -> str:
+    """Format the result of `backtest` for people; arguments as for `backtest_object`."""
+    report = backtest_object(result, zero_ns, is_trained=is_trained)
     lines = [f"{file}: {report['samples']} rows over {report['span_min']:g} min"]
     lines += [f"  {name} is not watched: {why}" for name, why in result.left_out.items()]
     if result.runs > 1:
@@ -76,8 +79,9 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     elif report["trained_until_min"] is None:
         lines.append("too short to watch: all of it went into the training (make it shorter with --training)")
     else:
+        where = "on another file" if is_trained else f"until {report['trained_until_min']:g} min"
         lines.append(
-            f"trained until {report['trained_until_min']:g} min; "
+            f"trained {where} ({result.training_rows} rows); "
             f"{report['expected_false_alarms']:.2g} false alarms are to be expected in the rest by chance"
         )
         lines.append(_reference_line(result))

@@ -1,0 +1,110 @@
+"""Effects made from any model, and which of them a process's own effects replace."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reactorwatch.process import EFFECTS_OF, MODELS, effects_of, named_effects
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.effect_states import reset_function
+from reactorwatch.process.effect_twins import EffectChanges, add_generic, are_twins
+from reactorwatch.process.generic_effects import generic_effects, reference_point
+from reactorwatch.process.library.cstr.effects.temperature_bias import TemperatureBias
+from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.model import ProcessModel
+from tests.unit.diagnosis.linear_tank import tank
+
+of_every_model = pytest.mark.parametrize("make", [*MODELS, tank], ids=lambda make: str(make.__name__))
+
+
+@of_every_model
+def test_every_signal_parameter_and_state_has_its_effects(make: Callable[[], ProcessModel]) -> None:
+    model = make()
+    expected = {f"{name}.{kind}" for name in model.output_names for kind in ("bias", "gain", "lag", "delay", "stuck")}
+    kinds = ("gain", "offset", "lag", "delay", "stiction")
+    expected |= {f"{name}.{kind}" for name in model.input_names for kind in kinds}
+    expected |= {f"{name}.deviation" for name in model.parameter_names}
+    expected |= {f"{name}.source" for name in model.state_names}
+    names = [effect.name for effect in generic_effects(model)]
+    assert sorted(names) == sorted(expected)
+
+
+@of_every_model
+def test_at_the_neutral_size_each_is_the_base_model(make: Callable[[], ProcessModel]) -> None:
+    model = make()
+    x, u = reference_point(model)
+    expected = [np.array(item).ravel() for item in model.function()(x, u, model.values(), 0.0, 0.0)]
+    for effect in generic_effects(model):
+        extended = effect.extend(model)
+        states = np.append(x, np.full(len(extended.states) - x.size, 0.7))
+        p = extended.values({f"{effect.name}.size": effect.neutral})
+        started = reset_function(extended)(states, u, p, 0.0)
+        rates, shown = (np.array(item).ravel() for item in extended.function()(started, u, p, 0.0, 0.0))
+        np.testing.assert_allclose(rates[: x.size], expected[0], rtol=1e-12, err_msg=effect.name)
+        np.testing.assert_allclose(shown, expected[1], rtol=1e-12, err_msg=effect.name)
+
+
+@of_every_model
+def test_each_is_scaled_within_its_bounds_and_has_a_location_of_the_process(make: Callable[[], ProcessModel]) -> None:
+    model = make()
+    locations = {*model.output_names, *model.input_names, *(item.balance or item.name for item in model.states)}
+    for effect in generic_effects(model):
+        assert effect.lower <= effect.neutral != effect.typical <= effect.upper, effect.name
+        assert all(effect.lower <= size <= effect.upper for size in effect.start_values), effect.name
+        assert effect.location in locations, effect.name
+        assert effect.larger.count("{}") == 1, effect.name
+
+
+REPLACED = {
+    "cstr": {
+        *("C.bias", "C.gain", "C.delay", "T.bias", "T.lag", "qc.gain", "qc.lag", "qc.stiction", "q.deviation"),
+        *("Cf.deviation", "Tf.deviation", "Tcf.deviation", "E_R.deviation", "K1.deviation", "K3.deviation"),
+        *("C.source", "T.source"),  # what a feed of another concentration or temperature adds
+    },
+    "tanks": {"x2.bias", "u.gain", "k1.deviation", "k4.deviation"},
+    "three_tanks": {
+        *("h1.bias", "h2.bias", "h3.bias", "Q1.offset", "Q2.offset", "a1.deviation", "a2.deviation", "a3.deviation"),
+        *("h1.source", "h2.source"),  # what a pump adds
+    },
+}
+
+
+@pytest.mark.parametrize("make", MODELS, ids=lambda make: str(make.__name__))
+def test_a_generic_effect_is_replaced_by_one_of_the_process_that_does_the_same(
+    make: Callable[[], ProcessModel],
+) -> None:
+    model = make()
+    own = EFFECTS_OF[model.name]
+    causes = add_generic(model, own)
+    assert causes[: len(own)] == own
+    left = {effect.name for effect in causes[len(own) :]}
+    assert {effect.name for effect in generic_effects(model)} - left == REPLACED[model.name]
+
+
+def test_a_twin_is_known_by_what_it_does_not_by_its_name_or_unit() -> None:
+    class Warm(TemperatureBias):
+        name = "warm"
+
+        def reading(self, value, size):  # type: ignore[no-untyped-def]
+            return value + 0.01 * size
+
+    model = MODELS[0]()
+    one, other = (EffectChanges(model, effect) for effect in (Warm(), TemperatureBias()))
+    assert are_twins(one, other)
+    assert not any(
+        are_twins(one, EffectChanges(model, effect))
+        for effect in EFFECTS_OF["cstr"]
+        if effect.name != other.effect.name
+    )
+
+
+def test_a_model_without_a_catalogue_has_the_generic_ones_and_a_text_may_name_them_in_any() -> None:
+    own = replace(three_tanks(), name="mine")
+    assert effects_of(own) == generic_effects(own)
+    names = [effect.name for effect in named_effects(three_tanks())]
+    assert len(names) == len(set(names))
+    assert {"leak1", "h1.bias", "h2.lag", "h3.source"} <= set(names)
+    first: Effect = next(effect for effect in named_effects(three_tanks()) if effect.name == "h1.bias")
+    assert first in EFFECTS_OF["three_tanks"]
