@@ -12,6 +12,9 @@ from reactorwatch.contract.alarm_text import priority_word
 from reactorwatch.records.record import to_minutes
 from reactorwatch.terminal import printable_lines
 
+REFERENCES = {"arx": "identified models (ARX)", "black-box": "a black box learned from the training"}
+"""References without equations, for people."""
+
 
 def backtest_object(
     result: Backtest, zero_ns: int, zero: str | None = None, *, is_trained: bool = False
@@ -101,6 +104,6 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path, *, is_trained: boo
 def _reference_line(result: Backtest) -> str:
     """Line with the reference and its noise levels."""
     if result.noise_levels is None:
-        return "judged by identified models (ARX)"
+        return f"judged by {REFERENCES.get(result.reference or '', result.reference)}"
     levels = (f"{name} {sd:.3g}" for name, sd in result.noise_levels["sensors"].items())
     return f"judged by the equations, with noise of the sensors (standard deviation) {', '.join(levels)}"
