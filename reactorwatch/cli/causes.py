@@ -30,6 +30,7 @@ def causes(
     stated: FileFormat = GUESS,
 ) -> None:
     """Show which causes the sensors distinguish, and from which size on each is seen."""
+    from reactorwatch.api.files import described_process, process_on_clock
     from reactorwatch.api.files import record as read_record
     from reactorwatch.cli.causes_report import as_json_text, as_matrix
     from reactorwatch.cli.progress import task
@@ -39,13 +40,15 @@ def causes(
     from reactorwatch.diagnosis.usual_excitation import excite
 
     choice = ProcessChoice(process)
-    described = choice.load()
-    model = described.require_model()
     if record is None:
+        described = choice.load()
+        model = described.require_model()
         measured = excite(model)
     else:
-        measured = read_record(check_recording(record), plant, parse_columns(column), described, stated=stated)
-        described = choice.load(measured.zero_ns)
+        path = check_recording(record)
+        described = described_process(path, plant, choice)
+        measured = read_record(path, plant, parse_columns(column), described, stated=stated)
+        described = process_on_clock(choice, described, measured.zero_ns)
         model = described.require_model()
     run = make_run(measured, model)
     with task(f"comparing the causes of {described.name}"):
