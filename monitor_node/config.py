@@ -51,6 +51,9 @@ SMALLEST_SD = {"C": 2e-4, "T": 0.05}
 """Defaults for the reactor's outputs; other outputs have none."""
 
 
+WITHOUT_EQUATIONS = ""
+"""Setting `process` of a plant that no equations judge."""
+
 DEFAULT_SIGNALS = {"inputs": ("qc",), "outputs": ("C", "T")}
 """Signals of the default process, by key."""
 
@@ -100,9 +103,10 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             the deviations that it had from the start.
         reference: model that predicts the rows: `equations`, the filter of the process's equations (older: `process`);
             `black-box`, a state map learned from the training, for few signals; `arx`, the identified model as fitted
-            to the training; `auto`, the first of these that predicts the training about as well as the last.
+            to the training; `auto`, the first of these that predicts the training about as well as the last (without
+            inputs no black box).
         process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
-            nominal reactor where its signals are watched.
+            nominal reactor where its signals are watched; empty: no equations judge.
         charts: charts of the residuals.
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
             nearest number that the charts can keep for the number of alarms and the sampling period.

@@ -90,7 +90,8 @@ class Monitor:
         self._replay_filter: ReplayFilter | None = None
         self.alarms = Annunciator(config)
         self.pipeline = self._new_pipeline(self.alarms)
-        self._sample_units = make_sample_units(config.units, None if model is None else model.units)
+        judged_by = self.pipeline.model
+        self._sample_units = make_sample_units(config.units, None if judged_by is None else judged_by.units)
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)

@@ -10,6 +10,7 @@ from monitor_node.config import (
     DEFAULT_TRAINING_ROWS,
     REACTOR,
     SMALLEST_SD,
+    WITHOUT_EQUATIONS,
     MonitorConfig,
 )
 from monitor_node.process_settings import signal_settings
@@ -42,7 +43,7 @@ def load_process(config: MonitorConfig, zero_ns: int = 0, rows: int | None = Non
     Raises:
         InputError: the process cannot be found or read, or does not fit the settings.
     """
-    if config.process is None:
+    if not config.process:
         return WatchedProcess(limit_training(config, rows), None)
     return watch_process(config, find_process(config.process, zero_ns, on_bus=True), rows)
 
@@ -66,6 +67,8 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
     for signal in (name for names in named.values() for name in names):
         if signal not in (*process.inputs, *process.outputs):
             raise InputError(describe_unknown("signal", signal, (*process.inputs, *process.outputs)))
+    if process.model is None:
+        changed["process"] = WITHOUT_EQUATIONS
     if process.name != REACTOR:
         if config.smallest_sd == SMALLEST_SD:
             changed["smallest_sd"] = {}
@@ -74,9 +77,6 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
         if config.training_min is None and config.training_rows is None:
             changed["training_rows"] = DEFAULT_TRAINING_ROWS
     changed_config = msgspec.structs.replace(config, **changed)
-    if process.model is None and changed_config.reference == "auto" and changed_config.is_reactor:
-        # Signals of these names would be judged by the reactor's equations.
-        changed_config = msgspec.structs.replace(changed_config, reference="black-box")
     return WatchedProcess(limit_training(changed_config, rows, is_stated=_states_training(config)), process.model)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from reactorwatch.api.records import ProcessLike, process_of
+from reactorwatch.api.records import ProcessLike, check_signals, process_of
 from reactorwatch.api.report_origin import report_origin
 from reactorwatch.api.views import diagnosis as view
 from reactorwatch.description.find import find_process
@@ -123,6 +123,7 @@ def diagnose(
     started = time.monotonic()
     described = find_process(process_of(record, process), record.zero_ns)
     model = described.require_model()
+    check_signals(record, model)
     make_run(record, model)
     causes = described.select_causes(without) if effects is None else effects
     known = described.uncertain | dict(uncertain or {})

@@ -229,13 +229,22 @@ def model_of(record: MeasuredRecord, process: ProcessLike | None) -> ProcessMode
             of them.
     """
     model = find_process(process_of(record, process), record.zero_ns).require_model()
+    check_signals(record, model)
+    return model
+
+
+def check_signals(record: MeasuredRecord, model: ProcessModel) -> None:
+    """Check that a record has the inputs and outputs of a model.
+
+    Raises:
+        InputError: it lacks one.
+    """
     missing = [name for name in (*model.input_names, *model.output_names) if name not in record.columns]
     if missing:
         raise InputError(
             f"{record.name}: must have the signals of {model.name}, {', '.join(missing)} missing, got "
             f"{', '.join(record.columns) or 'none'}; read it with the process that it is of"
         )
-    return model
 
 
 def effects(process: ProcessLike = DEFAULT_PROCESS) -> tuple[Effect, ...]:

@@ -30,22 +30,25 @@ def causes(
     stated: FileFormat = GUESS,
 ) -> None:
     """Show which causes the sensors distinguish, and from which size on each is seen."""
+    from reactorwatch.api.files import described_process, process_on_clock
+    from reactorwatch.api.files import record as read_record
     from reactorwatch.cli.causes_report import as_json_text, as_matrix
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.read_record import record as read_record
     from reactorwatch.description.choice import ProcessChoice
     from reactorwatch.diagnosis.identifiability import identifiability
     from reactorwatch.diagnosis.record_checks import make_run
     from reactorwatch.diagnosis.usual_excitation import excite
 
     choice = ProcessChoice(process)
-    described = choice.load()
-    model = described.require_model()
     if record is None:
+        described = choice.load()
+        model = described.require_model()
         measured = excite(model)
     else:
-        measured = read_record(check_recording(record), plant, parse_columns(column), described, stated=stated)
-        described = choice.load(measured.zero_ns)
+        path = check_recording(record)
+        described = described_process(path, plant, choice)
+        measured = read_record(path, plant, parse_columns(column), described, stated=stated)
+        described = process_on_clock(choice, described, measured.zero_ns)
         model = described.require_model()
     run = make_run(measured, model)
     with task(f"comparing the causes of {described.name}"):

@@ -35,7 +35,7 @@ class Variable:
         scale: a typical magnitude of its changes; tolerances are relative to it.
         meaning: a short description.
         symbol: symbol of the variable in the expressions.
-        balance: location of the balance that a state's equation is ; empty: none.
+        balance: location of the balance that a state's equation is; empty: none.
         usual: usual value of an input; None: unknown.
     """
 
