@@ -23,17 +23,18 @@ from monitor_node.baseline.references import (
     ProcessReferenceState,
     Reference,
 )
-from monitor_node.baseline.signal_range import signal_ranges
+from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
 from monitor_node.chart_stage import ChartWatch, alarm_names
-from monitor_node.config import MonitorConfig
+from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.health import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
+from monitor_node.operation import Operation
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.signal_checks.stage import SignalChecks
 from monitor_node.state.monitor_state import equations_text
@@ -88,6 +89,7 @@ class PlantPipeline:
         is_normal: True if the compiled step may take the next row, see `row_step`.
         left_out: signals that are not monitored, with the reason, after the training.
         signals: signal checks.
+        operation: operation of the plant, for the texts of alarms.
         training_rows: number of rows of the training, after its end.
     """
 
@@ -113,8 +115,12 @@ class PlantPipeline:
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
         self._numbers: Records = np.zeros(1, numbers_type(config))
-        self._ranges = signal_ranges(self.model, config.signals)
+        self._ranges, self._stated = possible_ranges(config, self.model), stated_ranges(config)
         self.signals = SignalChecks(config, board, self._ranges, self._numbers)
+        self.signals.use_ranges(self._ranges if self._is_process else self._stated)
+        units = {**config.units, **(self.model.units if self.model is not None else {})}
+        self.operation = Operation(config, input_bounds(config, self.model), units)
+        board.describe_operation = self.operation.describe
         self._drift = DriftWatch(config, board, publish=points)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
@@ -156,6 +162,7 @@ class PlantPipeline:
             self._began_ns,
             self._update.rows or self._training.state,
             None if self._reference is None else self._trained_state(self._reference),
+            self.operation.state,
         )
 
     def _trained_state(self, reference: Reference) -> TrainedState:
@@ -184,6 +191,7 @@ class PlantPipeline:
             ValueError: the state is damaged.
         """
         self._sampling.state = state.sampling
+        self.operation.restore(state.operation)
         self.signals.restore(state.signals, now_ns)
         for predictor, of_predictor in zip(self._predictors, state.predictors, strict=True):
             predictor.restore(of_predictor)
@@ -308,8 +316,11 @@ class PlantPipeline:
         if self.is_normal and not row.restarted and self._step_row(measured):
             return
         self._leave_normal()
+        if row.restarted:
+            self.operation.on_restart()
+        self.operation.inputs = inputs
         publications.extend(self.signals.check_row(time_ns, row.values))
-        if self._is_process:
+        if self._is_process or self._config.bounds:
             inputs, values = self._split(self.signals.mask_values(time_ns, row.values, publications))
             measured.inputs, measured.values = inputs, values
         if self._reference is None:
@@ -319,6 +330,7 @@ class PlantPipeline:
                 self.signals.reset()
             self._evaluate(measured)
             self.is_normal = self._find_normal(time_ns)
+        self.operation.inputs = ()
 
     def _split(self, values: tuple[float, ...]) -> tuple[tuple[float, ...], list[float]]:
         """Inputs and outputs of a row."""
@@ -510,6 +522,7 @@ class PlantPipeline:
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         if not again:
+            self.operation.end_training()
             self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
@@ -518,6 +531,7 @@ class PlantPipeline:
         """Set the reference for the rows to come."""
         self._reference, self._arl0 = reference, arl0
         self._is_process = self._is_process_given or isinstance(reference, ProcessReference)
+        self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
         self._kalman = None
@@ -716,7 +730,7 @@ def _filter_snapshot(reference: ProcessReference, output: str) -> ModelSnapshot:
 
 def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:
     """Process model for the plant, as the settings ask for it."""
-    if config.reference in ("black-box", "arx"):
+    if config.reference in ("black-box", "arx") or (model is None and config.process == WITHOUT_EQUATIONS):
         return None
     given, model = model is not None, model or cstr()
     fits = config.inputs == model.input_names and set(config.outputs) <= set(model.output_names)

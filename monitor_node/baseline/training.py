@@ -24,7 +24,7 @@ from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
 from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_structure, fewest_rows
 from monitor_node.baseline.references import ArxReference, ProcessReference, Reference, estimate_training_noise
 from monitor_node.baseline.resolution import resolution_sd
-from monitor_node.baseline.signal_range import signal_ranges
+from monitor_node.baseline.signal_range import possible_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals
 from reactorwatch.contract.messages_pb2 import Check
@@ -194,7 +194,10 @@ class Training:
         inputs = np.array([row[1] for row in rows], dtype=np.float64).reshape(len(rows), len(self._config.inputs))
         measured = np.array([row[2] for row in rows])
         outputs = self._config.outputs
-        steps = [resolution_sd(column) for column in measured.T]
+        steps = [
+            resolution_sd(column, self._config.resolution.get(name))
+            for name, column in zip(outputs, measured.T, strict=True)
+        ]
         smallest = [
             max(self._config.smallest_sd.get(name, 0.0), sd, 1e-12) for name, sd in zip(outputs, steps, strict=True)
         ]
@@ -224,12 +227,12 @@ class Training:
                 name="training", result=refused or _screening_summary(outputs, time_min, screenings, evaluated) or "ok"
             )
         ]
-        if isinstance(reference, ArxReference):
-            checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         if isinstance(reference, BlackBoxReference) and reference.weakness:
             checks.append(Check(name=reference.kind, result=reference.weakness))
         if self._without_black_box:
             checks.append(Check(name=BlackBoxReference.kind, result=f"the ARX models judge: {self._without_black_box}"))
+        if isinstance(reference, ArxReference):
+            checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
         return TrainingResult(reference, learned, e, np.where(usable, measured, np.nan), checks, refused, left_out)
 
@@ -247,7 +250,7 @@ class Training:
     def _constant_outputs(self, measured: Array, steps: list[float]) -> dict[str, str]:
         """Outputs that never vary, and have no smallest relevant deviation in the settings, with the reason."""
         return {
-            name: f"it reads {np.nanmax(column):.6g} in the whole training; smallest_sd could say what matters of it"
+            name: f"it reads {np.nanmax(column):.6g} in the whole training; smallest_sd or resolution may help"
             for name, column, step in zip(self._config.outputs, measured.T, steps, strict=True)
             if not step and not self._config.smallest_sd.get(name) and np.isfinite(column).any()
         }
@@ -272,7 +275,10 @@ class Training:
             residuals = z * np.array(reference.typical_sd)
             if self._config.reference == "equations" or _predicts_as_well(residuals, identified):
                 return reference, z, judged
-        black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
+        black_box = None
+        is_driven = bool(inputs.shape[1] and has_values.all())  # without inputs there is nothing to simulate
+        if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven):
+            black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
         if black_box is not None:
             residuals = black_box[1] * np.array(black_box[0].typical_sd)
             if self._config.reference == "black-box" or _predicts_as_well(residuals, identified):
@@ -296,10 +302,8 @@ class Training:
     def _black_box(
         self, time_min: Array, inputs: Array, outputs: Array, smallest: list[float], steps: list[float]
     ) -> tuple[BlackBoxReference, Array, list[Screening]] | None:
-        """Black box as reference; None if the settings exclude it, or the signals are too many or the rows too few."""
+        """Black box as reference; None if the signals are too many or the rows too few."""
         self._without_black_box = ""
-        if self._config.reference not in ("auto", "black-box"):
-            return None
         learned: list[BlackBoxReference] = []
 
         def innovations(rows: Array) -> Residuals:
@@ -316,7 +320,7 @@ class Training:
 
     def _mask_impossible(self, inputs: Array, measured: Array) -> tuple[Array, Array] | None:
         """Inputs and outputs with NaN for impossible values; None if there are too many: the process is another one."""
-        columns, ranges = np.column_stack([inputs, measured]), signal_ranges(self._model, self._config.signals)
+        columns, ranges = np.column_stack([inputs, measured]), possible_ranges(self._config, self._model)
         lower, upper = np.array([(item.lower, item.upper) for item in ranges]).T
         out = np.isfinite(columns) & ((columns < lower) | (columns > upper))
         if self._config.reference != "equations" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):

@@ -4,11 +4,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from reactorwatch.api.files import record as read_file
+from reactorwatch.api.views.page import write_page
+from reactorwatch.api.views.record import plot_record, record_frame, record_html
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import convert_to_process
@@ -21,6 +23,10 @@ from reactorwatch.records.frame import write_frame
 from reactorwatch.records.record import LONGEST_MIN
 from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.several_files import join_files
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 ProcessLike: TypeAlias = str | Path | Process | ProcessModel
 
@@ -80,6 +86,39 @@ class Record(MeasuredRecord):
     def signals(self) -> dict[str, Any]:
         """Values by signal."""
         return self.columns
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the signals that are inputs of the process."""
+        described = find_process(process_of(self, None))
+        return tuple(name for name in described.inputs if name in self.columns)
+
+    def _repr_html_(self) -> str:
+        return record_html(self)
+
+    def to_frame(self) -> "DataFrame":
+        """Rows as a pandas data frame, with the clock time as index, or `time_min` where it is unknown.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        return record_frame(self)
+
+    def plot(self) -> "Figure":
+        """Plot all signals over time.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        return plot_record(self, self.inputs)
+
+    def to_html(self, file: str | Path) -> None:
+        """Write the ranges and plots of the signals as one page.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        write_page(file, self.name, self._repr_html_(), self.plot, self.name)
 
 
 def _check_arrays(
@@ -186,9 +225,26 @@ def model_of(record: MeasuredRecord, process: ProcessLike | None) -> ProcessMode
     """Equations of the process of a record, their clock that of the record.
 
     Raises:
-        InputError: there is no such process, the file cannot be read, or the process has no equations.
+        InputError: there is no such process, its file cannot be read, it has no equations, or the record lacks a signal
+            of them.
     """
-    return find_process(process_of(record, process), record.zero_ns).require_model()
+    model = find_process(process_of(record, process), record.zero_ns).require_model()
+    check_signals(record, model)
+    return model
+
+
+def check_signals(record: MeasuredRecord, model: ProcessModel) -> None:
+    """Check that a record has the inputs and outputs of a model.
+
+    Raises:
+        InputError: it lacks one.
+    """
+    missing = [name for name in (*model.input_names, *model.output_names) if name not in record.columns]
+    if missing:
+        raise InputError(
+            f"{record.name}: must have the signals of {model.name}, {', '.join(missing)} missing, got "
+            f"{', '.join(record.columns) or 'none'}; read it with the process that it is of"
+        )
 
 
 def effects(process: ProcessLike = DEFAULT_PROCESS) -> tuple[Effect, ...]:

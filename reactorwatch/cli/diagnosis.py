@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 
 from reactorwatch.api.files import described_process, process_on_clock, record
+from reactorwatch.api.report_origin import report_origin
 from reactorwatch.cli.options import check_recording
-from reactorwatch.cli.report_origin import report_origin
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.parameter_priors import parse_priors

@@ -104,7 +104,7 @@ class Hypothesis:
         signals = [self.signals_at(parameters) for parameters in possible]
         shared = None
         if like is not None:
-            before = self.signals_at(like.parameters)
+            before = self.signals_at(self._complete(like.parameters))
             shared = [SharedPrefix(like.innovations, _count_equal_rows(item, before)) for item in signals]
         results = self.filter.evaluate_all(run, signals, shared)
         return [
@@ -116,9 +116,14 @@ class Hypothesis:
 
     def _clip(self, parameters: Sequence[Array]) -> tuple[Array, ...]:
         return tuple(
-            profile.clip(profile.complete(values), effect.lower, effect.upper)
-            for profile, values, effect in zip(self.profiles, parameters, self.filter.effects, strict=True)
+            profile.clip(values, effect.lower, effect.upper)
+            for profile, values, effect in zip(
+                self.profiles, self._complete(parameters), self.filter.effects, strict=True
+            )
         )
+
+    def _complete(self, parameters: Sequence[Array]) -> list[Array]:
+        return [profile.complete(values) for profile, values in zip(self.profiles, parameters, strict=True)]
 
     def fit(self, run: Run, start: Sequence[Array], steps: int = MOST_STEPS, like: Fit | None = None) -> Fit:
         """Fit the parameters by least squares; magnitudes of discontinuous effects stay.
