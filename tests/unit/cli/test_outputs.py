@@ -96,8 +96,8 @@ CASES = {
     "record": [
         Case(f"record {NO_ROUTER} --config settings.toml", {"config": ""}, "new.mcap", never_overwrites=True),
     ],
-    "up": [Case(f"up {NO_ROUTER}", {"config": "", "diagnose": "", "site": ""}, "folder")],
-    "demo": [Case("demo", {"site": ""}, "folder", never_overwrites=True)],
+    "up": [Case(f"up {NO_ROUTER}", {"config": "", "diagnose": "", "site": "", "process": "", "record": ""}, "folder")],
+    "demo": [Case("demo", {"site": "", "process": ""}, "folder", never_overwrites=True)],
 }
 ALL = [case for cases in CASES.values() for case in cases]
 FOLDERS = ("folder", "pictures")
