@@ -1,13 +1,13 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench faults study kills cuts fuzz soak outside pictures docs examples protobuf lock clean
+.PHONY: help setup demo test lint bench faults promise study kills cuts fuzz soak outside pictures docs examples protobuf lock clean
 
 PYTHON ?= python3
 BIN := .venv/bin
 # keep bytecode: without it each process that tests start compiles every module again
 unexport PYTHONDONTWRITEBYTECODE
 # each has a target of its own
-LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py)
+LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py false_alarms.py)
 READY := .venv/.ready
 DOCS_READY := .venv/.docs-ready
 
@@ -46,6 +46,9 @@ bench: $(READY) ## speed, as ratios measured in one run
 
 faults: $(READY) ## detection delays on a bank of faults, beside an oracle and the report's method: most of an hour
 	@$(BIN)/python benchmarks/fault_bank.py --write docs/fault_bank.md
+
+promise: $(READY) ## false alarms of 80 runs without a fault beside the number promised: two minutes
+	@$(BIN)/python benchmarks/false_alarms.py
 
 study: $(READY) ## the diagnosis of hidden causes; writes its tables into docs/diagnosis_study.md: hours
 	@$(BIN)/python benchmarks/diagnosis_study.py --write

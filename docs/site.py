@@ -205,6 +205,9 @@ def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
             parts.append(source)
             continue
         parts.append(f"```python\n{source}\n```")
+        printed = _without_spinner("".join("".join(item.get("text", "")) for item in cell.get("outputs", [])))
+        if printed:
+            parts.append(f"```text\n{printed}\n```")
         for output in cell.get("outputs", []):
             data = output.get("data", {})
             if "image/png" in data:
@@ -213,9 +216,8 @@ def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
                 parts.append(f"![Figure of the cell above]({name})")
             elif "text/html" in data:
                 parts.append("".join(data["text/html"]))
-            elif "text/plain" in data or "text" in output:
-                text = "".join(data.get("text/plain") or output["text"])
-                parts.append(f"```text\n{text.rstrip()}\n```")
+            elif "text/plain" in data:
+                parts.append(f"```text\n{''.join(data['text/plain']).rstrip()}\n```")
     parts.append(f"*The notebook: `examples/{path.name}`; `make examples` executes all of them.*")
     return "\n\n".join(parts) + "\n", pictures
 
@@ -227,6 +229,13 @@ def _add(files: Files, config: MkDocsConfig, name: str, text: str, repository_pa
     file = File.generated(config, name, content=text)
     file.repository_path = repository_path  # type: ignore[attr-defined]
     files.append(file)
+
+
+def _without_spinner(text: str) -> str:
+    """Output of a command as it stands on the terminal at the end: without the spinner that it erased."""
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
+    lines = [line.rstrip() for line in re.split(r"[\r\n]+", plain)]
+    return "\n".join(line for line in lines if line and not re.match(r"[\u2800-\u28ff]", line))
 
 
 def _notebooks() -> list[Path]:

@@ -51,8 +51,11 @@ SMALLEST_SD = {"C": 2e-4, "T": 0.05}
 """Defaults for the reactor's outputs; other outputs have none."""
 
 
-DEFAULT_SIGNALS = ("qc", "C", "T")
-"""Signals of the default process, the input first."""
+WITHOUT_EQUATIONS = ""
+"""Setting `process` of a plant that no equations judge."""
+
+DEFAULT_SIGNALS = {"inputs": ("qc",), "outputs": ("C", "T")}
+"""Signals of the default process, by key."""
 
 
 class TrainingLength(NamedTuple):
@@ -83,6 +86,12 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         plant: name of the plant.
         inputs: signals that drive the plant; none, one or several.
         outputs: signals that are predicted and monitored.
+        setpoints: signals that controllers aim at; an alarm states their recent moves.
+        modes: signals that say how the plant is operated, such as a controller in manual; an alarm states unusual ones.
+        labels: signals that are carried along, and ignored.
+        bounds: lowest and highest value by signal, in the unit in which it is judged; other values are not measured
+            values, and an input at a bound is saturated, which an alarm states.
+        resolution: smallest step between two values by output; without it, it is learned.
         units: unit by signal, as its process describes it: that of samples which name none, and, without equations,
             the unit in which a signal is judged.
         order: order of the ARX models.
@@ -97,7 +106,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             to the training; `auto`, the first of these that predicts the training about as well as the last (without
             inputs no black box).
         process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
-            nominal reactor where its signals are watched.
+            nominal reactor where its signals are watched; empty: no equations judge.
         charts: charts of the residuals.
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
             nearest number that the charts can keep for the number of alarms and the sampling period.
@@ -121,8 +130,13 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     """
 
     plant: str = "cstr"
-    inputs: tuple[str, ...] = ("qc",)
-    outputs: tuple[str, ...] = ("C", "T")
+    inputs: tuple[str, ...] = DEFAULT_SIGNALS["inputs"]
+    outputs: tuple[str, ...] = DEFAULT_SIGNALS["outputs"]
+    setpoints: tuple[str, ...] = ()
+    modes: tuple[str, ...] = ()
+    labels: tuple[str, ...] = ()
+    bounds: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
+    resolution: dict[str, float] = msgspec.field(default_factory=dict)
     units: dict[str, str] = msgspec.field(default_factory=dict)
     order: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
     delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
@@ -160,10 +174,14 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         check_plant(self.plant)
         check_rule(self.raise_count, self.window, self.clear_count)
-        if not self.outputs or len(set(self.signals)) != len(self.signals):
+        every = (*self.signals, *self.carried, *self.labels)
+        if not self.outputs or len(set(every)) != len(every):
+            beside = (
+                f", and {', '.join(every[len(self.signals) :])} beside them" if len(every) > len(self.signals) else ""
+            )
             raise ValueError(
-                f"outputs must be at least one signal, and each signal be named once among inputs and outputs, "
-                f"got inputs {self.inputs} and outputs {self.outputs}"
+                f"outputs must be at least one signal, and each signal have one role, "
+                f"got inputs {self.inputs} and outputs {self.outputs}{beside}"
             )
         check_bounds(MonitorConfig, msgspec.structs.asdict(self))
         msgspec.structs.force_setattr(self, "reference", OLDER_REFERENCES.get(self.reference, self.reference))
@@ -174,8 +192,18 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             )
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
-        if self.process is not None and self.signals == DEFAULT_SIGNALS:
-            return  # the signals are those of the process, which `watched_process` sets
+        if self.process is not None and self.outputs == DEFAULT_SIGNALS["outputs"]:
+            return  # the outputs are those of the process, which `watched_process` sets
+        for signal, (lower, upper) in self.bounds.items():
+            if signal not in self.signals:
+                raise ValueError(f"bounds are by input and output, {self.signals}, got {signal!r}")
+            if not lower < upper:
+                raise ValueError(f"bounds of {signal} must be a lower and a higher number, got {lower:g} and {upper:g}")
+        for signal, step in self.resolution.items():
+            if signal not in self.outputs:
+                raise ValueError(f"resolution is by output, {self.outputs}, got {signal!r}")
+            if not 0 < step < 1e6:
+                raise ValueError(f"resolution of {signal} must be in (0, 1e6), got {step:g}")
         for signal, sd in self.smallest_sd.items():
             if signal not in (*self.outputs, *SMALLEST_SD):
                 raise ValueError(f"smallest_sd is by output, {self.outputs}, got {signal!r}")
@@ -200,12 +228,17 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     @property
     def is_reactor(self) -> bool:
         """True if the signals are those of the default process."""
-        return self.inputs == ("qc",) and set(self.outputs) <= {"C", "T"}
+        return self.inputs == DEFAULT_SIGNALS["inputs"] and set(self.outputs) <= set(DEFAULT_SIGNALS["outputs"])
 
     @property
     def signals(self) -> tuple[str, ...]:
         """Signals of a row: the inputs, then the outputs."""
         return (*self.inputs, *self.outputs)
+
+    @property
+    def carried(self) -> tuple[str, ...]:
+        """Signals beside the rows that go with an alarm: set points, then modes."""
+        return (*self.setpoints, *self.modes)
 
     @property
     def chart_settings(self) -> dict[str, float]:

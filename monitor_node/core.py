@@ -81,14 +81,17 @@ class Monitor:
         self.rejects = RejectCounter()
         self.failures = Failures()
         self._signals = config.signals
-        self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in self._signals}
+        known = (*self._signals, *config.carried)
+        self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in known}
+        self._label_keys = {keys.key(config.plant, keys.SAMPLE, signal) for signal in config.labels}
         self._indices = {signal: place for place, signal in enumerate(self._signals)}
         self._aligner = Aligner(self._signals, config.reorder_rows)
         self._runs = [SequenceCheck() for _ in self._signals]
         self._replay_filter: ReplayFilter | None = None
         self.alarms = Annunciator(config)
         self.pipeline = self._new_pipeline(self.alarms)
-        self._sample_units = make_sample_units(config.units, None if model is None else model.units)
+        judged_by = self.pipeline.model
+        self._sample_units = make_sample_units(config.units, None if judged_by is None else judged_by.units)
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -111,6 +114,8 @@ class Monitor:
         if message.received_ns and now_ns - message.received_ns > self.stats.lag_ns:
             self.stats.lag_ns = now_ns - message.received_ns
         signal = self._signal_by_key.get(message.key)
+        if signal is None and message.key in self._label_keys:
+            return []
         if signal is None:
             self.rejects.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
             return []
@@ -139,14 +144,16 @@ class Monitor:
             except InputError as error:
                 self.rejects.add("unit", str(error))
                 return []
-        if self._replay_filter is not None and self._replay_filter.is_duplicate(
-            self._indices[signal], sample.time_ns, sample.sequence
-        ):
+        index = self._indices.get(signal)
+        if index is None:
+            self.pipeline.operation.on_sample(signal, sample.time_ns, value)
+            return []
+        if self._replay_filter is not None and self._replay_filter.is_duplicate(index, sample.time_ns, sample.sequence):
             self._aligner.state.counts.duplicated += 1
             return []
         publications: list[Publication] = []
         time_ns, number = sample.time_ns, sample.sequence
-        run, is_accepted = self._runs[self._indices[signal]], True
+        run, is_accepted = self._runs[index], True
         if run.accept_next(number, time_ns):  # as nearly always
             self._accept(signal, time_ns, number, value, unit, publications)
         elif not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):

@@ -23,17 +23,18 @@ from monitor_node.baseline.references import (
     ProcessReferenceState,
     Reference,
 )
-from monitor_node.baseline.signal_range import signal_ranges
+from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
 from monitor_node.chart_stage import ChartWatch, alarm_names
-from monitor_node.config import MonitorConfig
+from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.health import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
+from monitor_node.operation import Operation
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.signal_checks.stage import SignalChecks
 from monitor_node.state.monitor_state import equations_text
@@ -88,6 +89,7 @@ class PlantPipeline:
         is_normal: True if the compiled step may take the next row, see `row_step`.
         left_out: signals that are not monitored, with the reason, after the training.
         signals: signal checks.
+        operation: operation of the plant, for the texts of alarms.
         training_rows: number of rows of the training, after its end.
     """
 
@@ -113,8 +115,12 @@ class PlantPipeline:
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
         self._numbers: Records = np.zeros(1, numbers_type(config))
-        self._ranges = signal_ranges(self.model, config.signals)
+        self._ranges, self._stated = possible_ranges(config, self.model), stated_ranges(config)
         self.signals = SignalChecks(config, board, self._ranges, self._numbers)
+        self.signals.use_ranges(self._ranges if self._is_process else self._stated)
+        units = {**config.units, **(self.model.units if self.model is not None else {})}
+        self.operation = Operation(config, input_bounds(config, self.model), units)
+        board.describe_operation = self.operation.describe
         self._drift = DriftWatch(config, board, publish=points)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
@@ -126,6 +132,7 @@ class PlantPipeline:
         self._step: RowStep | None = None
         self._kalman: FilterNumbers | None = None
         self._row = np.empty(len(config.signals))
+        self._inputs = len(config.inputs)
         self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
@@ -156,6 +163,7 @@ class PlantPipeline:
             self._began_ns,
             self._update.rows or self._training.state,
             None if self._reference is None else self._trained_state(self._reference),
+            self.operation.state,
         )
 
     def _trained_state(self, reference: Reference) -> TrainedState:
@@ -184,6 +192,7 @@ class PlantPipeline:
             ValueError: the state is damaged.
         """
         self._sampling.state = state.sampling
+        self.operation.restore(state.operation)
         self.signals.restore(state.signals, now_ns)
         for predictor, of_predictor in zip(self._predictors, state.predictors, strict=True):
             predictor.restore(of_predictor)
@@ -307,16 +316,19 @@ class PlantPipeline:
         if self._update.changes:
             self._change_model(time_ns, publications)
         interval = self._sampling.update(time_ns)
-        inputs, values = self._split(row.values)
+        inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
         follows = interval.follows and not row.restarted
         measured = MeasuredRow(time_ns, inputs, values, units, interval, follows, publications)
-        if self.is_normal and not row.restarted and self._step_row(measured):
+        if self.is_normal and not row.restarted and self._step_row(measured, row.values):
             return
         self._leave_normal()
+        if row.restarted:
+            self.operation.on_restart()
+        self.operation.inputs = inputs
         publications.extend(self.signals.check_row(time_ns, row.values))
-        if self._is_process:
-            inputs, values = self._split(self.signals.mask_values(time_ns, row.values, publications))
-            measured.inputs, measured.values = inputs, values
+        if self._is_process or self._config.bounds:
+            usable = self.signals.mask_values(time_ns, row.values, publications)
+            measured.inputs, measured.values = usable[: self._inputs], list(usable[self._inputs :])
         if self._reference is None:
             self._train(measured)
         else:
@@ -324,11 +336,7 @@ class PlantPipeline:
                 self.signals.reset()
             self._evaluate(measured)
             self.is_normal = self._find_normal(time_ns)
-
-    def _split(self, values: tuple[float, ...]) -> tuple[tuple[float, ...], list[float]]:
-        """Inputs and outputs of a row."""
-        inputs = len(self._config.inputs)
-        return values[:inputs], list(values[inputs:])
+        self.operation.inputs = ()
 
     def snapshots(self, time_ns: int) -> list[Publication]:
         """Snapshots of each output's models: the adaptive one, the one fitted to the training, and the reference.
@@ -518,6 +526,7 @@ class PlantPipeline:
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         if not again:
+            self.operation.end_training()
             self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
@@ -526,6 +535,7 @@ class PlantPipeline:
         """Set the reference for the rows to come."""
         self._reference, self._arl0 = reference, arl0
         self._is_process = self._is_process_given or isinstance(reference, ProcessReference)
+        self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
         self._kalman = None
@@ -550,7 +560,7 @@ class PlantPipeline:
         """Search the causes of alarms; an error there costs the state of the search, and no alarm."""
         assert self._suspicion is not None
         try:
-            return self._suspicion.update(row.time_ns, row.inputs[0], row.values, row.units, list(stuck))
+            return self._suspicion.update(row.time_ns, row.inputs, row.values, row.units, list(stuck))
         except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
             self._failures.add("isolation", error, "the search for the cause of this alarm starts again")
             assert self._reference is not None
@@ -589,20 +599,19 @@ class PlantPipeline:
             self._charts.store(self._numbers[0])
             self.is_normal = False
 
-    def _step_row(self, row: MeasuredRow) -> bool:
+    def _step_row(self, row: MeasuredRow, values: tuple[float, ...]) -> bool:
         """Process a row by the compiled step; returns False if it is an event, for which nothing has changed."""
         assert self._step is not None
         assert self._kalman is not None
         assert isinstance(self._reference, ProcessReference | BlackBoxReference)
         time_ns, time_min = row.time_ns, row.time_ns / MINUTE_NS
-        count = len(row.inputs)
-        self._row[:count], self._row[count:] = row.inputs, row.values
+        self._row[:] = values
         verdict = self._step.update(self._numbers, self._kalman, time_ns, time_min, self._row)
         if verdict == EVENT:
             return False
         if verdict == VIOLATING:
             self._charts.store_delays(self._numbers[0])
-        self._reference.accept_row(time_min, tuple(row.inputs))
+        self._reference.accept_row(time_min, row.inputs)
         self.rows_watched += 1
         if self._points:
             self._publish_step(row)
@@ -610,7 +619,7 @@ class PlantPipeline:
             self._buffer(row)
             row.publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
-            self._suspicion.add(time_min, row.inputs[0], row.values)
+            self._suspicion.add(time_min, row.inputs, row.values)
         return True
 
     def _publish_step(self, row: MeasuredRow) -> None:
@@ -630,10 +639,10 @@ class PlantPipeline:
         assert reference is not None
         if self.left_out:
             self._note_late_signals(row.inputs, row.values)
-            row.inputs = [  # as in the training
+            row.inputs = tuple(  # as in the training
                 0.0 if name in self.left_out else value
                 for name, value in zip(self._config.inputs, row.inputs, strict=True)
-            ]
+            )
             row.values = [
                 value if evaluated else nan for value, evaluated in zip(row.values, self._evaluated, strict=True)
             ]
@@ -652,8 +661,8 @@ class PlantPipeline:
             for whitener in self._whiteners:
                 whitener.restart()
         predictions, sds = reference.update(time_ns, row.inputs, values, self._quarantined, row.interval.missing)
-        if isinstance(reference, ArxReference):
-            self._note_inputs_beyond(reference, row.inputs)
+        if isinstance(reference, ArxReference) and reference.beyond:
+            self._note_inputs_beyond(reference.beyond)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
@@ -681,9 +690,9 @@ class PlantPipeline:
                     "rows are not judged while inputs have values that the black box has not learned, and teach it"
                 )
 
-    def _note_inputs_beyond(self, reference: ArxReference, inputs: Sequence[float]) -> None:
+    def _note_inputs_beyond(self, indices: list[int]) -> None:
         """Note once each input that leaves its range in the training, as rows are not judged then."""
-        for name in (self._config.inputs[i] for i in reference.find_beyond(inputs)):
+        for name in (self._config.inputs[i] for i in indices):
             if name not in self._noted:
                 self._noted.add(name)
                 self.notes.append(
@@ -729,7 +738,7 @@ def _filter_snapshot(reference: ProcessReference, output: str) -> ModelSnapshot:
 
 def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:
     """Process model for the plant, as the settings ask for it."""
-    if config.reference in ("black-box", "arx"):
+    if config.reference in ("black-box", "arx") or (model is None and config.process == WITHOUT_EQUATIONS):
         return None
     given, model = model is not None, model or cstr()
     fits = config.inputs == model.input_names and set(config.outputs) <= set(model.output_names)

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from monitor_node.alarms.on_off_delay import DELAY, add_point, is_normal, raises
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.references import GATE
-from monitor_node.baseline.signal_range import SignalRange, signal_ranges
+from monitor_node.baseline.resolution import quantise
+from monitor_node.baseline.signal_range import SignalRange, possible_ranges
 from monitor_node.chart_stage import alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import TOLERANCE, WHOLE
@@ -127,6 +128,7 @@ def settings_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
         [
             ("filter_address", "i8"),  # address of the filter's machine code; 0: a black box
             ("spacing_min", "f8", (2,)),  # shortest and longest time between two rows
+            ("resolutions", "f8", (outputs,)),  # stated resolution of each output; 0 where it is learned
             ("ranges", "f8", (inputs + outputs, 2)),  # smallest and largest value of each signal
             ("silence_limit", "f8"),  # see `DataTimeout`
             ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
@@ -294,7 +296,7 @@ def step(
     outputs = values.size - inputs
     for i in range(outputs):
         value, whitener = values[inputs + i], p.whiteners[i]
-        take_reading(p.stuck[i], value)
+        take_reading(p.stuck[i], quantise(value, settings.resolutions[i]))
         if is_stuck(p.stuck[i]):
             return EVENT
         work.expected[i] = expected_value(whitener)
@@ -367,6 +369,7 @@ class RowStep:
         p = self.settings[0]
         p["filter_address"], p["spacing_min"] = row_filter.address, row_filter.spacing_min
         p["silence_limit"] = config.silence_periods
+        p["resolutions"] = [config.resolution.get(name, 0.0) for name in config.outputs]
         p["ranges"] = [[item.lower, item.upper] for item in ranges]
         p["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
         for i, kind in enumerate(kinds):
@@ -396,7 +399,7 @@ class RowStep:
         belief, spacing_min = states + states**2, (0.0, LONGEST_ROW_MIN)
         code = compiled_filter(model)
         row_filter = RowFilter(code.address, belief, model.values(), outputs + states, spacing_min, code)
-        return RowStep(config, row_filter, ranges or signal_ranges(model, config.signals))
+        return RowStep(config, row_filter, ranges or possible_ranges(config, model))
 
     @staticmethod
     def of_black_box(

@@ -1,6 +1,6 @@
 """Process that a monitor watches: its signals and equations in the settings of the monitor."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -10,6 +10,7 @@ from monitor_node.config import (
     DEFAULT_TRAINING_ROWS,
     REACTOR,
     SMALLEST_SD,
+    WITHOUT_EQUATIONS,
     MonitorConfig,
 )
 from monitor_node.process_settings import signal_settings
@@ -42,7 +43,7 @@ def load_process(config: MonitorConfig, zero_ns: int = 0, rows: int | None = Non
     Raises:
         InputError: the process cannot be found or read, or does not fit the settings.
     """
-    if config.process is None:
+    if not config.process:
         return WatchedProcess(limit_training(config, rows), None)
     return watch_process(config, find_process(config.process, zero_ns, on_bus=True), rows)
 
@@ -60,14 +61,14 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
     """
     if config.reference == "equations":
         process.require_model()
-    changed: dict[str, object] = {"units": process.units}
-    if config.signals == DEFAULT_SIGNALS:
-        changed |= signal_settings(process)
-    for signal in () if "inputs" in changed else config.signals:
+    described = signal_settings(process)
+    named = {key: getattr(config, key) for key, names in DEFAULT_SIGNALS.items() if getattr(config, key) != names}
+    changed: dict[str, object] = {"units": process.units} | _restrict(described, described | named)
+    for signal in (name for names in named.values() for name in names):
         if signal not in (*process.inputs, *process.outputs):
             raise InputError(describe_unknown("signal", signal, (*process.inputs, *process.outputs)))
-    if process.model is None and config.reference == "auto":
-        changed["reference"] = "arx"
+    if process.model is None:
+        changed["process"] = WITHOUT_EQUATIONS
     if process.name != REACTOR:
         if config.smallest_sd == SMALLEST_SD:
             changed["smallest_sd"] = {}
@@ -77,6 +78,21 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
             changed["training_rows"] = DEFAULT_TRAINING_ROWS
     changed_config = msgspec.structs.replace(config, **changed)
     return WatchedProcess(limit_training(changed_config, rows, is_stated=_states_training(config)), process.model)
+
+
+def _restrict(described: dict[str, Any], chosen: dict[str, Any]) -> dict[str, Any]:
+    """Settings of the signals of a process, for the inputs and outputs that are watched."""
+    inputs, outputs = chosen["inputs"], chosen["outputs"]
+    others = [name for key in ("inputs", "outputs") for name in described[key] if name not in (*inputs, *outputs)]
+    return {
+        "inputs": inputs,
+        "outputs": outputs,
+        "setpoints": described["setpoints"],
+        "modes": described["modes"],
+        "labels": (*described["labels"], *others),
+        "bounds": {name: bounds for name, bounds in described["bounds"].items() if name in (*inputs, *outputs)},
+        "resolution": {name: step for name, step in described["resolution"].items() if name in outputs},
+    }
 
 
 def limit_training(config: MonitorConfig, rows: int | None, *, is_stated: bool | None = None) -> MonitorConfig:

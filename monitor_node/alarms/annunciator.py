@@ -4,7 +4,7 @@ Alarms change with samples, with an operator's actions, and when shelving ends. 
 without an operator's action follow from the samples alone.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from math import isfinite
 from typing import Literal
 
@@ -99,6 +99,8 @@ class Annunciator:
         self.time_ns: int | None = None
         self.changes = 0
         self.has_unexplained = False
+        self.describe_operation: Callable[[int], str] = lambda time_ns: ""
+        """Operation of the plant at a time, which the text of a raised alarm then states; empty: as usual."""
 
     def declare(
         self,
@@ -147,6 +149,8 @@ class Annunciator:
         Arguments as for `ChartAlarm.record`.
         """
         before = alarm.memory.state
+        if explanation is not None and (operation := self.describe_operation(time_ns)):
+            explanation = explanation._replace(text=f"{explanation.text}; {operation}")
         event = alarm.record(time_ns, judgement, unit, explanation)
         self._on_change(alarm, event, before, time_ns)
         return self._publication(alarm, event, time_ns)

@@ -24,7 +24,7 @@ from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
 from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_structure, fewest_rows
 from monitor_node.baseline.references import ArxReference, ProcessReference, Reference, estimate_training_noise
 from monitor_node.baseline.resolution import resolution_sd
-from monitor_node.baseline.signal_range import signal_ranges
+from monitor_node.baseline.signal_range import possible_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals
 from reactorwatch.contract.messages_pb2 import Check
@@ -41,6 +41,10 @@ MOST_ROWS = 10_000
 
 FEWEST_ROWS = 50
 """Least number of residuals; the training continues until there are as many."""
+
+FEWEST_FAMILIAR_ROWS = 200
+"""Least number of rows of a training after which `auto` takes a black box: after fewer, too many values of the inputs
+are unfamiliar to it, and it judges too few rows."""
 
 MOST_REFUSALS = 2
 
@@ -194,7 +198,10 @@ class Training:
         inputs = np.array([row[1] for row in rows], dtype=np.float64).reshape(len(rows), len(self._config.inputs))
         measured = np.array([row[2] for row in rows])
         outputs = self._config.outputs
-        steps = [resolution_sd(column) for column in measured.T]
+        steps = [
+            resolution_sd(column, self._config.resolution.get(name))
+            for name, column in zip(outputs, measured.T, strict=True)
+        ]
         smallest = [
             max(self._config.smallest_sd.get(name, 0.0), sd, 1e-12) for name, sd in zip(outputs, steps, strict=True)
         ]
@@ -226,7 +233,7 @@ class Training:
         ]
         if isinstance(reference, BlackBoxReference) and reference.weakness:
             checks.append(Check(name=reference.kind, result=reference.weakness))
-        if self._without_black_box:
+        if self._without_black_box and self._config.reference == "black-box":
             checks.append(Check(name=BlackBoxReference.kind, result=f"the ARX models judge: {self._without_black_box}"))
         if isinstance(reference, ArxReference):
             checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
@@ -247,7 +254,7 @@ class Training:
     def _constant_outputs(self, measured: Array, steps: list[float]) -> dict[str, str]:
         """Outputs that never vary, and have no smallest relevant deviation in the settings, with the reason."""
         return {
-            name: f"it reads {np.nanmax(column):.6g} in the whole training; smallest_sd could say what matters of it"
+            name: f"it reads {np.nanmax(column):.6g} in the whole training; smallest_sd or resolution may help"
             for name, column, step in zip(self._config.outputs, measured.T, steps, strict=True)
             if not step and not self._config.smallest_sd.get(name) and np.isfinite(column).any()
         }
@@ -274,11 +281,12 @@ class Training:
                 return reference, z, judged
         black_box = None
         is_driven = bool(inputs.shape[1] and has_values.all())  # without inputs there is nothing to simulate
-        if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven):
+        is_long = len(time_min) >= FEWEST_FAMILIAR_ROWS
+        if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven and is_long):
             black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
         if black_box is not None:
-            residuals = black_box[1] * np.array(black_box[0].typical_sd)
-            if self._config.reference == "black-box" or _predicts_as_well(residuals, identified):
+            residuals, is_sure = black_box[1] * np.array(black_box[0].typical_sd), not black_box[0].weakness
+            if self._config.reference == "black-box" or (is_sure and _predicts_as_well(residuals, identified)):
                 return black_box
         return self._arx_reference(given_inputs), identified, screenings
 
@@ -317,7 +325,7 @@ class Training:
 
     def _mask_impossible(self, inputs: Array, measured: Array) -> tuple[Array, Array] | None:
         """Inputs and outputs with NaN for impossible values; None if there are too many: the process is another one."""
-        columns, ranges = np.column_stack([inputs, measured]), signal_ranges(self._model, self._config.signals)
+        columns, ranges = np.column_stack([inputs, measured]), possible_ranges(self._config, self._model)
         lower, upper = np.array([(item.lower, item.upper) for item in ranges]).T
         out = np.isfinite(columns) & ((columns < lower) | (columns > upper))
         if self._config.reference != "equations" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):

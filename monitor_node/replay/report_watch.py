@@ -53,7 +53,7 @@ def watch(
         message for name, chart in charts.items() for message in _alarms(name, chart, chart.out & watched, times)
     ]
     if log is not None:
-        log.rows.extend(_logged(np.array([chart.out & watched for chart in charts.values()]), times))
+        log.rows.extend(_log_rows(np.array([chart.out & watched for chart in charts.values()]), times))
     return Backtest(
         inputs=tuple(inputs),
         outputs=tuple(outputs),
@@ -109,7 +109,7 @@ def _alarms(
     return messages
 
 
-def _logged(out: np.ndarray[tuple[int, int], np.dtype[np.bool_]], times: list[int]) -> list[LoggedRow]:
+def _log_rows(out: np.ndarray[tuple[int, int], np.dtype[np.bool_]], times: list[int]) -> list[LoggedRow]:
     rises = (out & ~np.column_stack([np.zeros(len(out), bool), out[:, :-1]])).any(axis=0)
     return [
         LoggedRow(time_ns, bool(active), bool(raised))

@@ -17,6 +17,7 @@ from monitor_node.baseline.signal_range import ANY, SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import Flags, SignalCheck
 from monitor_node.signal_checks.catalogue import CHECKS
+from monitor_node.signal_checks.range import RangeCheck
 from monitor_node.signal_checks.spike import SpikeCheck, SpikeState
 from monitor_node.signal_checks.stuck import StuckCheck, StuckState
 from monitor_node.signal_checks.timeout import DataTimeoutState, SilenceCheck
@@ -106,6 +107,12 @@ class SignalChecks:
     def trainings(self) -> list[tuple[dict[int, int], float]]:
         """See `StuckCheck.trainings`."""
         return self._stuck.trainings
+
+    def use_ranges(self, ranges: Sequence[SignalRange]) -> None:
+        """Take values beyond these ranges for no measurements from now on."""
+        for check in self._checks:
+            if isinstance(check, RangeCheck):
+                check.ranges = ranges
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """Learn from the training; arguments as for `SignalCheck.start`."""

@@ -35,6 +35,10 @@ TRAINING = ("training_min", "training_rows")
 """Settings that are compared only where they are stated."""
 
 
+ROLES = ("setpoints", "modes", "labels", "bounds", "resolution")
+"""Settings of signals that a state has only where there are any; earlier versions had none."""
+
+
 class OtherSettingsError(InputError):
     """The state is intact, but was learned with other settings."""
 
@@ -88,6 +92,9 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
     fields = {field: value for field, value in msgspec.structs.asdict(config).items() if field not in NOT_LEARNED_BY}
     for name in TRAINING:
         if fields[name] is None:
+            del fields[name]
+    for name in ROLES:
+        if not fields[name]:
             del fields[name]
     if model is not None:
         del fields["units"]  # the equations have their own

@@ -4,11 +4,13 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from reactorwatch.api.records import ProcessLike, process_of
+from reactorwatch.api.records import ProcessLike, check_signals, process_of
+from reactorwatch.api.report_origin import report_origin
+from reactorwatch.api.views import diagnosis as view
 from reactorwatch.description.find import find_process
 from reactorwatch.diagnosis.diagnose import diagnose as find_causes
 from reactorwatch.diagnosis.record_checks import make_run
@@ -19,6 +21,10 @@ from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.record import Record
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,26 @@ class DiagnosisResult(Diagnosis):
         """The object that `reactorwatch diagnose --json` prints, and the differences of the simulation."""
         return report_object(self, self.file, self.seconds, self.zero)
 
+    def _repr_html_(self) -> str:
+        return view.diagnosis_html(self, self.effects)
+
+    def to_frame(self) -> "DataFrame":
+        """A row for each cause of each explanation; explanation 0 is the named one, the others are alternatives.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        return view.diagnosis_frame(self)
+
+    def plot(self) -> "Figure":
+        """Plot the measured outputs with the simulation as it was and the extended one.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        assert self.curves is not None, "a diagnosis of a record has curves"
+        return view.plot_diagnosis(self, self.curves, self.model.units)
+
     def to_html(self, file: str | Path) -> None:
         """Write the report as one page.
 
@@ -64,8 +90,8 @@ class DiagnosisResult(Diagnosis):
         """
         from reactorwatch.diagnosis.report.page import as_page
 
-        names = (self.record.name, "extended.json", "experiment.csv")
-        page = as_page(self, self.model, self.effects, *names, on_the_bus=False)
+        names, origin = (self.record.name, "extended.json", "experiment.csv"), report_origin(Path(self.record.name), {})
+        page = as_page(self, self.model, self.effects, *names, on_the_bus=False, origin=origin)
         with atomic_write(Path(file)) as temporary:
             temporary.write_text(page, encoding="utf-8")
 
@@ -97,6 +123,7 @@ def diagnose(
     started = time.monotonic()
     described = find_process(process_of(record, process), record.zero_ns)
     model = described.require_model()
+    check_signals(record, model)
     make_run(record, model)
     causes = described.select_causes(without) if effects is None else effects
     known = described.uncertain | dict(uncertain or {})

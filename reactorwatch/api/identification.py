@@ -1,15 +1,72 @@
 """Identify linear models of a record from Python."""
 
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
 
 from reactorwatch.api.records import ProcessLike, process_of
+from reactorwatch.api.views import identification as view
+from reactorwatch.api.views.page import write_page
 from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.dataset import Dataset
-from reactorwatch.identification.identify import Identification, ModelForm
-from reactorwatch.identification.identify import identify as identify_model
+from reactorwatch.identification.identify import HeldOutRun, Identification, ModelForm, identify_and_run
 from reactorwatch.records.record import Record
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+
+class IdentificationResult(Identification, frozen=True, kw_only=True):
+    """An `Identification` with its run on the held-out rows.
+
+    Attributes:
+        run: measured, predicted and simulated output on the held-out rows.
+        record: the record that was fitted.
+    """
+
+    run: HeldOutRun
+    record: Record
+
+    def __repr__(self) -> str:
+        return f"<{self.model} of order {self.order} for {self.output}: free run {self.fit.free_run:.2f} %>"
+
+    def _repr_html_(self) -> str:
+        return view.identification_html(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The object that `reactorwatch identify --json` prints."""
+        names = Identification.__struct_fields__
+        found: dict[str, Any] = msgspec.to_builtins(Identification(**{name: getattr(self, name) for name in names}))
+        return found
+
+    def to_frame(self) -> "DataFrame":
+        """Held-out rows: the output measured, predicted one step ahead and simulated.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        return view.held_out_frame(self, self.run)
+
+    def plot(self) -> "Figure":
+        """Plot the held-out rows with the simulation and the one-step-ahead prediction.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        return view.plot_identification(self, self.run, self.record.units.get(self.output, ""))
+
+    def to_html(self, file: str | Path) -> None:
+        """Write the result with its figure as one page.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        title = f"{self.model} model of {self.output}: {self.record.name}"
+        write_page(file, title, view.identification_html(self), self.plot, self.record.name)
 
 
 def identify(
@@ -21,7 +78,7 @@ def identify(
     validate: Record | None = None,
     settle: int = 0,
     **form: Any,
-) -> Identification:
+) -> IdentificationResult:
     """Fit a model of one output to the first half of a record and validate it on the second.
 
     Args:
@@ -46,4 +103,7 @@ def identify(
     else:
         inputs = (input,) if isinstance(input, str) else tuple(input)
     held_out = None if validate is None else Dataset.of_record(validate, inputs, output)
-    return identify_model(Dataset.of_record(record, inputs, output), ModelForm(**form), held_out, settle)
+    data = Dataset.of_record(record, inputs, output)
+    found, run = identify_and_run(data, ModelForm(**form), held_out, settle)
+    values = {name: getattr(found, name) for name in Identification.__struct_fields__}
+    return IdentificationResult(**values, run=run, record=record)

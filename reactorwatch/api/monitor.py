@@ -1,6 +1,7 @@
 """A monitor that is fed from Python."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from math import isfinite
 from typing import Any
 
 import msgspec
@@ -11,6 +12,7 @@ from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.watched_process import load_process, watch_process
 from reactorwatch.api.files import DEFAULT_PLANT
 from reactorwatch.api.records import ProcessLike
+from reactorwatch.api.rows import iterate_rows
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import priority_word
 from reactorwatch.contract.codec import Publication, encode
@@ -22,10 +24,20 @@ from reactorwatch.runtime.config import section
 
 
 class Suspect(msgspec.Struct, frozen=True):
-    """A cause that an alarm may come from, with its probability."""
+    """A cause that an alarm may come from.
+
+    Attributes:
+        cause: name in the catalogue, or `unknown`.
+        probability: probability of the cause.
+        text: meaning of its size in words; empty: not known.
+    """
 
     cause: str
     probability: float
+    text: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.text or self.cause.replace('_', ' ')} ({100 * self.probability:.0f} %)"
 
 
 class AlarmChange(msgspec.Struct, frozen=True):
@@ -104,6 +116,20 @@ class Monitor:
         self._rows += 1
         return changes
 
+    def feed(self, rows: Any, time: str = "time_min") -> Iterator[AlarmChange]:
+        """Process rows from anywhere, and yield the changes of alarms as they come.
+
+        Args:
+            rows: a record, a data frame (pandas or polars), or an iterable of mappings of names to values, such as a
+                `csv.DictReader` or a generator; an empty or missing value was not measured.
+            time: name of the time: minutes, or clock times (`datetime`), which are counted from the first row.
+
+        Raises:
+            InputError: a row has no time, or a cell is no number.
+        """
+        for minute, values in iterate_rows(rows, time):
+            yield from self.update(minute, {name: value for name, value in values.items() if isfinite(value)})
+
     def to_bytes(self) -> bytes:
         """The state; a monitor of the same settings that it is restored into goes on with bit-identical output."""
         return msgspec.msgpack.encode((self._rows, self._core.to_bytes()))
@@ -123,7 +149,7 @@ class Monitor:
 
 
 def _change(alarm: Alarm) -> AlarmChange:
-    suspects = [Suspect(item.cause, item.probability) for item in alarm.suspects]
+    suspects = [Suspect(item.cause, item.probability, item.text) for item in alarm.suspects]
     return AlarmChange(
         to_minutes(alarm.time_ns), alarm.alarm, alarm.event, priority_word(alarm.priority), alarm.text, suspects
     )

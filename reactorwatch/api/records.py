@@ -4,11 +4,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from reactorwatch.api.files import described_process
 from reactorwatch.api.files import record as read_file
+from reactorwatch.api.views.page import write_page
+from reactorwatch.api.views.record import plot_record, record_frame, record_html
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import convert_to_process
@@ -21,6 +24,10 @@ from reactorwatch.records.frame import write_frame
 from reactorwatch.records.record import LONGEST_MIN
 from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.several_files import join_files
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 ProcessLike: TypeAlias = str | Path | Process | ProcessModel
 
@@ -81,6 +88,39 @@ class Record(MeasuredRecord):
         """Values by signal."""
         return self.columns
 
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the signals that are inputs of the process."""
+        described = find_process(process_of(self, None))
+        return tuple(name for name in described.inputs if name in self.columns)
+
+    def _repr_html_(self) -> str:
+        return record_html(self)
+
+    def to_frame(self) -> "DataFrame":
+        """Rows as a pandas data frame, with the clock time as index, or `time_min` where it is unknown.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        return record_frame(self)
+
+    def plot(self) -> "Figure":
+        """Plot all signals over time.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        return plot_record(self, self.inputs)
+
+    def to_html(self, file: str | Path) -> None:
+        """Write the ranges and plots of the signals as one page.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        write_page(file, self.name, self._repr_html_(), self.plot, self.name)
+
 
 def _check_arrays(
     time_min: Any, signals: Mapping[str, Any], process: ProcessLike | None, about: Mapping[str, Any]
@@ -137,7 +177,7 @@ def read_record(
         file: a table (`.csv`, `.xlsx`, `.parquet` and others), a recording (`.mcap`), a folder of recordings, several
             files in a row, or a data frame (pandas, polars, Arrow).
         process: decides which signals the file must have, and how it is read; the functions that take the record use
-            it. None: the reactor.
+            it. None: the one that a recording describes, else the reactor.
         plant: name of the plant in a recording; None: the only one in it.
         columns: names of the columns in a table, by signal, where they differ.
         form: what is not to be guessed about a table: `time`, `time_unit`, `time_format`, `zone`, `period`, `missing`,
@@ -156,12 +196,16 @@ def read_record(
     missing = form.pop("missing", ())
     words = (missing,) if isinstance(missing, str | float | int) else missing
     stated = FileFormat(**form, missing=tuple(map(str, words)))
-    described = find_process() if process is None else find_process(process)
+    names = dict(columns or {})
     if hasattr(file, "__arrow_c_stream__") or hasattr(file, "__dataframe__"):
-        read = [_read_frame(file, described, dict(columns or {}), stated)]
+        described = find_process(process or DEFAULT_PROCESS)
+        read = [_read_frame(file, described, names, stated)]
     else:
-        files = [file] if isinstance(file, str | Path) else file
-        read = [read_file(Path(item), plant, dict(columns or {}), described, stated) for item in files]
+        files = [Path(item) for item in ([file] if isinstance(file, str | Path) else file)]
+        described = described_process(files[0], plant) if process is None else find_process(process)
+        read = [read_file(item, plant, names, described, stated) for item in files]
+    if process is None and described.name != DEFAULT_PROCESS:
+        process = described  # as the recording has it
     return Record(**measured_fields(join_files(read)), process=process)
 
 
@@ -186,9 +230,26 @@ def model_of(record: MeasuredRecord, process: ProcessLike | None) -> ProcessMode
     """Equations of the process of a record, their clock that of the record.
 
     Raises:
-        InputError: there is no such process, the file cannot be read, or the process has no equations.
+        InputError: there is no such process, its file cannot be read, it has no equations, or the record lacks a signal
+            of them.
     """
-    return find_process(process_of(record, process), record.zero_ns).require_model()
+    model = find_process(process_of(record, process), record.zero_ns).require_model()
+    check_signals(record, model)
+    return model
+
+
+def check_signals(record: MeasuredRecord, model: ProcessModel) -> None:
+    """Check that a record has the inputs and outputs of a model.
+
+    Raises:
+        InputError: it lacks one.
+    """
+    missing = [name for name in (*model.input_names, *model.output_names) if name not in record.columns]
+    if missing:
+        raise InputError(
+            f"{record.name}: must have the signals of {model.name}, {', '.join(missing)} missing, got "
+            f"{', '.join(record.columns) or 'none'}; read it with the process that it is of"
+        )
 
 
 def effects(process: ProcessLike = DEFAULT_PROCESS) -> tuple[Effect, ...]:

@@ -3,22 +3,27 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from plant_node.initial_state import complete_state
 from reactorwatch.api.records import ProcessLike, Record, measured_fields, model_of, process_of
+from reactorwatch.api.views.record import plot_record, record_html
 from reactorwatch.diagnosis.impossible_values import check_values
 from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
+from reactorwatch.notebook import html
 from reactorwatch.process import named_effects
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.record import join_runs
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class Rmse(NamedTuple):
@@ -39,13 +44,30 @@ class Simulation(Record):
 
     Attributes:
         rmse: difference from the record, by output.
+        measured: the record; None: unknown.
     """
 
     rmse: Mapping[str, Rmse] = field(default_factory=dict)
+    measured: MeasuredRecord | None = field(default=None, repr=False)
 
-    def __init__(self, rmse: Mapping[str, Rmse], **about: Any) -> None:
+    def __init__(self, rmse: Mapping[str, Rmse], measured: MeasuredRecord | None = None, **about: Any) -> None:
         super().__init__(**about)
         object.__setattr__(self, "rmse", rmse)
+        object.__setattr__(self, "measured", measured)
+
+    def _repr_html_(self) -> str:
+        rows = [(name, f"{item.value:.3g} {item.unit}") for name, item in self.rmse.items()]
+        return record_html(self) + html.table(("output", "root mean square difference from the record"), rows)
+
+    def plot(self) -> "Figure":
+        """Plot the measured and the simulated signals.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        if self.measured is None:
+            return super().plot()
+        return plot_record(self.measured, self.inputs, self)
 
 
 def simulate(record: MeasuredRecord, process: ProcessLike | None = None, faults: Sequence[str] = ()) -> Simulation:
@@ -65,7 +87,7 @@ def simulate(record: MeasuredRecord, process: ProcessLike | None = None, faults:
     model = model_of(record, process)
     simulated = simulate_along(record, model, list(faults))
     rmse = root_mean_squares(record, simulated, model)
-    return Simulation(rmse, **measured_fields(simulated), process=process_of(record, process))
+    return Simulation(rmse, record, **measured_fields(simulated), process=process_of(record, process))
 
 
 def root_mean_squares(measured: MeasuredRecord, simulated: MeasuredRecord, model: ProcessModel) -> dict[str, Rmse]:

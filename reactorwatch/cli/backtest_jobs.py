@@ -12,6 +12,7 @@ import numpy as np
 
 from monitor_node.config import DEFAULT_TRAINING_ROWS, MonitorConfig
 from monitor_node.replay.backtest import Backtest, TrainedPlant, run, train
+from monitor_node.replay.record_checks import check_training_record
 from monitor_node.replay.report_watch import watch
 from monitor_node.replay.row_log import LoggedRow, RowLog, rows_of_file
 from monitor_node.watched_process import WatchedProcess, limit_training, load_process, watch_process
@@ -112,11 +113,13 @@ class _Opened(NamedTuple):
         source: messages of the file.
         watched: settings and equations.
         process: process that was named, recorded or described by its columns; None: as the settings say.
+        still: inputs that never move, with the reason why they explain nothing.
     """
 
     source: MessageSource
     watched: WatchedProcess
     process: Process | None
+    still: dict[str, str]
 
 
 def choose_settings(settings: MonitorConfig, choice: ProcessChoice) -> ProcessChoice:
@@ -153,7 +156,7 @@ def train_on(file: Path, asked: BacktestOptions) -> TrainedPlant:
     Raises:
         InputError: as `run_job`; or the file has too few rows, or no output that can be watched.
     """
-    opened = _open(file, asked)
+    opened = _open(file, asked, learns=True)
     try:
         config, model = opened.watched
         return train(opened.source.messages, config, opened.source.zero_ns or 0, model)
@@ -167,13 +170,14 @@ def run_job(job: Job) -> JobResult:
     Raises:
         InputError: the file cannot be read or has no value of any output, or settings do not fit together.
     """
-    opened = _open(job.at, job.asked)
+    opened = _open(job.at, job.asked, learns=job.trained is None)
     source, (config, model) = opened.source, opened.watched
     first, log = FirstSamples(config.plant), RowLog() if job.asked.log_rows else None
     if job.asked.scheme == REPORT_SCHEME:
         result = _watch_by_report(job, opened, log)
     else:
         result = run(first.collect_samples(source.messages), config, source.zero_ns or 0, model, job.trained, log)
+    result.left_out = opened.still | result.left_out
     _check_watched(job.at, result)
     zero_ns = result.first_ns if source.zero_ns is None else source.zero_ns
     found = backtest_object(result, zero_ns, source.zero(result.first_ns), is_trained=job.trained is not None)
@@ -208,11 +212,17 @@ def _check_watched(file: Path, result: Backtest) -> None:
         raise InputError(f"{file}: there is no output to watch ({reasons})")
 
 
-def _open(file: Path, asked: BacktestOptions) -> _Opened:
+def _open(file: Path, asked: BacktestOptions, *, learns: bool) -> _Opened:
     """Open a file, and find the settings to watch it by.
 
+    Args:
+        file: path of the file.
+        asked: options of the back-test.
+        learns: True if the monitor is trained on the file.
+
     Raises:
-        InputError: the file or the process cannot be read, or settings do not fit together.
+        InputError: the file or the process cannot be read, settings do not fit together, or the file is none to learn
+            from.
     """
     plant = resolve_plant(check_recording(file), asked.plant)
     settings = msgspec.structs.replace(asked.settings, plant=plant)
@@ -223,10 +233,13 @@ def _open(file: Path, asked: BacktestOptions) -> _Opened:
     if choice.is_default:
         recorded = source.process if source.measured is None else None
         if recorded is None or recorded.name == cstr().name:
-            return _Opened(source, load_process(limit_training(settings, rows)), None)
-        return _Opened(source, watch_process(settings, recorded, rows), recorded)
+            return _Opened(source, load_process(limit_training(settings, rows)), None, {})
+        return _Opened(source, watch_process(settings, recorded, rows), recorded, {})
     process = choice.load(source.zero_ns or 0, on_bus=True)
-    return _Opened(source, watch_process(settings, process, rows), process)
+    watched, still = watch_process(settings, process, rows), dict[str, str]()
+    if source.measured is not None and learns:
+        still = check_training_record(source.measured, *watched)
+    return _Opened(source, watched, process, still)
 
 
 def _count_rows(messages: Iterable[Encoded], plant: str) -> tuple[int, Iterator[Encoded]]:

@@ -136,6 +136,7 @@ def backtest(
     tables = read_settings(config)
     flags: dict[str, Any] = {"plant": plant or DEFAULT_PLANT, "reference": reference}
     if choice.outputs:
+        choice.load()  # reports a column of two roles
         flags |= {"inputs": choice.inputs, "outputs": choice.outputs}
     flags |= training_flags(tables, training, training_rows)
     settings = section(MonitorConfig, "monitor", tables, flags)

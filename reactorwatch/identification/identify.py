@@ -194,10 +194,34 @@ class Identification(msgspec.Struct, frozen=True):
         return self.fit_percent
 
 
+@dataclass(frozen=True, eq=False)
+class HeldOutRun:
+    """A model on the held-out rows.
+
+    Attributes:
+        time: times of the rows, shape (rows,).
+        measured: the output, NaN where nothing was measured.
+        one_step: one-step-ahead prediction, NaN where there is none.
+        free: simulation, NaN where there is none, inf after it has diverged.
+    """
+
+    time: Array
+    measured: Array
+    one_step: Array
+    free: Array
+
+
 def identify(
     data: Dataset, form: ModelForm | None = None, validation: Dataset | None = None, settle: int = 0
 ) -> Identification:
-    """Fit a model to the first half of a data set and validate it on the second.
+    """Fit a model and validate it; see `identify_and_run`."""
+    return identify_and_run(data, form, validation, settle)[0]
+
+
+def identify_and_run(
+    data: Dataset, form: ModelForm | None = None, validation: Dataset | None = None, settle: int = 0
+) -> tuple[Identification, HeldOutRun]:
+    """Fit a model to the first half of a data set and validate it on the second; returns it with its run there.
 
     Args:
         data: the rows.
@@ -239,7 +263,7 @@ def identify(
     predicted[:settle] = np.nan
     y = held_out.output[:, 0]
     values, deviations = _coefficients(model, form, data)
-    return Identification(
+    found = Identification(
         model=form.model,
         order=form.order,
         delay=form.delay,
@@ -253,6 +277,7 @@ def identify(
         rmse=Rmse(_rmse(y, predicted), _rmse(y, run)) if validation is not None or settle else UNSET,
         **values,
     )
+    return found, HeldOutRun(held_out.time, y, predicted, run)
 
 
 def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out: Dataset, settle: int) -> None:

@@ -30,6 +30,7 @@ class EffectConstant:
         lower: smallest value that makes physical sense.
         upper: largest value that makes physical sense.
         meaning: a short description.
+        start_values: other values from which fits start.
     """
 
     name: str
@@ -39,6 +40,7 @@ class EffectConstant:
     lower: float
     upper: float
     meaning: str
+    start_values: tuple[float, ...] = ()
 
 
 class Effect(ABC):
@@ -155,9 +157,9 @@ class Effect(ABC):
 
     def prefix(self, model: ProcessModel) -> str:
         """Prefix of the names of the parameters and states that this effect adds to a model."""
-        taken = set(model.parameter_names)
+        taken = (*model.parameter_names, *model.state_names)
         prefix, number = self.name, 1
-        while f"{prefix}.size" in taken:
+        while any(name.startswith(f"{prefix}.") for name in taken):
             number += 1
             prefix = f"{self.name}_{number}"
         return prefix

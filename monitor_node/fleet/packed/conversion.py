@@ -127,7 +127,9 @@ class Conversion:
             model: process model of the plants; None: there is none.
         """
         step = RowStep.of(config, model)
-        if model is None or step is None or len(config.inputs) != 1:  # the ring keeps the levels of one input
+        if model is None or step is None:
+            return None
+        if len(config.inputs) != 1 or config.carried:  # the ring keeps the levels of one input, and no others
             return None
         form = Conversion(config, model, step)
         return form if form.keeps >= form.remembered else None

@@ -86,14 +86,16 @@ def describe_timing(cause: Cause, curves: Curves | None = None) -> str:
 
 
 def describe_size(cause: Cause, effects: Sequence[Effect]) -> str:
-    """Size of a cause in its unit and meaning with its 95 % interval, and the part of the profile it belongs to.
+    """Size of a cause with its 95 % interval, the part of the profile it belongs to, and constants of the effect.
 
     Args:
         cause: cause of an explanation.
         effects: the catalogue, which has its meaning.
     """
     of_what = {"ramp": " at the end", "decay": " in the end", "sine": " to either side", "free": " at its largest"}
-    return _describe_size(cause, effects) + of_what.get(cause.profile, "")
+    own = (item for effect in effects if effect.name == cause.cause for item in effect.constants)
+    constants = [f", {item.name} {format_interval(cause.parameters[item.name])}" for item in own]
+    return _describe_size(cause, effects) + of_what.get(cause.profile, "") + "".join(constants)
 
 
 def describe_explanation(causes: Sequence[Cause], effects: Sequence[Effect]) -> str:

@@ -22,7 +22,7 @@ from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvalu
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.knot_selection import fine_grid, select_knots
 from reactorwatch.diagnosis.fitting.outliers import find_gross_outliers, find_outliers, remove_outliers
-from reactorwatch.diagnosis.fitting.profiles import PiecewiseLinear, Signal
+from reactorwatch.diagnosis.fitting.profiles import LateSine, PiecewiseLinear, Signal, Sine
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.cause_prior import CausePrior
 from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
@@ -48,10 +48,16 @@ other noise levels, too. A curve with twelve knots that needs only three costs n
 ROUGH = 1e-3
 """Minimum error of a predicted gain, as a fraction of it: the equations are not linear."""
 
+SMALLEST_NOISE = 1e-3
+"""Lower bound of a sensor's noise as a fraction of the state's scale; files have so many digits."""
+
 LEAST_SENSOR_GAIN = 10.0
 """Minimum gain in BIC of coloured sensor noise."""
 
 ROUNDS = 5
+
+SINE_ONSETS = 24
+"""Onsets that are tried for a sine."""
 
 CONVERGED_NOISE = 10.0
 """Threshold in BIC: noise levels that gain less are not worth another round."""
@@ -285,7 +291,7 @@ class Search:
         return fine_grid(self.run.time_min)
 
     def with_selected_knots(self, item: FittedHypothesis, steps: int = MOST_STEPS) -> FittedHypothesis:
-        """Refit piecewise-linear profiles with the number of knots that they need."""
+        """Refit piecewise-linear profiles with the number of knots that they need, and sines that set in later."""
         hypothesis = item.hypothesis
         for index, profile in enumerate(hypothesis.profiles):
             if not isinstance(profile, PiecewiseLinear) or index == hypothesis.filter.delay_index:
@@ -295,6 +301,23 @@ class Search:
             if profiles[index].n_linear != profile.n_linear:
                 other = self.fit(Hypothesis(hypothesis.filter, profiles), parameters, steps, scan=False)
                 item = min(item, other, key=lambda item: item.bic)
+        return self._with_late_sines(item, steps)
+
+    def _with_late_sines(self, item: FittedHypothesis, steps: int) -> FittedHypothesis:
+        """Refit sines with an onset, where they gain by setting in later."""
+        for index, profile in enumerate(item.hypothesis.profiles):
+            if type(profile) is not Sine:
+                continue
+            late, profiles = LateSine(self.run.time_min), list(item.hypothesis.profiles)
+            profiles[index] = late
+            hypothesis = Hypothesis(item.hypothesis.filter, profiles)
+            onsets = late.start_min + self.run.span_min * np.linspace(0.0, 0.9, SINE_ONSETS + 1)[1:]
+            tried = [list(item.fit.parameters) for _ in onsets]
+            for parameters, onset in zip(tried, onsets.tolist(), strict=True):
+                parameters[index] = late.from_sine(parameters[index], onset)
+            first = min(hypothesis.evaluate_all(self.run, tried), key=lambda fit: fit.loss)
+            if first.loss < item.fit.loss:
+                item = min(item, self.fit(hypothesis, first.parameters, steps, scan=False), key=lambda each: each.bic)
         return item
 
     def _sort(self, candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -343,8 +366,8 @@ class Search:
         """Return true if a candidate with the best's cause and profile starts far from its fit."""
         if not candidate.profile.nonlinear_parameters:
             return False
-        parameters = best.fit.parameters[0]
-        apart = np.abs(candidate.parameters - parameters)[candidate.profile.n_linear :]
+        shape = slice(candidate.profile.n_linear, candidate.profile.n_shape)
+        apart = np.abs(candidate.parameters[shape] - best.fit.parameters[0][shape])
         return bool(np.any(apart > _NEAR * candidate.profile.difference_steps))
 
     def refit(self, fitted: FittedHypothesis) -> FittedHypothesis:
@@ -369,7 +392,8 @@ class Search:
 
     def score_fit(self, hypothesis: Hypothesis, fit: Fit) -> FittedHypothesis:
         """BIC of an existing fit."""
-        bic = 2.0 * fit.loss + hypothesis.n_parameters * log(self.run.values)
+        charged = hypothesis.n_parameters - len(hypothesis.constant_indices)
+        bic = 2.0 * fit.loss + charged * log(self.run.values) + hypothesis.constants_evidence(self.run, fit)
         return FittedHypothesis(hypothesis, fit, bic + self.prior.cost(hypothesis))
 
 
@@ -397,3 +421,9 @@ def _least_score(candidate: Candidate) -> float:
 
 def _label(candidate: Candidate) -> Label:
     return ((candidate.effect.name, candidate.profile.name),)
+
+
+def smallest_noise(model: ProcessModel) -> list[float]:
+    """Lower bound of each sensor's noise."""
+    scales = {state.name: state.scale for state in model.states}
+    return [SMALLEST_NOISE * scales.get(output.name, 1.0) for output in model.outputs]

@@ -146,12 +146,12 @@ def _has_feedthrough(model: ProcessModel) -> bool:
     return any(ca.depends_on(output.expression, model.arguments()[1]) for output in model.outputs)
 
 
-def bic_on(fitted: FittedHypothesis, known: NDArray[np.bool_], run: Run) -> float:
+def bic_on(fitted: FittedHypothesis, known: NDArray[np.bool_]) -> float:
     """BIC of a hypothesis of the catalogue, by some of the values alone."""
     w, sd = fitted.fit.w, fitted.fit.innovations.conditional_sd
     counted = known & np.isfinite(w) & np.isfinite(sd)
     logs = float(np.sum(np.log(np.where(counted, sd, 1.0))))
-    return 2.0 * (huber_loss(np.where(counted, w, 0.0)) + logs) + fitted.hypothesis.n_parameters * log(run.values)
+    return 2.0 * (huber_loss(np.where(counted, w, 0.0)) + logs - fitted.fit.loss) + fitted.bic
 
 
 def _reference(model: ProcessModel, run: Run, nominal: Fit) -> ReferenceTrajectory:

@@ -31,6 +31,15 @@ def test_a_simulation_with_the_stated_causes_leaves_the_noise(name: str) -> None
         assert 0.9 * sd < rmse < 1.2 * sd, f"{signal}: {rmse:g}"
 
 
+@pytest.mark.parametrize("name", ["leak", "fouling", "analyser_drift"])
+def test_a_backtest_names_the_hidden_cause_and_contains_no_error_of_this_software(name: str) -> None:
+    record, truth = make_example(name, SEED)
+    result = rw.backtest(record)
+    assert "error of this software" not in result.text
+    (cause,) = truth["causes"]
+    assert cause["cause"] in {item.cause for alarm in result.alarms for item in alarm.suspect[:1]}
+
+
 def test_the_unknown_law_cools_the_contents_where_they_are_hot() -> None:
     record, truth = make_example("unknown", SEED)
     simulated = rw.simulate(record).columns["T"]

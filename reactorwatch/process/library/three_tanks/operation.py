@@ -31,5 +31,5 @@ OPERATION = Operation(
         for pump, flow in BASE_FLOWS_CM3_S.items()
     },
     noise_sd={"h1": 0.05, "h2": 0.05, "h3": 0.05},
-    fault="leak1:step:0.2",
+    fault="leak1:step:0.05",
 )

@@ -106,6 +106,9 @@ def to_version_3(fields: dict[str, Any]) -> None:
             (reference[name],) = reference[name]
     if reference:
         reference.pop("uses_inputs", None)
+    suspicion = fields["watch"]["watched"] and fields["watch"]["watched"]["suspicion"]
+    if suspicion and suspicion["reconstruction"]:
+        (suspicion["reconstruction"]["last_input"],) = suspicion["reconstruction"].pop("last_inputs")
     if reference and "last_inputs" in reference:
         (reference["last_input"],) = reference.pop("last_inputs")
 

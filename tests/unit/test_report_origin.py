@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 
 import reactorwatch
-from reactorwatch.cli.report_origin import report_origin
+from reactorwatch.api.report_origin import report_origin
 from reactorwatch.diagnosis.report.page import as_page
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
