@@ -103,7 +103,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             the deviations that it had from the start.
         reference: model that predicts the rows: `equations`, the filter of the process's equations (older: `process`);
             `black-box`, a state map learned from the training, for few signals; `arx`, the identified model as fitted
-            to the training; `auto`, the first of these that predicts the training about as well as the last.
+            to the training; `auto`, the first of these that predicts the training about as well as the last (without
+            inputs no black box).
         process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
             nominal reactor where its signals are watched; empty: no equations judge.
         charts: charts of the residuals.

@@ -419,6 +419,11 @@ class Monitor:
         return self._watching_since_ns
 
     @property
+    def unjudged_rows(self) -> int:
+        """Number of rows that were not judged, see `PlantPipeline.unjudged_rows`."""
+        return self.pipeline.unjudged_rows
+
+    @property
     def expected_false_alarms(self) -> float:
         """Mean number of false alarms expected so far."""
         return self.pipeline.expected_false_alarms

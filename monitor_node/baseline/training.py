@@ -42,6 +42,10 @@ MOST_ROWS = 10_000
 FEWEST_ROWS = 50
 """Least number of residuals; the training continues until there are as many."""
 
+FEWEST_FAMILIAR_ROWS = 200
+"""Least number of rows of a training after which `auto` takes a black box: after fewer, too many values of the inputs
+are unfamiliar to it, and it judges too few rows."""
+
 MOST_REFUSALS = 2
 
 Residuals: TypeAlias = tuple[Array, list[float]]
@@ -227,12 +231,12 @@ class Training:
                 name="training", result=refused or _screening_summary(outputs, time_min, screenings, evaluated) or "ok"
             )
         ]
-        if isinstance(reference, ArxReference):
-            checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         if isinstance(reference, BlackBoxReference) and reference.weakness:
             checks.append(Check(name=reference.kind, result=reference.weakness))
-        if self._without_black_box:
+        if self._without_black_box and self._config.reference == "black-box":
             checks.append(Check(name=BlackBoxReference.kind, result=f"the ARX models judge: {self._without_black_box}"))
+        if isinstance(reference, ArxReference):
+            checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
         return TrainingResult(reference, learned, e, np.where(usable, measured, np.nan), checks, refused, left_out)
 
@@ -275,10 +279,14 @@ class Training:
             residuals = z * np.array(reference.typical_sd)
             if self._config.reference == "equations" or _predicts_as_well(residuals, identified):
                 return reference, z, judged
-        black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
+        black_box = None
+        is_driven = bool(inputs.shape[1] and has_values.all())  # without inputs there is nothing to simulate
+        is_long = len(time_min) >= FEWEST_FAMILIAR_ROWS
+        if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven and is_long):
+            black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
         if black_box is not None:
-            residuals = black_box[1] * np.array(black_box[0].typical_sd)
-            if self._config.reference == "black-box" or _predicts_as_well(residuals, identified):
+            residuals, is_sure = black_box[1] * np.array(black_box[0].typical_sd), not black_box[0].weakness
+            if self._config.reference == "black-box" or (is_sure and _predicts_as_well(residuals, identified)):
                 return black_box
         return self._arx_reference(given_inputs), identified, screenings
 
@@ -299,10 +307,8 @@ class Training:
     def _black_box(
         self, time_min: Array, inputs: Array, outputs: Array, smallest: list[float], steps: list[float]
     ) -> tuple[BlackBoxReference, Array, list[Screening]] | None:
-        """Black box as reference; None if the settings exclude it, or the signals are too many or the rows too few."""
+        """Black box as reference; None if the signals are too many or the rows too few."""
         self._without_black_box = ""
-        if self._config.reference not in ("auto", "black-box"):
-            return None
         learned: list[BlackBoxReference] = []
 
         def innovations(rows: Array) -> Residuals:

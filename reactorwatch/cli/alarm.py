@@ -1,6 +1,5 @@
 """`alarm`: an operator's commands for alarms of the running monitor, and of the recorder for its own."""
 
-import contextlib
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reactorwatch.cli.command_client import TIMEOUT_S, NoReplyError, send_command
+from reactorwatch.cli.command_client import TIMEOUT_S, LateReplyError, NoReplyError, send_command
 from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Settings, check_encodable
 from reactorwatch.cli.printing import print_lines
 from reactorwatch.contract.keys import ACKNOWLEDGE_RECORDER, LIST_RECORDER_ALARMS, RECORDING
@@ -109,8 +108,12 @@ def _list(config: Path | None, endpoint: str | None, name: str | None, timeout: 
     from reactorwatch.contract.messages_pb2 import ListAlarms
 
     listed = list(send_command(MONITOR, config, endpoint, name, timeout, "list_alarms", ListAlarms()).alarms)
-    with contextlib.suppress(NoReplyError):  # a plant may be watched and not be recorded
+    try:
         listed += send_command(RECORDER, config, endpoint, name, timeout, LIST_RECORDER_ALARMS, ListAlarms()).alarms
+    except LateReplyError as late:
+        typer.echo(f"the alarms of the recorder are missing: {late}", err=True)
+    except NoReplyError:
+        pass  # a plant may be watched and not be recorded
     return listed
 
 

@@ -6,14 +6,18 @@ noise of the measurements, uncertainty of the state, and uncertainty of the para
 At a set point that the training has not seen the first rows have wide limits and teach; the errors of a parameter are
 the same in many rows, and only a filter that learns them makes the innovations independent, as charts need them.
 
-A row whose standard deviation is above `UNSEEN` times that of the training is not judged: there the model is an
-extrapolation. While learning is off the uncertainty of the parameters stays in the variances (a consider filter:
-Schmidt 1966), and they are not corrected. Their covariance grows by 1 / `MEMORY` a row, but not beyond that of the
-training on average: so rows are forgotten, and the uncertainty stays bounded without excitation.
+A row whose standard deviation is above `UNSEEN` times that of the training is an extrapolation. After an input took an
+unfamiliar value it is not judged, until `SETTLED` rows in succession are none. With familiar inputs the plant should
+not be there: such a row is judged with that limit as its standard deviation, and teaches nothing.
 
-The numbers of a filter are one vector, its belief: learning flag, past inputs, state, parameters, covariance of state
-and parameters. A row is one compiled function of the belief; constants and results are laid out as in
-`reactorwatch.kalman.ekf_step`, so one step of the monitor serves both.
+While learning is off the uncertainty of the parameters stays in the variances (a consider filter: Schmidt 1966), and
+they are not corrected. Their covariance grows by 1 / `MEMORY` a row, but not beyond that of the training on average: so
+rows are forgotten, and the uncertainty stays bounded without excitation.
+
+The numbers of a filter are one vector, its belief: learning flag, flag of unfamiliar inputs, rows since they settled,
+flags of familiar values of each input, past inputs, state, parameters, covariance of state and parameters. A row is one
+compiled function of the belief; constants and results are laid out as in `reactorwatch.kalman.ekf_step`, so one step of
+the monitor serves both.
 """
 
 from collections.abc import Sequence
@@ -30,7 +34,16 @@ from reactorwatch.identification.black_box.state_map import evaluate, predict_ou
 from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
 
 UNSEEN = 1.3
-"""Ratio of the standard deviation of an innovation to that of the training beyond which a row is not judged."""
+"""Ratio of the standard deviation of an innovation to that of the training beyond which a row is an extrapolation."""
+
+SETTLED = 25
+"""Rows in succession that are no extrapolation after which the values of the inputs are familiar."""
+
+BINS, BIN_WIDTH = 64, 0.25
+"""Intervals of the values of an input that are familiar or not, and their width in its standard deviations."""
+
+FLAGS = 3
+"""Numbers at the start of a belief: learning flag, flag of unfamiliar inputs, rows since they settled."""
 
 MEMORY = 10_000
 """Rows after which a row is forgotten."""
@@ -39,6 +52,12 @@ HEAD = 7
 """Numbers before the arrays in the constants: outputs, inputs, lags, delay, terms, degree, rate of forgetting."""
 
 FAILED, UNJUDGED, JUDGED = -1.0, 0.0, 1.0
+
+
+@jit
+def bin_of(value: float) -> int:
+    """Index of the interval of a scaled input."""
+    return int(min(max(np.floor(value / BIN_WIDTH) + BINS // 2, 0.0), BINS - 1.0))
 
 
 @jit
@@ -52,7 +71,7 @@ def filter_row(
     """Filter a row; returns `FAILED`, `UNJUDGED` or `JUDGED`.
 
     Args:
-        belief: learning flag, past inputs (newest first), state, parameters, covariance.
+        belief: flags, familiar values, past inputs (newest first), state, parameters, covariance.
         given: inputs of the row before, inputs, time and two step lengths (not used), measured values, limits: numbers
             of standard deviations beyond which a value does not correct the filter.
         constants: see `constants_of`.
@@ -76,9 +95,13 @@ def filter_row(
     at += terms * degree
     training = constants[at : at + p * terms]
     after[:] = belief
-    inputs, x = after[1 : 1 + past], after[1 + past : 1 + past + n_x]
-    theta = after[1 + past + n_x : 1 + past + size].reshape((p, terms))
-    P = after[1 + past + size :].reshape((size, size))
+    at = FLAGS + m * BINS
+    inputs, x = after[at : at + past], after[at + past : at + past + n_x]
+    theta = after[at + past + n_x : at + past + size].reshape((p, terms))
+    P = after[at + past + size :].reshape((size, size))
+    for i in range(n_u):
+        if after[FLAGS + (i % m) * BINS + bin_of(inputs[past - n_u + i])] == 0.0:
+            after[1], after[2] = 1.0, 0.0
     signals, values, slopes = np.empty(n_x + n_u), np.empty(terms), np.empty((terms, n_x))
     predicted, jacobian, moved = np.empty(p), np.empty((p, n_x)), np.zeros((p, size))
     signals[:n_x] = x
@@ -123,18 +146,33 @@ def filter_row(
             for a in range(n_x, size):
                 for b in range(n_x, size):
                     P[a, b] += constants[6] * P[a, b]
-    measured, limits, verdict = given[2 * m + 3 : 2 * m + 3 + p], given[2 * m + 3 + p :], JUDGED
+    measured, limits, is_within = given[2 * m + 3 : 2 * m + 3 + p], given[2 * m + 3 + p :], True
     for j in range(p):
         variance = P[j, j] + r[j]
         if not (P[j, j] > 0.0 and variance < inf and abs(x[j]) < inf):
             results[5 * p] = FAILED
             return FAILED
+        sd = np.sqrt(variance)
+        if sd > limit_sd[j]:
+            is_within = False
+            if after[1] == 0.0:
+                sd = limit_sd[j]
         results[j] = centres[j] + spreads[j] * x[j]
         results[p + j] = measured[j] - results[j]
-        results[2 * p + j] = results[4 * p + j] = spreads[j] * np.sqrt(variance)
+        results[2 * p + j] = results[4 * p + j] = spreads[j] * sd
         results[3 * p + j] = results[p + j] / results[2 * p + j]
-        if not np.sqrt(variance) <= limit_sd[j]:
+    verdict = JUDGED
+    if after[1] != 0.0:
+        if not is_within:
             verdict = UNJUDGED
+        after[2] = after[2] + 1.0 if is_within else 0.0
+        if after[2] >= SETTLED:
+            after[1] = 0.0
+            if learns:
+                for i in range(n_u):
+                    after[FLAGS + (i % m) * BINS + bin_of(inputs[past - n_u + i])] = 1.0
+    elif not is_within:
+        learns = False
     column, end = np.empty(size), size if learns else n_x
     for j in range(p):
         value = (measured[j] - centres[j]) / spreads[j]
@@ -202,7 +240,8 @@ class BlackBoxFilter:
         self._shape, self._p, self._m = shape, shape.outputs, shape.inputs
         self._past, self._size = shape.past * shape.inputs, shape.states + shape.parameters
         self.constants = constants_of(model)
-        self.belief: Array = np.zeros(1 + self._past + self._size + self._size**2)
+        self._first = FLAGS + self._m * BINS
+        self.belief: Array = np.zeros(self._first + self._past + self._size + self._size**2)
         self.belief[0] = 1.0
         self._theta, self._P = self._views()
         self._after = np.empty_like(self.belief)
@@ -213,9 +252,9 @@ class BlackBoxFilter:
         self.reset_parameters()
 
     def _views(self) -> tuple[Array, Array]:
-        first = 1 + self._past + self._shape.states
+        first = self._first + self._past + self._shape.states
         theta = self.belief[first : first + self._shape.parameters]
-        return theta, self.belief[1 + self._past + self._size :].reshape(self._size, self._size)
+        return theta, self.belief[self._first + self._past + self._size :].reshape(self._size, self._size)
 
     @property
     def learning(self) -> bool:
@@ -300,8 +339,10 @@ class BlackBoxFilter:
         centres, spreads = np.array(self.model.centres), np.array(self.model.spreads)
         rows = (np.array(self._first_rows[::-1]) - centres) / spreads
         n_x = shape.states
-        self.belief[1 : 1 + self._past] = rows[:, p:].ravel()
-        self.belief[1 + self._past : 1 + self._past + n_x] = rows[: shape.lags, :p].ravel()
+        first = self._first + self._past
+        self.belief[self._first : first] = rows[:, p:].ravel()
+        self.belief[first : first + n_x] = rows[: shape.lags, :p].ravel()
+        self.belief[1:FLAGS] = 0.0
         self._P[:n_x], self._P[:, :n_x] = 0.0, 0.0
         self._P[range(n_x), range(n_x)] = np.tile(self.model.r, shape.lags)
         self._first_rows.clear()
@@ -325,6 +366,10 @@ class BlackBoxFilter:
         self.reset_parameters((theta, np.zeros_like(covariance)))
         self.learning = False
         self.limit_sd = np.full(self._p, inf)
+        p, centres, spreads = self._p, self.model.centres, self.model.spreads
+        for i, column in enumerate(inputs.T):
+            for value in column[np.isfinite(column)].tolist():
+                self.belief[FLAGS + i * BINS + bin_of((value - centres[p + i]) / spreads[p + i])] = 1.0
         residuals, sds = np.full(outputs.shape, nan), np.full(outputs.shape, nan)
         unlimited = [inf] * self._p
         for k, (row_inputs, values) in enumerate(zip(inputs.tolist(), outputs.tolist(), strict=True)):

@@ -8,7 +8,14 @@ import pytest
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification.black_box.filter import BlackBoxFilter, BlackBoxState, constants_of, filter_row
+from reactorwatch.identification.black_box.filter import (
+    BINS,
+    FLAGS,
+    BlackBoxFilter,
+    BlackBoxState,
+    constants_of,
+    filter_row,
+)
 from reactorwatch.identification.black_box.fit import MOST_PARAMETERS, fit_black_box, largest_shapes, row_kinds
 from reactorwatch.identification.black_box.model import BlackBoxModel
 from reactorwatch.identification.black_box.prediction_error import NEXT, START, prediction_errors
@@ -85,10 +92,10 @@ def test_a_row_is_filtered_as_by_the_textbook_equations_of_state_and_parameters(
     theta, covariance = black_box.parameters
     shape, m = model.shape, 1
     n_x, p = shape.states, 2
-    past = shape.past * m
-    x = black_box.belief[1 + past : 1 + past + n_x].copy()
-    P = black_box.belief[1 + past + n_x + theta.size :].reshape(n_x + theta.size, -1).copy()
-    signals_u = black_box.belief[1 : 1 + past].copy()
+    first, past = FLAGS + BINS * m, shape.past * m
+    x = black_box.belief[first + past : first + past + n_x].copy()
+    P = black_box.belief[first + past + n_x + theta.size :].reshape(n_x + theta.size, -1).copy()
+    signals_u = black_box.belief[first : first + past].copy()
     products = shape.products()
 
     def step(z: Array) -> Array:
@@ -152,6 +159,16 @@ def test_the_first_rows_of_an_unseen_point_are_not_judged_and_teach() -> None:
     _, judged = innovations(black_box, new_inputs, simulate(new_inputs, 8))
     assert not any(judged[2:6])
     assert all(judged[-20:])
+
+
+def test_a_plant_that_leaves_its_region_with_familiar_inputs_is_judged() -> None:
+    model, inputs, outputs = trained()
+    black_box = BlackBoxFilter(model)
+    black_box.run(inputs, outputs, following(TRAINING))
+    far = simulate(inputs[:200], 9) + np.linspace(0.0, 8.0, 200)[:, None]
+    z, judged = innovations(black_box, inputs[:200], far)
+    assert np.mean(judged) > 0.97
+    assert np.abs(z[-20:]).max() > 6.0
 
 
 def test_without_learning_the_parameters_stay_and_their_uncertainty_remains() -> None:
@@ -237,6 +254,6 @@ def test_a_filter_that_is_not_finite_fails_and_changes_nothing() -> None:
     model, _, _ = trained()
     constants = constants_of(model)
     black_box = BlackBoxFilter(model)
-    black_box.belief[1 + model.shape.past] = inf
+    black_box.belief[FLAGS + BINS + model.shape.past] = inf
     after, results = np.empty_like(black_box.belief), np.empty(11)
     assert filter_row(black_box.belief, np.zeros(9), constants, after, results) < 0.0
