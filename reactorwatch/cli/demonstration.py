@@ -7,6 +7,7 @@ the alarms, a comparison with the alarms of a back-test, value for value, and a 
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +22,9 @@ from reactorwatch.cli.bus_settings import (
     restrict_to_plant,
     write_node_settings,
 )
+from reactorwatch.cli.display import format_age, print_report
 from reactorwatch.cli.plant_settings import WAIT_FOR, complete_plant_settings
-from reactorwatch.cli.printing import print_lines, print_text
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.processes import Processes, settings_text
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.run_progress import POLL_S, RunProgress
@@ -31,7 +33,9 @@ from reactorwatch.contract.codec import decode
 from reactorwatch.contract.messages_pb2 import Alarm, Fault, Sample
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
+from reactorwatch.diagnosis.result import NAMED, Diagnosis
 from reactorwatch.errors import InputError
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import make_folder
@@ -217,8 +221,11 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     def minutes(time_ns: int) -> str:
         return f"{to_minutes(time_ns, first_ns):.1f} min"
 
+    delay_s = None if onset_ns is None or not after else (after[0].time_ns - onset_ns) / 1e9
     lines = [
         "# What happened",
+        "",
+        headline(delay_s, diagnosis, case.effects),
         "",
         f"- Fault injected: `{fault}`, set in at {minutes(onset_ns)}."
         if onset_ns is not None
@@ -255,11 +262,31 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         "",
     ]
     text = printable_lines(lines)
-    print_text(text)
+    print_report(text)
     with atomic_write(folder / "summary.md") as temporary:
         temporary.write_text(text, encoding="utf-8")
     print_lines(f"All of it is in {folder}")
     return 0 if after and not before and same else 1
+
+
+def headline(delay_s: float | None, diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
+    """Delay of the detection, and the cause that the diagnosis names, in a sentence.
+
+    Args:
+        delay_s: seconds of plant time from the fault to the first alarm; None: there was none.
+        diagnosis: diagnosis of the recording.
+        effects: possible causes.
+    """
+    detected = "Not detected" if delay_s is None else f"Detected after {format_age(delay_s)}"
+    catalogue = {effect.name: effect for effect in effects}
+    causes = [
+        f"{cause.label}, {catalogue[cause.cause].describe(cause.parameters['size'].value)}"
+        for cause in diagnosis.causes
+        if cause.cause in catalogue
+    ]
+    if diagnosis.verdict == NAMED and causes:
+        return f"{detected}; cause named: {' and '.join(causes)}."
+    return f"{detected}; no single cause named: the diagnosis is {diagnosis.verdict}."
 
 
 def _program(name: str) -> str:
