@@ -58,7 +58,7 @@ def print_rows(rows: Iterable[Row], indent: int = 0) -> None:
         typer.echo(text)
 
 
-def print_formatted(text: str) -> None:
+def print_screen_text(text: str) -> None:
     """Print what a function of this module has formatted, in which all texts are printable."""
     typer.echo(text)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from reactorwatch.cli.alarm_rows import ANNUNCIATED, Now, age_s, sort_alarms
-from reactorwatch.cli.display import has_colour, print_formatted, screen_width
+from reactorwatch.cli.display import has_colour, print_screen_text, screen_width
 from reactorwatch.cli.status_view import format_plant
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import priority_word, state_word
@@ -200,7 +200,7 @@ def run(
             if once or as_json:
                 stopped.wait(listen_s)
                 _query_alarms(bus, board)
-                print_formatted(_text(board, as_json=as_json))
+                print_screen_text(_text(board, as_json=as_json))
             else:
                 _show(bus, board, stopped)
         finally:
