@@ -106,7 +106,18 @@ def test_live_resumed_replayed_and_back_tested_alarms_are_the_same(
 ) -> None:
     """And each output is watched, or named with the reason."""
     plant = linear_plant(inputs, outputs, seed, missing)
-    config, messages = plant.config(), plant.messages()
+    check_equality(plant, plant.config(reference="arx"), stopped)
+
+
+@pytest.mark.parametrize("inputs", [0, 2])
+def test_with_a_black_box_they_are_the_same_too(inputs: int) -> None:
+    plant = linear_plant(inputs, 2, seed=7)
+    check_equality(plant, plant.config(), stopped=0.6)
+
+
+def check_equality(plant: Plant, config: MonitorConfig, stopped: float) -> None:
+    """Alarms live, resumed at a share of the samples, replayed and back-tested."""
+    messages = plant.messages()
     monitor = Monitor(config, START_NS)
     published = live(monitor, messages) + monitor.finish()
     before, resumed, last = Monitor(config, START_NS), Monitor(config, START_NS), int(stopped * len(messages))
@@ -164,7 +175,7 @@ def test_an_input_that_says_nothing_hinders_no_watch(kind: str) -> None:
         "rare": np.where(np.arange(ROWS) % 20, np.nan, u),
         "gone": np.where(np.arange(ROWS) > 20, np.nan, u),
     }[kind]
-    monitor = Monitor(plant.config(), START_NS)
+    monitor = Monitor(plant.config(reference="arx"), START_NS)
     published = live(monitor, plant.messages()) + monitor.finish()
     assert monitor.failures.by_stage == {}
     assert not set(plant.outputs) & set(monitor.excluded_signals)
