@@ -78,6 +78,7 @@ def report(measured: Record, simulated: Record, model: ProcessModel, out: Path |
         as_json: format as a JSON object.
     """
     rmse, units = {}, model.units
+    remarks = [sentence for law in model.laws for sentence in law.outside(simulated.columns)]
     for name in model.output_names:
         difference = simulated.columns[name] - measured.columns[name]
         rmse[name] = float(np.sqrt(np.nanmean(difference**2)))
@@ -87,9 +88,10 @@ def report(measured: Record, simulated: Record, model: ProcessModel, out: Path |
             "rows": measured.rows,
             "runs": len(measured.run_starts),
             "rmse": {name: {"value": value, "unit": units[name]} for name, value in rmse.items()},
+            **({"remarks": remarks} if model.laws else {}),
         }
         return msgspec.json.encode(result).decode()
     parts = ", ".join(f"{name} {value:.3g} {units[name]}" for name, value in rmse.items())
     written = "not written" if out is None else f"wrote {out}"
     line = f"{written}: {measured.rows} rows; root mean square difference from the record: {parts}"
-    return "\n".join([line, *(f"note: {remark}" for remark in measured.remarks)])
+    return "\n".join([line, *(f"note: {remark}" for remark in [*measured.remarks, *remarks])])
