@@ -1,6 +1,8 @@
+# Two images: `docker build --target nodes .` for plant, monitor and recorder, which never draw; `docker build .` for all
+# commands, a third larger by the viewer.
 # Pinned by version; `docs/deployment.md` has the command that gives the digest, to be put behind it as @sha256:...
 ARG PYTHON_IMAGE=python:3.13.9-slim-trixie
-FROM ${PYTHON_IMAGE}
+FROM ${PYTHON_IMAGE} AS nodes
 
 # A home of its own: compiled kernels and models are kept there. /recordings, /state and the cache are made here so that
 # new volumes belong to the user; nothing else is written to, so the root may be read-only.
@@ -10,7 +12,9 @@ ENV NUMBA_CACHE_DIR=/home/reactorwatch/.cache/numba
 
 WORKDIR /app
 COPY deploy/requirements.lock ./
-RUN pip install --no-cache-dir --require-hashes -r requirements.lock
+# The lock without rerun-sdk: its line, and those of its hashes.
+RUN sed '/^rerun-sdk==/,/[^\\]$/d' requirements.lock > nodes.lock
+RUN pip install --no-cache-dir --require-hashes -r nodes.lock
 COPY pyproject.toml README.md LICENSE ./
 COPY reactorwatch ./reactorwatch
 COPY plant_node ./plant_node
@@ -25,3 +29,8 @@ WORKDIR /home/reactorwatch
 RUN reactorwatch compile
 STOPSIGNAL SIGTERM
 ENTRYPOINT ["reactorwatch"]
+
+FROM nodes AS full
+USER root
+RUN pip install --no-cache-dir --require-hashes -r /app/requirements.lock
+USER reactorwatch

@@ -1,14 +1,15 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench faults study kills cuts fuzz soak pictures protobuf lock clean
+.PHONY: help setup demo test lint bench faults promise study kills cuts fuzz soak outside pictures docs examples protobuf lock clean
 
 PYTHON ?= python3
 BIN := .venv/bin
 # keep bytecode: without it each process that tests start compiles every module again
 unexport PYTHONDONTWRITEBYTECODE
 # each has a target of its own
-LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py)
+LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py false_alarms.py)
 READY := .venv/.ready
+DOCS_READY := .venv/.docs-ready
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / \t/' | expand -t 12
@@ -46,6 +47,9 @@ bench: $(READY) ## speed, as ratios measured in one run
 faults: $(READY) ## detection delays on a bank of faults, beside an oracle and the report's method: most of an hour
 	@$(BIN)/python benchmarks/fault_bank.py --write docs/fault_bank.md
 
+promise: $(READY) ## false alarms of 80 runs without a fault beside the number promised: two minutes
+	@$(BIN)/python benchmarks/false_alarms.py
+
 study: $(READY) ## the diagnosis of hidden causes; writes its tables into docs/diagnosis_study.md: hours
 	@$(BIN)/python benchmarks/diagnosis_study.py --write
 
@@ -61,8 +65,26 @@ fuzz: $(READY) ## 200,000 random messages, commands, states and settings: no fai
 soak: $(READY) ## a fleet for ten minutes of kills, cuts and garbage (MINUTES=10 PLANTS=200 SEED=): what is missing or repeated
 	@$(BIN)/python -m benchmarks.soak $(or $(MINUTES),10) $(or $(PLANTS),200) $(SEED)
 
+outside: $(READY) ## public benchmarks beside other methods (DATA=folder of their data); writes its tables into docs/outside.md
+	@$(BIN)/python -m benchmarks.outside --data $(DATA) --write docs/outside.md
+
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
 	@$(BIN)/python docs/pictures/make.py
+
+docs: $(DOCS_READY) ## the documentation site, in site/: links are checked, and it is readable without the network
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo site/index.html
+
+examples: $(DOCS_READY) ## execute the notebooks; `make docs` then shows their figures
+	@$(BIN)/python docs/execute.py
+
+$(DOCS_READY): $(READY)
+	@if command -v uv >/dev/null 2>&1; then \
+		uv pip install --quiet --python $(BIN)/python --editable '.[docs]'; \
+	else \
+		$(BIN)/python -m pip install --quiet --editable '.[docs]'; \
+	fi
+	@touch $@
 
 lock: $(READY) ## write deploy/requirements.lock: what the image installs, with hashes
 	@$(BIN)/python deploy/lock.py

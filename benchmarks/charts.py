@@ -74,7 +74,7 @@ def of_a_plant() -> None:
     learned = [Prewhitening(0.0, (0.1,), 1.0, 1000, 5e-4, 1e-3)] * 2
     residuals = rng.standard_normal((ROWS, 2)).tolist()
     interval = Interval(True, False, 0)
-    rows = [MeasuredRow(time_ns, 0.0, e, ["", ""], interval, True, []) for time_ns, e in enumerate(residuals)]
+    rows = [MeasuredRow(time_ns, (0.0,), e, ["", ""], interval, True, []) for time_ns, e in enumerate(residuals)]
     kinds: tuple[tuple[ChartName, ...], ...] = (
         MonitorConfig().charts,
         tuple(kind.name for kind in CHARTS if kind.name != "parameters"),

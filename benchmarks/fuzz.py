@@ -241,7 +241,7 @@ def fuzz_values(count: int, seed: int = 5) -> dict[str, int]:
 
 def _bad_values(draw: random.Random, count: int) -> tuple[list[float], list[int]]:
     """Values within the range of a signal, at its edges and anywhere, and the samples that they take the place of."""
-    signals = (MONITOR.input, *MONITOR.outputs)
+    signals = MONITOR.signals
     row, values, places = 250, list[float](), list[int]()
     while len(values) < count:
         signal, rows = draw.randrange(len(signals)), draw.randrange(1, LONGEST_RUN + 1)

@@ -46,6 +46,7 @@ CASES: tuple[tuple[Whose, Manner], ...] = (
 )
 ROWS_PER_S = RATE_PER_S // SIGNALS
 WARM_UP_S = 0.2
+HISTORY_S = 600.0  # a process takes a minute to start where much else runs
 STUCK_S = 7.0  # a publisher that waits for the network waits less
 
 _BLOCK = 65_536
@@ -224,11 +225,11 @@ class Load:
 
     def wait_for_rows(self, span_s: float) -> None:
         """Wait for the rows of a number of seconds."""
-        self.publisher.wait(self.publisher.sequence + round(span_s * ROWS_PER_S))
+        self.publisher.wait(self.publisher.sequence + round(span_s * self.publisher.rows_per_s))
 
 
 @contextlib.contextmanager
-def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: int) -> Iterator[Load]:
+def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: int, rate_per_s: int) -> Iterator[Load]:
     """A publisher and a recorder at a router.
 
     Args:
@@ -236,6 +237,7 @@ def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: i
         router: address of the router.
         whose: node whose link goes through the proxy.
         cache_messages: number of messages in the cache of the publisher.
+        rate_per_s: number of samples published in a second.
     """
     proxy = Proxy(router)
     direct = BusConfig(endpoint=router, cache_messages=cache_messages)
@@ -249,12 +251,12 @@ def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: i
     bus = connect_client(via if whose == "publisher" else direct)
     try:
         tokens.wait(alive=True)
-        publisher = Publisher(bus, RATE_PER_S)
+        publisher = Publisher(bus, rate_per_s)
         load = Load(proxy, publisher, bus, heard, [])
         load.wait_for_rows(WARM_UP_S)
         yield load
         publisher.close()
-        heard.wait(publisher.sequence * SIGNALS)
+        assert heard.wait(publisher.sequence * SIGNALS), "the recorder does not keep up"
     finally:
         stop.set()
         recording.join(PATIENCE_S)
@@ -271,22 +273,30 @@ def connect_client(config: BusConfig) -> ZenohBus:
     return bus
 
 
-def cut(folder: Path, whose: Whose, manner: Manner, span_s: float, cache_messages: int = 10_000) -> Found:
+def cut(
+    folder: Path,
+    whose: Whose,
+    manner: Manner,
+    span_s: float,
+    *,
+    cache_messages: int = 10_000,
+    rate_per_s: int = RATE_PER_S,
+) -> Found:
     """Cut a link for a time."""
     with (
         contextlib.closing(Router(endpoint := free_endpoint())),
-        under_load(folder, endpoint, whose, cache_messages) as load,
+        under_load(folder, endpoint, whose, cache_messages, rate_per_s) as load,
         load.proxy.cut(manner),
     ):
         load.wait_for_rows(span_s)
     return load.found[0]
 
 
-def kill_router(folder: Path, span_s: float, cache_messages: int = 10_000) -> Found:
+def kill_router(folder: Path, span_s: float, *, cache_messages: int = 10_000, rate_per_s: int = RATE_PER_S) -> Found:
     """Kill the router, and start another one after a time."""
     with (
         contextlib.closing(Router(endpoint := free_endpoint())) as router,
-        under_load(folder, endpoint, None, cache_messages) as load,
+        under_load(folder, endpoint, None, cache_messages, rate_per_s) as load,
     ):
         router.kill()
         load.wait_for_rows(span_s)
@@ -319,22 +329,24 @@ def main() -> None:
         cache = round(2 * (span_s + 10.0) * ROWS_PER_S)
         for whose, manner in CASES:
             with tempfile.TemporaryDirectory() as folder:
-                _tell(f"{whose}, {manner} {span_s:g} s", cut(Path(folder), whose, manner, span_s, cache))
+                _tell(f"{whose}, {manner} {span_s:g} s", cut(Path(folder), whose, manner, span_s, cache_messages=cache))
         with tempfile.TemporaryDirectory() as folder:
-            _tell(f"router killed {span_s:g} s", kill_router(Path(folder), span_s, cache))
+            _tell(f"router killed {span_s:g} s", kill_router(Path(folder), span_s, cache_messages=cache))
     with tempfile.TemporaryDirectory() as folder:
         other, stuck = stick(Path(folder), STUCK_S)
         _tell(f"beside one stuck {STUCK_S:g} s", other)
         _tell(f"stuck {STUCK_S:g} s", stuck)
 
 
-def stick(folder: Path, span_s: float, cache_messages: int = 20_000) -> tuple[Found, Found]:
+def stick(
+    folder: Path, span_s: float, *, cache_messages: int = 20_000, rate_per_s: int = RATE_PER_S
+) -> tuple[Found, Found]:
     """Freeze one of two recorders, as a broken disk would; returns the content of both recordings."""
     stuck = folder / "stuck"
     stuck.mkdir()
     with (
         contextlib.closing(Router(endpoint := free_endpoint())),
-        under_load(folder, endpoint, None, cache_messages) as load,
+        under_load(folder, endpoint, None, cache_messages, rate_per_s) as load,
     ):
         heard = Heard(load.bus, "stuck")
         with recorder_process(stuck, endpoint, Tokens(load.bus, "stuck"), plant="stuck") as process:
@@ -343,7 +355,7 @@ def stick(folder: Path, span_s: float, cache_messages: int = 20_000) -> tuple[Fo
             assert load.heard.wait(load.publisher.sequence * SIGNALS), "one that is stuck holds the other up"
             process.send_signal(signal.SIGCONT)
             load.publisher.close()
-            heard.wait(load.publisher.sequence * SIGNALS)
+            assert heard.wait(load.publisher.sequence * SIGNALS), "the recorder that was stuck does not keep up"
     return load.found[0], read_content(recordings_in(stuck), load.publisher)
 
 
@@ -353,7 +365,8 @@ def recorder_process(
 ) -> Iterator["subprocess.Popen[bytes]"]:
     """A recorder in a process of its own, which ends by being asked to."""
     config = RecorderConfig(plant=plant, out=str(folder), health_period_s=0.2, black_box_min=0.0)
-    write_settings(folder / "settings.toml", {"bus": BusConfig(endpoint=endpoint), "recorder": config})
+    bus = BusConfig(endpoint=endpoint, history_s=HISTORY_S)
+    write_settings(folder / "settings.toml", {"bus": bus, "recorder": config})
     tokens.wait(alive=False)
     command = [sys.executable, "-m", "recorder", str(folder / "settings.toml")]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)

@@ -34,7 +34,7 @@ from recorder.tools.player import samples_of
 
 RUNS = 300
 CONFIG = MonitorConfig(training_min=20.0)
-SIGNALS = (CONFIG.input, *CONFIG.outputs)
+SIGNALS = CONFIG.signals
 TRAINED, ROWS = 240, 350
 FAULTS = ("coolant_flow:step:-0.05", "coolant_flow:step:-0.3", "heat_transfer:step:-0.8", "temperature_bias:step:30")
 PERIODS_MIN = (0.2, 0.5, 1.0, 5.0, 25.0)

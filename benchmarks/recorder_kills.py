@@ -76,6 +76,11 @@ class Publisher:
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
+    @property
+    def rows_per_s(self) -> int:
+        """Number of rows published in a second."""
+        return self._rows * BATCHES_PER_S
+
     def wait(self, rows: int) -> None:
         """Wait until so many rows were published."""
         with self._changed:

@@ -47,6 +47,7 @@ from benchmarks.fleet.traffic import (
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.node import UNCACHED, FleetNode, watch
+from monitor_node.fleet.watched_plants import WatchedPlants
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.records.record import NEVER_NS
@@ -165,6 +166,7 @@ def report_memory(endpoint: str, plants: int) -> None:
     assert bus is not None
     node = Counting(FAST, bus, stop)
     node.learn(plants)
+    assert isinstance(node._watched, WatchedPlants)
     quiet = node._watched._quiet
     assert quiet is not None
     due_ns = quiet._slots.health_due_ns

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from plant_node.config import NoiseSd, PlantConfig
+from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.process.library.cstr.model import cstr
@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 
 def main(rows: int) -> None:
     """Print the table."""
-    record = simulate_record(PlantConfig(noise_sd=NoiseSd(C=0.0, T=0.0)), rows)
+    record = simulate_record(PlantConfig(noise_sd={"C": 0.0, "T": 0.0}), rows)
     times, flows = record.time_min, record.columns["qc"]
     start = np.array([record.columns["C"][0], record.columns["T"][0]])
     simulator = Simulator(cstr())

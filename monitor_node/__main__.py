@@ -23,6 +23,7 @@ from monitor_node.isolation import stage
 from monitor_node.other_monitors import OtherMonitors, log_report
 from monitor_node.storage.alarm_file import AlarmFile
 from monitor_node.storage.state_file import StateFile
+from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
@@ -32,7 +33,6 @@ from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, stop_on_signals
 from reactorwatch.runtime.metrics import Metrics, serve_metrics
-from reactorwatch.runtime.model_file import read_model_on_bus_clock
 from reactorwatch.runtime.node_main import main
 from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
 
@@ -68,7 +68,8 @@ class MonitorNode(Monitor):
     """
 
     def __init__(self, config: MonitorConfig, start_ns: int) -> None:
-        super().__init__(config, start_ns, model=read_model_on_bus_clock(config.model))
+        config, model = load_process(config)
+        super().__init__(config, start_ns, model=model)
         self._logged: dict[object, str] = {}
         self._rate = CommandRateLimiter()
         self.preparation: Iterator[None] | None = None
@@ -215,13 +216,15 @@ def run(
         InputError: the settings are inconsistent, or a file of the settings is unusable.
     """
     node = MonitorNode(config, time.time_ns())
+    config = node.config
     node.preparation = stage.preparation(config, node.equations)
     with serve_metrics(metrics_config, Metrics(config.plant, NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:
             return
         try:
-            log.info("listening", plant=config.plant, training_min=config.training_min)
+            length = config.training_length
+            log.info("listening", plant=config.plant, training_min=length.minutes, training_rows=length.rows or None)
             on_publish = metrics.observe(node.alarms.all_alarms) if metrics is not None else None
             loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
             # All samples published since the state was stored, however long ago; the node skips those it knows.

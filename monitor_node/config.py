@@ -1,6 +1,8 @@
 """The monitor's settings."""
 
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import msgspec
 
@@ -27,6 +29,20 @@ else:
 
 PriorityName = Literal["low", "medium", "high", "critical"]
 
+ReferenceName = Literal["auto", "equations", "black-box", "arx"]
+
+OLDER_REFERENCES = {"process": "equations"}
+"""Older words for references in settings files."""
+
+REACTOR = "cstr"
+"""The default process."""
+
+REACTOR_TRAINING_MIN = 100.0
+"""Training of the reactor where nothing is stated, in minutes."""
+
+DEFAULT_TRAINING_ROWS = 1000
+"""Training of other processes where nothing is stated."""
+
 DEFAULT_PRIORITIES: dict[str, PriorityName] = {"T": "high"}
 """Default priorities of signals that are outputs."""
 
@@ -35,23 +51,62 @@ SMALLEST_SD = {"C": 2e-4, "T": 0.05}
 """Defaults for the reactor's outputs; other outputs have none."""
 
 
+WITHOUT_EQUATIONS = ""
+"""Setting `process` of a plant that no equations judge."""
+
+DEFAULT_SIGNALS = {"inputs": ("qc",), "outputs": ("C", "T")}
+"""Signals of the default process, by key."""
+
+
+class TrainingLength(NamedTuple):
+    """Duration of a training.
+
+    Attributes:
+        minutes: duration in minutes of the plant; None: it is stated in rows.
+        rows: duration in rows.
+    """
+
+    minutes: float | None
+    rows: int = 0
+
+    def share(self, minutes: float, rows: int) -> float:
+        """Share of the training that is done, at most 1.
+
+        Args:
+            minutes: time since its first row.
+            rows: number of its rows.
+        """
+        return min(minutes / self.minutes if self.minutes is not None else rows / self.rows, 1.0)
+
+
 class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     """Settings of a monitor. The charts of the catalogue have keys of their own beside these: see `chart_settings`.
 
     Attributes:
         plant: name of the plant.
-        input: signal that drives the plant.
+        inputs: signals that drive the plant; none, one or several.
         outputs: signals that are predicted and monitored.
+        setpoints: signals that controllers aim at; an alarm states their recent moves.
+        modes: signals that say how the plant is operated, such as a controller in manual; an alarm states unusual ones.
+        labels: signals that are carried along, and ignored.
+        bounds: lowest and highest value by signal, in the unit in which it is judged; other values are not measured
+            values, and an input at a bound is saturated, which an alarm states.
+        resolution: smallest step between two values by output; without it, it is learned.
+        units: unit by signal, as its process describes it: that of samples which name none, and, without equations,
+            the unit in which a signal is judged.
         order: order of the ARX models.
         delay: delay of the input in samples; with 1 it acts on the next sample.
         forgetting: forgetting factor of the adaptive model, in [0.5, 1]; with 1 it forgets nothing.
-        training_min: duration of the training, in minutes of the plant.
+        training_min: duration of the training, in minutes of the plant; None: see `training_length`.
+        training_rows: duration of the training in rows, instead of `training_min`.
         diagnose_training: true to diagnose the training, beside the watch, and to judge the plant by the equations with
             the deviations that it had from the start.
-        reference: model that predicts the rows: `process`, the filter of the reactor's equations; `arx`, the identified
-            model as fitted to the training; `auto`, the first if it predicts the training about as well as the second,
-            else the second.
-        model: file of an extended model (`diagnose -o`) for the equations; None: the nominal reactor.
+        reference: model that predicts the rows: `equations`, the filter of the process's equations (older: `process`);
+            `black-box`, a state map learned from the training, for few signals; `arx`, the identified model as fitted
+            to the training; `auto`, the first of these that predicts the training about as well as the last (without
+            inputs no black box).
+        process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
+            nominal reactor where its signals are watched; empty: no equations judge.
         charts: charts of the residuals.
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
             nearest number that the charts can keep for the number of alarms and the sampling period.
@@ -75,15 +130,22 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     """
 
     plant: str = "cstr"
-    input: str = "qc"
-    outputs: tuple[str, ...] = ("C", "T")
+    inputs: tuple[str, ...] = DEFAULT_SIGNALS["inputs"]
+    outputs: tuple[str, ...] = DEFAULT_SIGNALS["outputs"]
+    setpoints: tuple[str, ...] = ()
+    modes: tuple[str, ...] = ()
+    labels: tuple[str, ...] = ()
+    bounds: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
+    resolution: dict[str, float] = msgspec.field(default_factory=dict)
+    units: dict[str, str] = msgspec.field(default_factory=dict)
     order: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
     delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
     forgetting: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.999
-    training_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] = 100.0
+    training_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None
+    training_rows: Annotated[int, msgspec.Meta(ge=1, le=10_000)] | None = None
     diagnose_training: bool = True
-    reference: Literal["auto", "process", "arx"] = "auto"
-    model: str | None = None
+    reference: ReferenceName | Literal["process"] = "auto"
+    process: str | None = None
     charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
     false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None
     smallest_sd: dict[str, float] = msgspec.field(default_factory=SMALLEST_SD.copy)
@@ -104,16 +166,44 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     health_period_s: Annotated[float, msgspec.Meta(ge=0.05, le=3600.0)] = 5.0
     priorities: dict[str, PriorityName] = msgspec.field(default_factory=lambda: DEFAULT_PRIORITIES)
 
+    older_keys: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = MappingProxyType(
+        {"input": ("inputs", lambda name: [name]), "model": ("process", lambda name: name)}
+    )
+    """Older names of keys, each with the present one and the function from a value of the older to one of it."""
+
     def __post_init__(self) -> None:
         check_plant(self.plant)
         check_rule(self.raise_count, self.window, self.clear_count)
-        if not self.outputs or self.input in self.outputs or len(set(self.outputs)) != len(self.outputs):
+        every = (*self.signals, *self.carried, *self.labels)
+        if not self.outputs or len(set(every)) != len(every):
+            beside = (
+                f", and {', '.join(every[len(self.signals) :])} beside them" if len(every) > len(self.signals) else ""
+            )
             raise ValueError(
-                f"outputs must be at least one signal, each once, without the input {self.input!r}, got {self.outputs}"
+                f"outputs must be at least one signal, and each signal have one role, "
+                f"got inputs {self.inputs} and outputs {self.outputs}{beside}"
             )
         check_bounds(MonitorConfig, msgspec.structs.asdict(self))
+        msgspec.structs.force_setattr(self, "reference", OLDER_REFERENCES.get(self.reference, self.reference))
+        if self.training_min is not None and self.training_rows is not None:
+            raise ValueError(
+                f"training_min and training_rows both state the training, got {self.training_min:g} and "
+                f"{self.training_rows}; leave one out"
+            )
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
+        if self.process is not None and self.outputs == DEFAULT_SIGNALS["outputs"]:
+            return  # the outputs are those of the process, which `watched_process` sets
+        for signal, (lower, upper) in self.bounds.items():
+            if signal not in self.signals:
+                raise ValueError(f"bounds are by input and output, {self.signals}, got {signal!r}")
+            if not lower < upper:
+                raise ValueError(f"bounds of {signal} must be a lower and a higher number, got {lower:g} and {upper:g}")
+        for signal, step in self.resolution.items():
+            if signal not in self.outputs:
+                raise ValueError(f"resolution is by output, {self.outputs}, got {signal!r}")
+            if not 0 < step < 1e6:
+                raise ValueError(f"resolution of {signal} must be in (0, 1e6), got {step:g}")
         for signal, sd in self.smallest_sd.items():
             if signal not in (*self.outputs, *SMALLEST_SD):
                 raise ValueError(f"smallest_sd is by output, {self.outputs}, got {signal!r}")
@@ -125,6 +215,30 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         for signal in self.priorities:
             if signal not in self.outputs:
                 raise ValueError(f"priorities are by output, {self.outputs}, got {signal!r}")
+
+    @property
+    def training_length(self) -> TrainingLength:
+        """Duration of the training: as stated, else 100 minutes of the reactor and 1,000 rows of another process."""
+        if self.training_rows is not None:
+            return TrainingLength(None, self.training_rows)
+        if self.training_min is None and not self.is_reactor:
+            return TrainingLength(None, DEFAULT_TRAINING_ROWS)
+        return TrainingLength(REACTOR_TRAINING_MIN if self.training_min is None else self.training_min)
+
+    @property
+    def is_reactor(self) -> bool:
+        """True if the signals are those of the default process."""
+        return self.inputs == DEFAULT_SIGNALS["inputs"] and set(self.outputs) <= set(DEFAULT_SIGNALS["outputs"])
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Signals of a row: the inputs, then the outputs."""
+        return (*self.inputs, *self.outputs)
+
+    @property
+    def carried(self) -> tuple[str, ...]:
+        """Signals beside the rows that go with an alarm: set points, then modes."""
+        return (*self.setpoints, *self.modes)
 
     @property
     def chart_settings(self) -> dict[str, float]:

@@ -23,8 +23,10 @@ from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, ReceiveS
 from monitor_node.ingest.rejects import RejectCounter
 from monitor_node.ingest.replay_filter import ReplayFilter
 from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, reject_reason
+from monitor_node.ingest.sample_units import make_sample_units
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from monitor_node.pipeline import PlantPipeline
+from monitor_node.process_settings import order_inputs
 from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
 from reactorwatch.contract import keys
@@ -58,6 +60,7 @@ class Monitor:
         last_ns: time of the last row; None before the first.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
         received: number of messages so far.
+        on_row_end: called after each row with its time and the publications because of it; None: not called.
         stats: statistics by receive time, which a restart resets.
     """
 
@@ -70,21 +73,25 @@ class Monitor:
         model: ProcessModel | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
     ) -> None:
-        self.config = config
+        self.config = config = order_inputs(config, model)
         self._points, self._model, self._diagnose = points, model, diagnose
         self._changes: deque[ScheduledChange] = deque()
         self._republishes_baseline = False
         self._settings: dict[str, Any] | None = None
         self.rejects = RejectCounter()
         self.failures = Failures()
-        self._signals = (config.input, *config.outputs)
-        self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in self._signals}
+        self._signals = config.signals
+        known = (*self._signals, *config.carried)
+        self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in known}
+        self._label_keys = {keys.key(config.plant, keys.SAMPLE, signal) for signal in config.labels}
         self._indices = {signal: place for place, signal in enumerate(self._signals)}
         self._aligner = Aligner(self._signals, config.reorder_rows)
         self._runs = [SequenceCheck() for _ in self._signals]
         self._replay_filter: ReplayFilter | None = None
         self.alarms = Annunciator(config)
         self.pipeline = self._new_pipeline(self.alarms)
+        judged_by = self.pipeline.model
+        self._sample_units = make_sample_units(config.units, None if judged_by is None else judged_by.units)
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -94,6 +101,7 @@ class Monitor:
         self._watching_since_ns: int | None = None
         self.received = 0
         self.stats = ReceiveStats(start_ns, start_ns)
+        self.on_row_end: Callable[[int, list[Publication]], None] | None = None
         self._published = 0
         self._snapshot_due_ns: int | None = None
         self._snapshot_ns = int(config.snapshot_min * MINUTE_NS)
@@ -106,6 +114,8 @@ class Monitor:
         if message.received_ns and now_ns - message.received_ns > self.stats.lag_ns:
             self.stats.lag_ns = now_ns - message.received_ns
         signal = self._signal_by_key.get(message.key)
+        if signal is None and message.key in self._label_keys:
+            return []
         if signal is None:
             self.rejects.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
             return []
@@ -124,27 +134,35 @@ class Monitor:
 
     def on_sample(self, signal: str, sample: Sample, now_ns: int) -> list[Publication]:
         """Process a sample of one of the plant's signals; returns publications."""
-        quality, value = sample.quality, sample.value  # each access to the message costs as much as a line here
+        quality, value, unit = sample.quality, sample.value, sample.unit  # each access costs as much as a line here
         if quality not in USABLE or not abs(value) < LARGEST_VALUE:
             self.rejects.add(*reject_reason(signal, sample))
             return []
-        if self._replay_filter is not None and self._replay_filter.is_duplicate(
-            self._indices[signal], sample.time_ns, sample.sequence
-        ):
+        if self._sample_units is not None:
+            try:
+                value, unit = self._sample_units.convert(signal, unit, value)
+            except InputError as error:
+                self.rejects.add("unit", str(error))
+                return []
+        index = self._indices.get(signal)
+        if index is None:
+            self.pipeline.operation.on_sample(signal, sample.time_ns, value)
+            return []
+        if self._replay_filter is not None and self._replay_filter.is_duplicate(index, sample.time_ns, sample.sequence):
             self._aligner.state.counts.duplicated += 1
             return []
         publications: list[Publication] = []
         time_ns, number = sample.time_ns, sample.sequence
-        run, is_accepted = self._runs[self._indices[signal]], True
+        run, is_accepted = self._runs[index], True
         if run.accept_next(number, time_ns):  # as nearly always
-            self._accept(signal, time_ns, number, value, sample.unit, publications)
+            self._accept(signal, time_ns, number, value, unit, publications)
         elif not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):
             self.rejects.add(
                 "out_of_range", f"{signal} number {number} at {time_ns} ns: no plant counts or lasts so far"
             )
             return []
         else:
-            accepted, rejected = run.update(HeldSample(time_ns, number, value, sample.unit), self.config.reorder_rows)
+            accepted, rejected = run.update(HeldSample(time_ns, number, value, unit), self.config.reorder_rows)
             is_accepted = bool(accepted)
             for item in rejected:
                 self._reject(signal, item, run)
@@ -469,7 +487,7 @@ class Monitor:
         return publications
 
     def _on_row(self, row: Row, publications: list[Publication]) -> None:
-        time_ns, due_ns = row.time_ns, self._snapshot_due_ns
+        time_ns, due_ns, before = row.time_ns, self._snapshot_due_ns, len(publications)
         if self.first_ns is None or time_ns < self.first_ns:
             self.first_ns = time_ns
         if self.last_ns is not None and not row.restarted:
@@ -486,6 +504,8 @@ class Monitor:
             self._snapshot_due_ns = time_ns + self._snapshot_ns
             if due_ns is not None:
                 publications.extend(self._snapshots(time_ns))
+        if self.on_row_end is not None:
+            self.on_row_end(time_ns, publications[before:])
 
     def _snapshots(self, time_ns: int) -> list[Publication]:
         try:

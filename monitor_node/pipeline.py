@@ -13,8 +13,9 @@ from math import isfinite, nan
 import numpy as np
 
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.baseline.black_box_reference import BlackBoxReference, BlackBoxReferenceState
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
-from monitor_node.baseline.predictor import ArxPredictor
+from monitor_node.baseline.predictor import ArxPredictor, arx_structure
 from monitor_node.baseline.references import (
     ArxReference,
     ArxReferenceState,
@@ -22,17 +23,18 @@ from monitor_node.baseline.references import (
     ProcessReferenceState,
     Reference,
 )
-from monitor_node.baseline.signal_range import signal_ranges
+from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
 from monitor_node.chart_stage import ChartWatch, alarm_names
-from monitor_node.config import MonitorConfig
+from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.health import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
-from monitor_node.ingest.sampling import SamplingPeriod
+from monitor_node.ingest.sampling import SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
+from monitor_node.operation import Operation
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.signal_checks.stage import SignalChecks
 from monitor_node.state.monitor_state import equations_text
@@ -87,6 +89,8 @@ class PlantPipeline:
         is_normal: True if the compiled step may take the next row, see `row_step`.
         left_out: signals that are not monitored, with the reason, after the training.
         signals: signal checks.
+        operation: operation of the plant, for the texts of alarms.
+        training_rows: number of rows of the training, after its end.
     """
 
     def __init__(
@@ -107,12 +111,16 @@ class PlantPipeline:
         self._board = board
         self._points = points
         self.model = _model(config, model)
-        self._is_process = self._is_process_given = model is not None or config.reference == "process"
+        self._is_process = self._is_process_given = model is not None or config.reference == "equations"
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
         self._numbers: Records = np.zeros(1, numbers_type(config))
-        self._ranges = signal_ranges(self.model, (config.input, *config.outputs))
+        self._ranges, self._stated = possible_ranges(config, self.model), stated_ranges(config)
         self.signals = SignalChecks(config, board, self._ranges, self._numbers)
+        self.signals.use_ranges(self._ranges if self._is_process else self._stated)
+        units = {**config.units, **(self.model.units if self.model is not None else {})}
+        self.operation = Operation(config, input_bounds(config, self.model), units)
+        board.describe_operation = self.operation.describe
         self._drift = DriftWatch(config, board, publish=points)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
@@ -123,7 +131,7 @@ class PlantPipeline:
         self._whiteners: list[Prewhitener] = []
         self._step: RowStep | None = None
         self._kalman: FilterNumbers | None = None
-        self._row = np.empty(1 + len(config.outputs))
+        self._row = np.empty(len(config.signals))
         self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
@@ -131,10 +139,13 @@ class PlantPipeline:
         self._evaluated = [True] * len(config.outputs)
         self._start_training(None)
         self._promise_checked = False
+        self._is_training_open = False
         self.notes: list[str] = []
         self.rows_watched = 0
         self.is_normal = False
+        self.training_rows = 0
         self.left_out: dict[str, str] = {}
+        self._noted: set[str] = set()
 
     # --- state -----------------------------------------------------------------------------------------------
 
@@ -151,6 +162,7 @@ class PlantPipeline:
             self._began_ns,
             self._update.rows or self._training.state,
             None if self._reference is None else self._trained_state(self._reference),
+            self.operation.state,
         )
 
     def _trained_state(self, reference: Reference) -> TrainedState:
@@ -179,6 +191,7 @@ class PlantPipeline:
             ValueError: the state is damaged.
         """
         self._sampling.state = state.sampling
+        self.operation.restore(state.operation)
         self.signals.restore(state.signals, now_ns)
         for predictor, of_predictor in zip(self._predictors, state.predictors, strict=True):
             predictor.restore(of_predictor)
@@ -210,9 +223,13 @@ class PlantPipeline:
             self._suspicion.restore(watched.suspicion)
         self._quarantined, self.rows_watched = tuple(watched.withheld), watched.rows_watched
 
-    def _restore_reference(self, state: ProcessReferenceState | ArxReferenceState) -> Reference:
+    def _restore_reference(
+        self, state: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
+    ) -> Reference:
         if isinstance(state, ArxReferenceState):
-            return ArxReference.from_state(state)
+            return ArxReference(state)
+        if isinstance(state, BlackBoxReferenceState):
+            return BlackBoxReference.from_state(state)
         if self.equations is None:
             raise ValueError("the state must be of a plant without a process model")
         return ProcessReference.from_state(state, self.equations, self._config.outputs)
@@ -255,7 +272,7 @@ class PlantPipeline:
 
     @property
     def reference(self) -> str:
-        """Kind of the reference: `equations` or `arx`; empty before there is one."""
+        """Kind of the reference: `equations`, `black-box` or `arx`; empty before there is one."""
         return "" if self._reference is None else self._reference.kind
 
     @property
@@ -269,7 +286,7 @@ class PlantPipeline:
             return 1.0
         if self._began_ns is None or last_ns is None:
             return 0.0
-        return min(max((last_ns - self._began_ns) / MINUTE_NS / self._config.training_min, 0.0), 1.0)
+        return max(self._config.training_length.share((last_ns - self._began_ns) / MINUTE_NS, self._training.rows), 0.0)
 
     @property
     def refused_trainings(self) -> int:
@@ -285,7 +302,7 @@ class PlantPipeline:
         """Process a row.
 
         Args:
-            row: values, the input first.
+            row: values, the inputs first.
             units: units of the outputs.
             publications: list to which publications are added; those before an error are published nevertheless.
         """
@@ -293,15 +310,19 @@ class PlantPipeline:
         if self._update.changes:
             self._change_model(time_ns, publications)
         interval = self._sampling.update(time_ns)
-        input_value, *values = row.values
+        inputs, values = self._split(row.values)
         follows = interval.follows and not row.restarted
-        measured = MeasuredRow(time_ns, input_value, values, units, interval, follows, publications)
+        measured = MeasuredRow(time_ns, inputs, values, units, interval, follows, publications)
         if self.is_normal and not row.restarted and self._step_row(measured):
             return
         self._leave_normal()
+        if row.restarted:
+            self.operation.on_restart()
+        self.operation.inputs = inputs
         publications.extend(self.signals.check_row(time_ns, row.values))
-        if self._is_process:
-            measured.input_value, *measured.values = self.signals.mask_values(time_ns, row.values, publications)
+        if self._is_process or self._config.bounds:
+            inputs, values = self._split(self.signals.mask_values(time_ns, row.values, publications))
+            measured.inputs, measured.values = inputs, values
         if self._reference is None:
             self._train(measured)
         else:
@@ -309,6 +330,12 @@ class PlantPipeline:
                 self.signals.reset()
             self._evaluate(measured)
             self.is_normal = self._find_normal(time_ns)
+        self.operation.inputs = ()
+
+    def _split(self, values: tuple[float, ...]) -> tuple[tuple[float, ...], list[float]]:
+        """Inputs and outputs of a row."""
+        inputs = len(self._config.inputs)
+        return values[:inputs], list(values[inputs:])
 
     def snapshots(self, time_ns: int) -> list[Publication]:
         """Snapshots of each output's models: the adaptive one, the one fitted to the training, and the reference.
@@ -335,12 +362,49 @@ class PlantPipeline:
 
     # --- training --------------------------------------------------------------------------------------------
 
+    def open_training(self) -> None:
+        """Train until `end_training`, on all rows until then."""
+        self._is_training_open = True
+        self._training.keep_all_rows()
+
+    def end_training(self, time_ns: int) -> None:
+        """End the training with the rows so far; the next row is the first of another run of the plant.
+
+        Args:
+            time_ns: time of the last row.
+
+        Raises:
+            InputError: there are too few rows to learn from, or no output can be watched.
+        """
+        if not self._training.is_enough([False] * len(self._config.outputs)):
+            raise InputError(
+                f"must have at least {self._training.fewest_rows} rows with a value of each output to learn from, got "
+                f"{self._training.rows} rows"
+            )
+        rows, self.training_rows = self._training.state, self._training.rows
+        trained = self._training.finish(last_chance=True)
+        if trained.refused:
+            raise InputError(f"there is no output to watch: {trained.refused}")
+        self._start(trained)
+        self._start_diagnosis(rows)
+        self._change_model(time_ns, [])
+
+    def start_run(self) -> None:
+        """Expect the first row of another run of the plant, whose times are unrelated to those of the training."""
+        self._sampling.state = SamplingState(period_ns=self._sampling.state.period_ns)
+        if self._reference is not None:
+            self._reference.restart()
+        self._quarantined = (False,) * len(self._config.outputs)
+        for whitener in self._whiteners:
+            whitener.restart()
+        self.signals.restart()
+        self.signals.reset()
+
     def _start_training(self, time_ns: int | None) -> None:
         config = self._config
         self._began_ns = time_ns
         self._predictors: list[ArxPredictor] = [
-            ArxPredictor(config.order, config.delay, config.forgetting, with_snapshots=self._points)
-            for _ in config.outputs
+            ArxPredictor(arx_structure(config), config.forgetting, with_snapshots=self._points) for _ in config.outputs
         ]
         self._training: Training = Training(config, self.model, self._predictors)
 
@@ -351,9 +415,10 @@ class PlantPipeline:
             self._promise_checked = True
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
-        trained_min = (time_ns - self._began_ns) / MINUTE_NS
-        if trained_min >= config.training_min and self._training.is_enough(self.signals.silence.silent[1:]):
-            rows = self._training.state
+        share = config.training_length.share((time_ns - self._began_ns) / MINUTE_NS, self._training.rows)
+        timed_out = self.signals.silence.silent[len(config.inputs) :]
+        if share >= 1.0 and not self._is_training_open and self._training.is_enough(timed_out):
+            rows, self.training_rows = self._training.state, self._training.rows
             trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
             if trained.refused:
                 self._refusals += 1
@@ -366,7 +431,7 @@ class PlantPipeline:
                 self._evaluate(row)
                 publications.extend(self.snapshots(time_ns))
                 return
-        self._training.add(time_ns, row.input_value, values)
+        self._training.add(time_ns, row.inputs, values)
         if not self._points:
             self._buffer(row)
         else:
@@ -380,14 +445,14 @@ class PlantPipeline:
     def _predict(self, row: MeasuredRow) -> list[float]:
         """Predict each output by its identified model, which is updated with the row."""
         return [
-            predictor.update(row.time_ns, row.input_value, value, follows=row.follows)
+            predictor.update(row.time_ns, row.inputs, value, follows=row.follows)
             for predictor, value in zip(self._predictors, row.values, strict=True)
         ]
 
     def _buffer(self, row: MeasuredRow) -> None:
         """Buffer a row for the identified models, whose predictions nothing needs now."""
         for predictor, value in zip(self._predictors, row.values, strict=True):
-            predictor.buffer(row.time_ns, row.input_value, value, follows=row.follows)
+            predictor.buffer(row.time_ns, row.inputs, value, follows=row.follows)
 
     def _leave_out(self, left_out: dict[str, str]) -> None:
         """Exclude signals from monitoring."""
@@ -457,6 +522,7 @@ class PlantPipeline:
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         if not again:
+            self.operation.end_training()
             self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
@@ -465,10 +531,15 @@ class PlantPipeline:
         """Set the reference for the rows to come."""
         self._reference, self._arl0 = reference, arl0
         self._is_process = self._is_process_given or isinstance(reference, ProcessReference)
+        self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
-        self._step, self._kalman = RowStep.of(self._config, self._reference_model, self._ranges), None
-        if self._step is not None and isinstance(reference, ProcessReference):
+        self._kalman = None
+        if isinstance(reference, BlackBoxReference):
+            self._step = RowStep.of_black_box(self._config, reference, self._ranges)
+        else:
+            self._step = RowStep.of(self._config, self._reference_model, self._ranges)
+        if self._step is not None and isinstance(reference, ProcessReference | BlackBoxReference):
             belief, variances = reference.numbers
             self._kalman = FilterNumbers(belief[None], variances[None])
 
@@ -485,7 +556,7 @@ class PlantPipeline:
         """Search the causes of alarms; an error there costs the state of the search, and no alarm."""
         assert self._suspicion is not None
         try:
-            return self._suspicion.update(row.time_ns, row.input_value, row.values, row.units, list(stuck))
+            return self._suspicion.update(row.time_ns, row.inputs[0], row.values, row.units, list(stuck))
         except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
             self._failures.add("isolation", error, "the search for the cause of this alarm starts again")
             assert self._reference is not None
@@ -505,7 +576,7 @@ class PlantPipeline:
         reference, sampling, time_min = self._reference, self._sampling.state, time_ns / MINUTE_NS
         if self._step is None or self._board.has_unexplained or not self._charts.is_normal:
             return False
-        assert isinstance(reference, ProcessReference)
+        assert isinstance(reference, ProcessReference | BlackBoxReference)
         if self.left_out or True in self._quarantined or sampling.period_ns is None or sampling.spacing_ns is None:
             return False
         if not (self.signals.is_normal and reference.is_normal(time_min)):
@@ -514,7 +585,7 @@ class PlantPipeline:
         if p["timeouts"]["last_ns"][0] != time_ns or not all(item.is_ready for item in self._whiteners):
             return False
         p["last_ns"], p["period_ns"] = time_ns, sampling.period_ns
-        p["time_min"], p["input"] = time_min, reference.last_input
+        p["time_min"], p["inputs"] = time_min, reference.last_inputs
         self._charts.load(p)
         return True
 
@@ -528,15 +599,16 @@ class PlantPipeline:
         """Process a row by the compiled step; returns False if it is an event, for which nothing has changed."""
         assert self._step is not None
         assert self._kalman is not None
-        assert isinstance(self._reference, ProcessReference)
+        assert isinstance(self._reference, ProcessReference | BlackBoxReference)
         time_ns, time_min = row.time_ns, row.time_ns / MINUTE_NS
-        self._row[0], self._row[1:] = row.input_value, row.values
+        count = len(row.inputs)
+        self._row[:count], self._row[count:] = row.inputs, row.values
         verdict = self._step.update(self._numbers, self._kalman, time_ns, time_min, self._row)
         if verdict == EVENT:
             return False
         if verdict == VIOLATING:
             self._charts.store_delays(self._numbers[0])
-        self._reference.accept_row(time_min, row.input_value)
+        self._reference.accept_row(time_min, tuple(row.inputs))
         self.rows_watched += 1
         if self._points:
             self._publish_step(row)
@@ -544,7 +616,7 @@ class PlantPipeline:
             self._buffer(row)
             row.publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
-            self._suspicion.add(time_min, row.input_value, row.values)
+            self._suspicion.add(time_min, row.inputs[0], row.values)
         return True
 
     def _publish_step(self, row: MeasuredRow) -> None:
@@ -563,8 +635,11 @@ class PlantPipeline:
         reference, time_ns, units, publications = self._reference, row.time_ns, row.units, row.publications
         assert reference is not None
         if self.left_out:
-            self._note_late_signals(row.input_value, row.values)
-            row.input_value = 0.0 if self._config.input in self.left_out else row.input_value  # as in the training
+            self._note_late_signals(row.inputs, row.values)
+            row.inputs = [  # as in the training
+                0.0 if name in self.left_out else value
+                for name, value in zip(self._config.inputs, row.inputs, strict=True)
+            ]
             row.values = [
                 value if evaluated else nan for value, evaluated in zip(row.values, self._evaluated, strict=True)
             ]
@@ -582,7 +657,9 @@ class PlantPipeline:
             self.signals.restart()
             for whitener in self._whiteners:
                 whitener.restart()
-        predictions, sds = reference.update(time_ns, row.input_value, values, self._quarantined, row.interval.missing)
+        predictions, sds = reference.update(time_ns, row.inputs, values, self._quarantined, row.interval.missing)
+        if isinstance(reference, ArxReference):
+            self._note_inputs_beyond(reference, row.inputs)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
@@ -602,10 +679,22 @@ class PlantPipeline:
             publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
             publications.extend(self._search_causes(row, stuck))
+        if isinstance(reference, BlackBoxReference):
+            reference.set_learning(not self._board.has_unexplained)
 
-    def _note_late_signals(self, input_value: float, values: list[float]) -> None:
+    def _note_inputs_beyond(self, reference: ArxReference, inputs: Sequence[float]) -> None:
+        """Note once each input that leaves its range in the training, as rows are not judged then."""
+        for name in (self._config.inputs[i] for i in reference.find_beyond(inputs)):
+            if name not in self._noted:
+                self._noted.add(name)
+                self.notes.append(
+                    f"rows are not judged while {name} is beyond its range in the training: the identified model does "
+                    "not hold there"
+                )
+
+    def _note_late_signals(self, inputs: Sequence[float], values: list[float]) -> None:
         """Note once each signal whose first value arrives after the training."""
-        for name, value in zip((self._config.input, *self._config.outputs), (input_value, *values), strict=True):
+        for name, value in zip(self._config.signals, (*inputs, *values), strict=True):
             if self.left_out.get(name) == NO_VALUE and isfinite(value):
                 self.left_out[name] = "its first value came after the training"
                 self.notes.append(
@@ -641,17 +730,18 @@ def _filter_snapshot(reference: ProcessReference, output: str) -> ModelSnapshot:
 
 def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:
     """Process model for the plant, as the settings ask for it."""
-    if config.reference == "arx":
+    if config.reference in ("black-box", "arx") or (model is None and config.process == WITHOUT_EQUATIONS):
         return None
     given, model = model is not None, model or cstr()
-    fits = (config.input,) == model.input_names and set(config.outputs) <= set(model.output_names)
+    fits = config.inputs == model.input_names and set(config.outputs) <= set(model.output_names)
     if fits:
         return model
     if config.reference == "auto" and not given:
         return None
     raise InputError(
-        f"reference 'process' needs the signals of {model.name}, input {', '.join(model.input_names)} and outputs of "
-        f"{', '.join(model.output_names)}, got {config.input} and {', '.join(config.outputs)}; "
+        f"reference 'equations' needs the signals of {model.name}, inputs {', '.join(model.input_names)} and outputs "
+        f"of {', '.join(model.output_names)}, got {', '.join(config.inputs) or 'none'} and "
+        f"{', '.join(config.outputs)}; "
         'set reference = "arx"'
     )
 

@@ -19,17 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.alarms.on_off_delay import DELAY, add_point, is_normal, raises
+from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.references import GATE
-from monitor_node.baseline.signal_range import SignalRange, signal_ranges
+from monitor_node.baseline.resolution import quantise
+from monitor_node.baseline.signal_range import SignalRange, possible_ranges
 from monitor_node.chart_stage import alarm_names
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.sampling import WHOLE
+from monitor_node.ingest.sampling import TOLERANCE, WHOLE
 from monitor_node.signal_checks.catalogue import CHECKS
 from monitor_node.signal_checks.stuck import STUCK, is_stuck, take_reading
 from monitor_node.signal_checks.timeout import TIMEOUT, update_timeout
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.codegen.numba_kernel import Entry, call_at, jit
+from reactorwatch.identification.black_box.filter import JUDGED, filter_row
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, row_function
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import ProcessModel
@@ -63,10 +66,11 @@ POINT = 5
 Records: TypeAlias = NDArray[np.void]
 
 
-def row_type(outputs: int, alarms: int) -> np.dtype[Any]:
+def row_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
     """Type of the numbers of a plant's stages, composed of the stages' own; the filter has its belief elsewhere.
 
     Args:
+        inputs: number of inputs.
         outputs: number of monitored outputs.
         alarms: number of alarms that the charts can raise.
     """
@@ -75,8 +79,8 @@ def row_type(outputs: int, alarms: int) -> np.dtype[Any]:
             ("last_ns", "i8"),  # time of the newest row
             ("period_ns", "f8"),  # sampling period
             ("time_min", "f8"),  # time of the filter's newest row
-            ("input", "f8"),  # input of that row
-            ("timeouts", TIMEOUT, (2 + outputs,)),  # of the plant, the input and each output
+            ("inputs", "f8", (inputs,)),  # inputs of that row
+            ("timeouts", TIMEOUT, (1 + inputs + outputs,)),  # of the plant, each input and each output
             ("whiteners", WHITENER, (outputs,)),
             ("stuck", STUCK, (outputs,)),
             ("spike_limits", "f8", (outputs,)),
@@ -90,17 +94,18 @@ def row_type(outputs: int, alarms: int) -> np.dtype[Any]:
     )
 
 
-def work_type(outputs: int, alarms: int) -> np.dtype[Any]:
+def work_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
     """Type of the results of a step.
 
     Args:
+        inputs: number of inputs.
         outputs: number of monitored outputs.
         alarms: number of alarms that the charts can raise.
     """
     rows = SETTINGS + max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
     return np.dtype(
         [
-            ("new", "f8", (5 + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
+            ("new", "f8", (3 + 2 * inputs + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
             ("outputs", "f8", (5 * outputs + 1,)),  # its results
             ("expected", "f8", (outputs,)),  # expected values of the prewhitening filters
             ("e", "f8", (outputs,)),  # prewhitened residuals
@@ -111,17 +116,20 @@ def work_type(outputs: int, alarms: int) -> np.dtype[Any]:
     )
 
 
-def settings_type(outputs: int, alarms: int) -> np.dtype[Any]:
+def settings_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
     """Type of the constants of a step.
 
     Args:
+        inputs: number of inputs.
         outputs: number of monitored outputs.
         alarms: number of alarms that the charts can raise.
     """
     return np.dtype(
         [
-            ("filter_address", "i8"),  # address of the filter's machine code
-            ("ranges", "f8", (1 + outputs, 2)),  # smallest and largest value of each signal
+            ("filter_address", "i8"),  # address of the filter's machine code; 0: a black box
+            ("spacing_min", "f8", (2,)),  # shortest and longest time between two rows
+            ("resolutions", "f8", (outputs,)),  # stated resolution of each output; 0 where it is learned
+            ("ranges", "f8", (inputs + outputs, 2)),  # smallest and largest value of each signal
             ("silence_limit", "f8"),  # see `DataTimeout`
             ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
             ("rules", "i8", (max(alarms, 1), 2)),  # violating points that raise each alarm, mask of its window
@@ -136,8 +144,9 @@ class FilterNumbers(NamedTuple):
     """Numbers of the filters of some plants.
 
     Attributes:
-        belief: state and covariance, shape (plants, states + states^2).
-        variances: variances of the sensors and of the process, shape (plants, outputs + states).
+        belief: state and covariance, shape (plants, states + states^2); of a black box see `BlackBoxFilter`.
+        variances: variances of the sensors and of the process, shape (plants, outputs + states); of a black box all
+            its constants.
     """
 
     belief: Array
@@ -152,23 +161,30 @@ def _predict(
     parameters: Array,
     after: Array,
     work: Any,
-    filter_address: int,
+    settings: Any,
     time_min: float,
     values: Array,
 ) -> bool:
-    """Filter a row that is at most two integration steps after the one before; returns True if all went well."""
-    count, new = values.size - 1, work.new
-    step = 0.5 * (time_min - p.time_min)
-    if not (step > 0.0 and 2.0 * step <= LONGEST_ROW_MIN):
+    """Filter a row that is not too far from the one before; returns True if all went well."""
+    inputs, new = p.inputs.size, work.new
+    count = values.size - inputs
+    spacing_min = time_min - p.time_min
+    if not settings.spacing_min[0] < spacing_min <= settings.spacing_min[1]:
         return False
-    new[0], new[1], new[2], new[3], new[4] = p.input, values[0], time_min, step, step
+    step = 0.5 * spacing_min
+    for i in range(inputs):
+        new[i], new[inputs + i] = p.inputs[i], values[i]
+    row = 2 * inputs
+    new[row], new[row + 1], new[row + 2] = time_min, step, step
     for i in range(count):
-        new[5 + i], new[5 + count + i] = values[1 + i], GATE
+        new[row + 3 + i], new[row + 3 + count + i] = values[inputs + i], GATE
     first = parameters.size - variances.size
     for i in range(variances.size):
         parameters[first + i] = variances[i]
+    if settings.filter_address == 0:
+        return filter_row(belief, new, parameters, after, work.outputs) == JUDGED
     before, given, constants = belief.ctypes.data, new.ctypes.data, parameters.ctypes.data
-    call_at(filter_address, (1, before, given, constants, after.ctypes.data, work.outputs.ctypes.data))
+    call_at(settings.filter_address, (1, before, given, constants, after.ctypes.data, work.outputs.ctypes.data))
     return bool(work.outputs[work.outputs.size - 1] != 0.0)
 
 
@@ -260,7 +276,7 @@ def step(
         plant: index of the plant.
         time_ns: time of the row.
         time_min: the same in minutes.
-        values: values of the row, the input first.
+        values: values of the row, the inputs first.
     """
     scratch[0] = numbers[plant]
     p, work, settings = scratch[0], works[0], constants[0]
@@ -270,16 +286,17 @@ def step(
     for i in range(values.size):
         if not settings.ranges[i, 0] <= values[i] <= settings.ranges[i, 1]:
             return EVENT
-    belief, address = beliefs[plant], settings.filter_address
-    if not _predict(p, belief, variances[plant], parameters, after, work, address, time_min, values):
+    belief = beliefs[plant]
+    if not _predict(p, belief, variances[plant], parameters, after, work, settings, time_min, values):
         return EVENT
     for i in range(p.timeouts.size):
         if update_timeout(p.timeouts[i], time_ns, True, settings.silence_limit, -1)[0]:
             return EVENT
-    outputs = values.size - 1
+    inputs = p.inputs.size
+    outputs = values.size - inputs
     for i in range(outputs):
-        value, whitener = values[1 + i], p.whiteners[i]
-        take_reading(p.stuck[i], value)
+        value, whitener = values[inputs + i], p.whiteners[i]
+        take_reading(p.stuck[i], quantise(value, settings.resolutions[i]))
         if is_stuck(p.stuck[i]):
             return EVENT
         work.expected[i] = expected_value(whitener)
@@ -289,7 +306,9 @@ def step(
     verdict = _update_charts(p, work, settings)
     if verdict == EVENT:
         return EVENT
-    p.last_ns, p.time_min, p.input = time_ns, time_min, values[0]
+    p.last_ns, p.time_min = time_ns, time_min
+    for i in range(inputs):
+        p.inputs[i] = values[i]
     for i in range(belief.size):
         belief[i] = after[i]
     numbers[plant] = scratch[0]
@@ -297,9 +316,29 @@ def step(
 
 
 @lru_cache
-def step_entry(outputs: int, alarms: int) -> Entry:
-    """Machine code of the step for the types of these numbers of outputs and alarms."""
+def step_entry(inputs: int, outputs: int, alarms: int) -> Entry:
+    """Machine code of the step for the types of these numbers of inputs, outputs and alarms."""
     return Entry(step)
+
+
+class RowFilter(NamedTuple):
+    """Filter of a step.
+
+    Attributes:
+        address: address of its machine code; 0: a black box.
+        belief: size of its belief.
+        parameters: parameters of the equations; none for a black box, whose constants are those of a plant.
+        constants: number of the other constants, see `FilterNumbers.variances`.
+        spacing_min: shortest and longest time between two rows, in minutes.
+        code: owner of the machine code.
+    """
+
+    address: int
+    belief: int
+    parameters: Array
+    constants: int
+    spacing_min: tuple[float, float]
+    code: CompiledFunction | None = None
 
 
 class RowStep:
@@ -307,8 +346,8 @@ class RowStep:
 
     Args:
         config: settings of the plants' monitors.
-        model: model by which the plants are judged.
-        ranges: ranges of the input and of each output.
+        row_filter: filter of the plants.
+        ranges: ranges of each input and of each output.
 
     Attributes:
         numbers_type: type of the numbers of a plant's stages.
@@ -320,24 +359,26 @@ class RowStep:
         after: belief of a filter, to work in.
     """
 
-    def __init__(self, config: MonitorConfig, model: ProcessModel, ranges: Sequence[SignalRange]) -> None:
-        outputs, states = len(config.outputs), len(model.states)
+    def __init__(self, config: MonitorConfig, row_filter: RowFilter, ranges: Sequence[SignalRange]) -> None:
         kinds = [chart for chart, _ in alarm_names(config)]
-        self._filter, self._step = compiled_filter(model), step_entry(outputs, len(kinds))
+        sizes = len(config.inputs), len(config.outputs), len(kinds)
+        self._code, self._step = row_filter.code, step_entry(*sizes)
         self.numbers_type = numbers_type(config)
-        self.filter_sizes = states + states**2, outputs + states
-        self.settings = np.zeros(1, settings_type(outputs, len(kinds)))
+        self.filter_sizes = row_filter.belief, row_filter.constants
+        self.settings = np.zeros(1, settings_type(*sizes))
         p = self.settings[0]
-        p["filter_address"], p["silence_limit"] = self._filter.address, config.silence_periods
+        p["filter_address"], p["spacing_min"] = row_filter.address, row_filter.spacing_min
+        p["silence_limit"] = config.silence_periods
+        p["resolutions"] = [config.resolution.get(name, 0.0) for name in config.outputs]
         p["ranges"] = [[item.lower, item.upper] for item in ranges]
         p["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
         for i, kind in enumerate(kinds):
             p["rules"][i] = (1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1)
         p["reach"], p["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
-        self.work = np.zeros(1, work_type(outputs, len(kinds)))
+        self.work = np.zeros(1, work_type(*sizes))
         self.scratch = np.zeros(1, self.numbers_type)
-        self.after: Array = np.empty(self.filter_sizes[0])
-        self.parameters: Array = np.concatenate([model.values(), np.empty(outputs + states)])
+        self.after: Array = np.empty(row_filter.belief)
+        self.parameters: Array = np.concatenate([row_filter.parameters, np.empty(row_filter.constants)])
 
     @staticmethod
     def of(
@@ -348,15 +389,34 @@ class RowStep:
         Args:
             config: settings of the plants' monitors.
             model: model by which the plants are judged; None: there is none.
-            ranges: ranges of the input and of each output; None: those of the model.
+            ranges: ranges of each input and of each output; None: those of the model.
         """
-        if model is None or model.breakpoints or len(model.input_names) != 1 or model.output_names != config.outputs:
+        if model is None or model.breakpoints or not has_step(config):
             return None
-        if {check.name for check in CHECKS} != CHECKED or not set(config.charts) <= set(CHARTS):
+        if (model.input_names, model.output_names) != (config.inputs, config.outputs):
             return None
-        if len(config.outputs) < 2 and Mewma.name in config.charts:
+        outputs, states = len(config.outputs), len(model.states)
+        belief, spacing_min = states + states**2, (0.0, LONGEST_ROW_MIN)
+        code = compiled_filter(model)
+        row_filter = RowFilter(code.address, belief, model.values(), outputs + states, spacing_min, code)
+        return RowStep(config, row_filter, ranges or possible_ranges(config, model))
+
+    @staticmethod
+    def of_black_box(
+        config: MonitorConfig, reference: BlackBoxReference, ranges: Sequence[SignalRange]
+    ) -> "RowStep | None":
+        """The step for a plant with a black box; None if its rows are not such that it could take them.
+
+        Args:
+            config: settings of the plant's monitor.
+            reference: reference of the plant.
+            ranges: ranges of each input and of each output.
+        """
+        if not has_step(config):
             return None
-        return RowStep(config, model, ranges or signal_ranges(model, (config.input, *config.outputs)))
+        belief, constants = reference.numbers
+        shortest, longest = ((1.0 + sign * TOLERANCE) * reference.period_min for sign in (-1.0, 1.0))
+        return RowStep(config, RowFilter(0, belief.size, np.empty(0), constants.size, (shortest, longest)), ranges)
 
     def update(self, numbers: Records, kalman: FilterNumbers, time_ns: int, time_min: float, values: Array) -> int:
         """Take a row of one plant through all stages; returns the verdict."""
@@ -365,9 +425,16 @@ class RowStep:
         return verdict
 
 
+def has_step(config: MonitorConfig) -> bool:
+    """True if the step has the charts and checks of these settings."""
+    if not config.inputs or {check.name for check in CHECKS} != CHECKED or not set(config.charts) <= set(CHARTS):
+        return False
+    return len(config.outputs) > 1 or Mewma.name not in config.charts
+
+
 def numbers_type(config: MonitorConfig) -> np.dtype[Any]:
     """Type of the numbers of the stages of a plant with these settings."""
-    return row_type(len(config.outputs), len(alarm_names(config)))
+    return row_type(len(config.inputs), len(config.outputs), len(alarm_names(config)))
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)

@@ -11,7 +11,7 @@ from plant_node.node import COMMANDS, NODE, PlantNode
 from plant_node.record import plant_from
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.description.process import Process
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.bus_zenoh import connect
@@ -28,7 +28,7 @@ def run(
     config: PlantConfig,
     bus_config: BusConfig,
     metrics_config: MetricsConfig = MetricsConfig(),  # noqa: B008 (it is frozen)
-    model: ProcessModel | None = None,
+    process: Process | None = None,
     driver: Record | None = None,
 ) -> None:
     """Simulate a plant on the bus until the end of its duration, SIGINT or SIGTERM.
@@ -37,13 +37,13 @@ def run(
         config: settings of the plant.
         bus_config: settings of the bus.
         metrics_config: settings of the metrics page.
-        model: the process; None: that of the settings.
-        driver: a record whose input drives the plant instead of the scenario of `config`.
+        process: the process; None: that of the settings.
+        driver: a record whose inputs drive the plant instead of the scenario of `config`.
 
     Raises:
         InputError: settings that cannot be used.
     """
-    plant = plant_from(config, model, driver)
+    plant = plant_from(config, process, driver)
     log.info("plant", seed=config.seed, settings=msgspec.to_builtins(config))
     with serve_metrics(metrics_config, Metrics(config.name, NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = connect(bus_config, NODE, stop)

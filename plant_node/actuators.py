@@ -4,21 +4,21 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class CoolantValve:
-    """A valve whose flow is its command, limited to its range.
+class Actuator:
+    """An actuator, such as a valve or a pump, whose input is its command, limited to its range.
 
     Attributes:
-        lower_l_min: flow when it is closed.
-        upper_l_min: flow when it is open.
+        lower: smallest input, in its unit.
+        upper: largest input.
     """
 
-    lower_l_min: float
-    upper_l_min: float
+    lower: float
+    upper: float
 
-    def flow(self, command_l_min: float) -> float:
-        """The coolant flow in l/min at a command in l/min."""
-        return min(max(command_l_min, self.lower_l_min), self.upper_l_min)
+    def limit(self, command: float) -> float:
+        """The input at a command."""
+        return min(max(command, self.lower), self.upper)
 
-    def reaches(self, command_l_min: float) -> bool:
-        """True if a command is within the valve's range."""
-        return self.lower_l_min <= command_l_min <= self.upper_l_min
+    def reaches(self, command: float) -> bool:
+        """True if a command is within the range."""
+        return self.lower <= command <= self.upper

@@ -1,150 +1,128 @@
-"""Controllers of the plant: of the temperature, by the coolant flow; of the level, by the outflow.
+"""Control loops of the plant: controllers of its process with their state. See `reactorwatch.process.controller`."""
 
-Temperature. A proportional controller, as in the study that this project starts from:
-
-    qc = qc0 + Kp (T_measured - T_set)
-
-It acts once a row, on the temperature measured in that row, noise included, and its command is held until the next row.
-More coolant makes the reactor colder, so a positive Kp is negative feedback. There is no integral action: the steady
-offset of the temperature from its set point is (qc - qc0) / Kp.
-
-The range of Kp follows from the linear plant sampled with period h, x(k+1) = Phi x(k) + Gamma qc(k): the loop is stable
-while the eigenvalues of Phi + Kp Gamma c (c picks T) lie inside the unit circle: Astrom & Wittenmark (1997),
-Computer-Controlled Systems, ch. 3. With rows of 0.1 min, at the operating points between 85 and 111 l/min, that is
-below 18 l/min/K (the limit of the hottest point, 85 l/min); with rows 0.2 and 0.3 min apart below 7.7 and 2.0. The
-default of 4 keeps a gain margin above 4, damps the point at 111 l/min (from a radius of 0.989 to 0.882), and passes a
-thermometer's noise of 0.3 K on as 1.2 l/min. It also stabilises flows beyond 112 l/min, where the plant in open loop is
-unstable.
-
-Level. See `reactorwatch.process.level_control`.
-"""
-
-from itertools import pairwise
+from dataclasses import dataclass, replace
 from math import isfinite
-from typing import TypeAlias
 
 import casadi as ca
-import msgspec
+from msgspec.structs import replace as with_changes
 
-from plant_node.actuators import CoolantValve
-from plant_node.scenario import SIGNAL
+from plant_node.actuators import Actuator
 from reactorwatch.errors import InputError
-from reactorwatch.process import level_control
-from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, OPERATING_STATE
-from reactorwatch.process.model import ProcessModel
-
-CONTROLLED = "T"
-GAIN = 4.0
-"""Default gain of the temperature controller, l/min/K."""
-
-SetPoint: TypeAlias = float | tuple[tuple[float, float], ...]
-
-_EDGE_MIN = 1e-9  # rounding of a row's time relative to a step
+from reactorwatch.process.controller import Controller
+from reactorwatch.process.model import ProcessModel, variable
 
 
-class TemperatureControl(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A proportional controller of the temperature, without a state.
+@dataclass(frozen=True)
+class ControlLoop:
+    """A controller with its state; the state of a row follows from that of the row before.
 
     Attributes:
-        set_point_K: one value, or steps as pairs of plant time in min and K, the first at 0, like
-            [[0, 438.54], [60, 440]].
-        gain_l_min_K: Kp.
-        base_flow_l_min: qc0, the coolant flow at the set point.
-        dither: whether the scenario's deviation from its mean is added to the command. Identification in closed loop
-            needs it: feedback alone is a function of the output and carries no information about the plant.
+        controller: the controller.
+        actuator: actuator of its input.
+        integral: integral part of the command, in the input's unit.
+        manual: command in place of the controller's; None: automatic.
     """
 
-    set_point_K: SetPoint = OPERATING_STATE[1]  # noqa: N815 # K is the unit
-    gain_l_min_K: float = GAIN  # noqa: N815 # as above
-    base_flow_l_min: float = OPERATING_COOLANT_FLOW
-    dither: bool = False
+    controller: Controller
+    actuator: Actuator
+    integral: float = 0.0
+    manual: float | None = None
 
-    def __post_init__(self) -> None:
-        if not (isfinite(self.gain_l_min_K) and self.gain_l_min_K > 0):
-            raise ValueError(f"gain_l_min_K must be above 0, got {self.gain_l_min_K:g}; for none leave the table out")
-        if not (isfinite(self.base_flow_l_min) and self.base_flow_l_min >= 0):
-            raise ValueError(f"base_flow_l_min must be at least 0, got {self.base_flow_l_min:g}")
-        times = [time for time, _ in self.steps]
-        if not times or times[0] != 0 or any(not one < other for one, other in pairwise(times)):
-            given = ", ".join(f"{time:g}" for time in times) or "none"
-            raise ValueError(f"set_point_K must have steps at rising times in min, the first at 0, got {given}")
-        for _, value in self.steps:
-            if not (isfinite(value) and value > 0):
-                raise ValueError(f"set_point_K must be above 0 K, got {value:g}")
+    def command(self, measured: float, time_min: float, dither: float) -> float:
+        """Command of a row, limited to the actuator's range, from the output measured in it."""
+        if self.manual is not None:
+            return self.manual
+        return self.actuator.limit(self._raw_command(measured, time_min, dither))
 
-    @property
-    def steps(self) -> tuple[tuple[float, float], ...]:
-        """The set point as pairs of plant time in min and K."""
-        return self.set_point_K if isinstance(self.set_point_K, tuple) else ((0.0, self.set_point_K),)
+    def advance(self, measured: float, time_min: float, dither: float, period_min: float) -> "ControlLoop":
+        """The loop at the next row; the integral part rests where the command is at its limit."""
+        control = self.controller
+        if self.manual is not None or not control.is_integral:
+            return self
+        deviation = measured - control.set_point_at(time_min)
+        change = control.gain * deviation * period_min / control.integral_time_min
+        raw = self._raw_command(measured, time_min, dither)
+        actuator = self.actuator
+        if (change > 0 and raw >= actuator.upper) or (change < 0 and raw <= actuator.lower):
+            return self
+        return replace(self, integral=self.integral + change)
 
-    def set_point(self, time_min: float) -> float:
-        """The set point in K at a plant time of at least 0."""
-        return [value for time, value in self.steps if time <= time_min + _EDGE_MIN][-1]
+    def with_set_point(self, value: float) -> "ControlLoop":
+        """The loop on automatic with another set point, constant from then on."""
+        return replace(self, controller=with_changes(self.controller, set_point=value), manual=None)
 
-    def command(self, temperature_K: float, time_min: float, dither_l_min: float = 0.0) -> float:
-        """Commanded coolant flow in l/min, which may be beyond the valve's range.
-
-        Args:
-            temperature_K: temperature measured in the row.
-            time_min: time of the row.
-            dither_l_min: dither added to the command.
-        """
-        error_K = temperature_K - self.set_point(time_min)
-        return self.base_flow_l_min + dither_l_min + self.gain_l_min_K * error_K
-
-    def check(self, model: ProcessModel, valve: CoolantValve) -> None:
-        """Check the settings against a model and a valve.
-
-        Raises:
-            InputError: the model has no temperature output, or a set point or the base flow is out of range.
-        """
-        if CONTROLLED not in model.output_names:
-            raise InputError(
-                f"temperature_control needs a model with the output {CONTROLLED!r}, "
-                f"{model.name} has {model.output_names}"
-            )
-        if not valve.reaches(self.base_flow_l_min):
-            raise InputError(
-                f"temperature_control: base_flow_l_min must be in [{valve.lower_l_min:g}, {valve.upper_l_min:g}] "
-                f"l/min, got {self.base_flow_l_min:g}"
-            )
-        for _, value in self.steps:
-            check_set_point(model, value)
-
-    def closed_loop(self, model: ProcessModel, valve: CoolantValve) -> ProcessModel:
-        """Model of the closed loop in continuous time, at the set point of plant time 0.
-
-        It has the steady state of the sampled loop, which is its purpose, but other transients. The input is the
-        coolant flow at the set point: `base_flow_l_min`, dither included.
-        """
-        qc = model.inputs[model.input_names.index(SIGNAL)].symbol
-        temperature = model.outputs[model.output_names.index(CONTROLLED)].expression
-        command = qc + self.gain_l_min_K * (temperature - self.set_point(0.0))
-        return model.substitute(qc, ca.fmin(ca.fmax(command, valve.lower_l_min), valve.upper_l_min))
+    def _raw_command(self, measured: float, time_min: float, dither: float) -> float:
+        control = self.controller
+        return control.base + dither + control.gain * (measured - control.set_point_at(time_min)) + self.integral
 
 
-def check_set_point(model: ProcessModel, value: float) -> None:
-    """Check a temperature set point.
+def check_controller(control: Controller, model: ProcessModel, actuator: Actuator | None) -> None:
+    """Check a controller against a model and its actuator.
+
+    Args:
+        control: the controller.
+        model: the process.
+        actuator: actuator of its input; None: there is no such input.
 
     Raises:
-        InputError: it is out of the bounds of the state.
+        InputError: the model has no such input or output, or a set point or the base is out of range.
     """
-    state = model.states[model.state_names.index(CONTROLLED)]
-    if not state.lower <= value <= state.upper:
+    if actuator is None or control.output not in model.output_names:
+        needed = ("input", control.input) if actuator is None else ("output", control.output)
+        got = model.input_names if actuator is None else model.output_names
+        name = f"controller of {control.input!r}"
+        raise InputError(f"{name} needs a model with the {needed[0]} {needed[1]!r}, {model.name} has {got}")
+    if not actuator.reaches(control.base):
+        unit = model.units[control.input]
         raise InputError(
-            f"set point of {CONTROLLED} must be in [{state.lower:g}, {state.upper:g}] {state.unit}, got {value:g}"
+            f"controller of {control.input!r}: base must be in [{actuator.lower:g}, {actuator.upper:g}] {unit}, "
+            f"got {control.base:g}"
+        )
+    for _, value in control.steps:
+        check_set_point(model, control.output, value)
+
+
+def check_set_point(model: ProcessModel, output: str, value: float) -> None:
+    """Check the set point of an output.
+
+    Raises:
+        InputError: it is no number, or out of the bounds of the state of that name.
+    """
+    state = next((item for item in model.states if item.name == output), None)
+    if state is None and not isfinite(value):
+        raise InputError(f"set point of {output} must be a finite number, got {value:g}")
+    if state is not None and not state.lower <= value <= state.upper:
+        raise InputError(
+            f"set point of {output} must be in [{state.lower:g}, {state.upper:g}] {state.unit}, got {value:g}"
         )
 
 
-class LevelControl(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A proportional controller of the level.
+def close_loops(model: ProcessModel, loops: tuple[ControlLoop, ...], *, integral: bool) -> ProcessModel:
+    """Model of the closed loops in continuous time, at the set points of plant time 0.
 
-    Attributes:
-        gain_per_min: Kc, change of the outflow over that of the volume.
+    It has the steady state of the sampled loops, which is its purpose, but other transients. A controlled input is its
+    command without feedback: base and dither.
+
+    Args:
+        model: the process.
+        loops: the loops.
+        integral: true to add the integral parts as the last states, in the order of the loops that have them.
     """
-
-    gain_per_min: float = level_control.GAIN
-
-    def __post_init__(self) -> None:
-        if not 0 < self.gain_per_min <= 1000:
-            raise ValueError(f"gain_per_min must be in (0, 1000], got {self.gain_per_min:g}")
+    closed = model
+    for loop in loops:
+        control, actuator = loop.controller, loop.actuator
+        given = model.inputs[model.input_names.index(control.input)]
+        measured = model.outputs[model.output_names.index(control.output)].expression
+        feedback = control.gain * (measured - control.set_point_at(0.0))
+        command = given.symbol + feedback
+        if integral and control.is_integral:
+            span = actuator.upper - actuator.lower
+            state = variable(f"integral {given.name}", given.unit, (-span, span), given.scale, "integral part")
+            command += state.symbol
+            closed = replace(
+                closed,
+                states=(*closed.states, state),
+                rhs=(*closed.rhs, feedback / control.integral_time_min),
+            )
+        closed = closed.substitute(given.symbol, ca.fmin(ca.fmax(command, actuator.lower), actuator.upper))
+    return closed

@@ -1,36 +1,36 @@
-"""The simulated plant: rows from equations, valve, sensors, scenario and faults. No clock, no bus.
+"""The simulated plant: rows from equations, actuators, sensors, scenarios and faults. No clock, no bus.
 
-Row k is measured at t_k = k periods, and its input is held until the next row. A change between two rows (an input, a
-fault injected or cleared) acts from the next row on, whose time is `time_min`. Under temperature control the input of
-row k is the controller's response to the measurement in row k. So the rows are a function of the configuration and of
-the row that each command precedes, and of nothing else.
+Row k is measured at t_k = k periods, and its inputs are held until the next row. A change between two rows (an input, a
+fault injected or cleared) acts from the next row on, whose time is `time_min`. Under control the input of row k is the
+controller's response to the measurement in row k. So the rows are a function of the configuration and of the row that
+each command precedes, and of nothing else.
 
-The plant may leave its operating branch, extinguish, ignite or run away: that is its physics, and the run continues.
+The plant may leave its operating branch (the reactor may extinguish, ignite or run away): that is its physics, and the
+run continues.
 While the equations cannot be integrated, the state is held and the rows are marked bad.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Literal
 
 import numpy as np
-from msgspec.structs import asdict
-from msgspec.structs import replace as with_changes
 
-from plant_node.actuators import CoolantValve
 from plant_node.config import PlantConfig
-from plant_node.controllers import CONTROLLED, check_set_point
+from plant_node.controllers import ControlLoop, check_controller, check_set_point, close_loops
 from plant_node.disturbances import process_noise
 from plant_node.initial_state import complete_state, start_state
-from plant_node.scenario import SIGNAL, Scenario
+from plant_node.process_settings import ProcessSettings, to_model_unit
+from plant_node.scenario import Scenario, seed_of_input
 from plant_node.sensors import Sensor
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
+from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import TIMING
-from reactorwatch.process.fault import FaultSpecification
+from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.process.integrate import SimulationError, Stepper
-from reactorwatch.process.level_control import with_level_control
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import to_minutes, to_time_ns
 
@@ -86,44 +86,48 @@ class Plant:
 
     Args:
         config: settings of the plant; those about pace and health are not used here.
-        model: the process, without the faults of `config`.
-        scenario: input of the plant.
+        process: the process, without the faults of `config`.
+        settings: settings of the plant as the process has them.
+        scenarios: programme of each input, by name.
+
+    Attributes:
+        units: units of the signals, by name, in which they are published.
+        trouble: reason why the equations could not be integrated; None: they could.
 
     Raises:
-        InputError: settings that do not fit the model.
+        InputError: settings that do not fit the process.
     """
 
-    def __init__(self, config: PlantConfig, model: ProcessModel, scenario: Scenario) -> None:
-        if model.input_names != (SIGNAL,):
-            raise InputError(f"{model.name}: a plant must have the one input {SIGNAL!r}, got {model.input_names}")
-        lower, upper = config.valve_limits_l_min
-        coolant = model.inputs[0]
-        if not coolant.lower <= lower < upper <= coolant.upper:
-            raise InputError(
-                f"valve_limits_l_min must be in [{coolant.lower:g}, {coolant.upper:g}] l/min, "
-                f"got {lower:g} and {upper:g}"
-            )
-        if config.level_control is not None:
-            model = _with_level(model, config.level_control.gain_per_min)
-        self.units = model.units
+    def __init__(
+        self, config: PlantConfig, process: Process, settings: ProcessSettings, scenarios: Mapping[str, Scenario]
+    ) -> None:
+        model = settings.equations
+        signals = {signal.name: signal for signal in process.signals}
+        self.units = {name: signals[name].unit or unit for name, unit in model.units.items()}
         self.trouble: str | None = None
+        self._scales = {name: to_model_unit(signals[name], model) for name in model.units}
+        self._effects = process.faults
         self._config = config
         self._base = model
-        self._scenario = scenario
-        self._valve = CoolantValve(lower, upper)
-        noise_sd, resolution = asdict(config.noise_sd), asdict(config.resolution)
+        self._scenarios = [scenarios[name] for name in model.input_names]
+        self._seeds = [seed_of_input(config.seed, index) for index in range(len(model.inputs))]
+        self._actuators = settings.actuators
+        self._manual: dict[str, float] = {}  # of inputs without a controller
         self._sensors = [
-            Sensor(signal, noise_sd.get(signal, 0.0), resolution.get(signal, 0.0), config.seed) for signal in self.units
+            Sensor(name, settings.noise_sd[name], settings.resolution[name], config.seed) for name in model.units
         ]
         self._process_noise = process_noise(config.process_noise_sd, model, config.period_min, config.seed)
         self._number = 0
         self._held: Array | None = None
-        self._control = config.temperature_control
-        if self._control is not None:
-            self._control.check(model, self._valve)
-        self._manual_l_min: float | None = None
+        for control in settings.controllers.values():
+            check_controller(control, model, settings.actuators.get(control.input))
+        self._loops = {
+            name: ControlLoop(settings.controllers[name], settings.actuators[name])
+            for name in model.input_names
+            if name in settings.controllers
+        }
         self._cleared: list[FaultChange] = []
-        self._installed = [_Installed(item, item.values.get("onset", 0.0)) for item in config.fault_specifications()]
+        self._installed = [_Installed(item, item.values.get("onset", 0.0)) for item in settings.faults]
         self._use(self._extend_model(self._installed))
         self._x = self._start()
 
@@ -139,10 +143,10 @@ class Plant:
 
     @property
     def mode(self) -> Literal["open loop", "automatic", "manual"]:
-        """Control mode of the coolant flow: by the scenario, by the temperature controller, or set in place of it."""
-        if self._control is None:
+        """Control mode: by the scenarios, by controllers, or with an input set in place of its controller."""
+        if not self._loops:
             return "open loop"
-        return "automatic" if self._manual_l_min is None else "manual"
+        return "automatic" if all(loop.manual is None for loop in self._loops.values()) else "manual"
 
     @property
     def state(self) -> dict[str, float]:
@@ -151,13 +155,14 @@ class Plant:
 
     def next_row(self) -> Row:
         """Measure a row, and integrate to the next."""
-        time_min, inputs = self.time_min, self._input()
+        time_min, inputs = self.time_min, self._inputs()
+        self._advance_loops()
         self._x, self._held = self._stepper.start_row(self._x, inputs, self._p, time_min), inputs
         row = Row(
             number=self._number,
             time_min=time_min,
             readings={
-                sensor.signal: sensor.reading(float(value), self._number)
+                sensor.signal: self._publish(sensor.signal, sensor.reading(float(value), self._number))
                 for sensor, value in zip(self._sensors, (*inputs, *self._true_outputs(inputs)), strict=True)
             },
             good=self.trouble is None,
@@ -174,26 +179,44 @@ class Plant:
         return row
 
     def set_input(self, signal: str, value: float) -> None:
-        """Hold an input at a value from the next row on, in place of the scenario or the controller.
+        """Hold an input at a value from the next row on, in place of its scenario or controller.
 
-        Under temperature control, `qc` switches the coolant flow to manual; and `T` sets the set point, constant from
-        then on, and switches back to automatic.
+        An input with a controller is then on manual. A controlled output sets the set point of its controller, constant
+        from then on, and switches back to automatic.
+
+        Args:
+            signal: name of the input or controlled output.
+            value: level in the unit in which the signal is published.
 
         Raises:
-            InputError: a signal that is not an input, or a value out of the range of the valve or the process.
+            InputError: any other signal, or a value out of the range of the actuator or the process.
         """
-        if self._control is not None and signal == CONTROLLED:
-            check_set_point(self._base, value)
-            self._control = with_changes(self._control, set_point_K=value)
-            self._manual_l_min = None
+        controlled = {loop.controller.output: name for name, loop in self._loops.items()}
+        if signal not in self._base.input_names and signal not in controlled:
+            raise InputError(f"unknown input {signal!r} (valid: {', '.join((*self._base.input_names, *controlled))})")
+        scale, offset = self._scales[signal]
+        level = scale * value + offset
+        if signal in controlled:
+            check_set_point(self._base, signal, level)
+            name = controlled[signal]
+            self._loops[name] = self._loops[name].with_set_point(level)
             return
-        if signal != SIGNAL:
-            valid = SIGNAL if self._control is None else f"{SIGNAL}, {CONTROLLED}"
-            raise InputError(f"unknown input {signal!r} (valid: {valid})")
-        if not (isfinite(value) and self._valve.reaches(value)):
-            lower, upper = self._valve.lower_l_min, self._valve.upper_l_min
-            raise InputError(f"{signal} must be in [{lower:g}, {upper:g}] l/min, got {value:g}")
-        self._manual_l_min = value
+        actuator = self._actuators[signal]
+        if not (isfinite(value) and actuator.reaches(level)):
+            lower, upper = (self._publish(signal, bound) for bound in (actuator.lower, actuator.upper))
+            raise InputError(f"{signal} must be in [{lower:g}, {upper:g}] {self.units[signal]}, got {value:g}")
+        if signal in self._loops:
+            self._loops[signal] = replace(self._loops[signal], manual=level)
+        else:
+            self._manual[signal] = level
+
+    def parse_fault(self, text: str) -> FaultSpecification:
+        """Read a fault specification with the effects of the process.
+
+        Raises:
+            InputError: a part of it is invalid.
+        """
+        return parse_fault(text, self._effects)
 
     def inject(self, specification: FaultSpecification) -> FaultSpecification:
         """Inject a fault.
@@ -237,30 +260,69 @@ class Plant:
         self._cleared += [FaultChange(item.specification, item.onset_min, False) for item in cleared if item.announced]
         return tuple(item.specification for item in cleared)
 
-    def _input(self) -> Array:
-        command = self._manual_l_min
-        if command is None and self._control is not None:
-            # The temperature does not depend on this row's input, which is not known yet.
-            outputs = self._true_outputs(np.array([self._control.base_flow_l_min]), self._controller_outputs)
-            index = self._model.output_names.index(CONTROLLED)
-            sensor = self._sensors[len(self._model.inputs) + index]
-            temperature_K = sensor.reading(float(outputs[index]), self._number)
-            command = self._control.command(temperature_K, self.time_min, self._dither())
-        elif command is None:
-            command = self._scenario.level(self.time_min, self._config.seed)
-        return np.array([self._valve.flow(command)])
+    def _inputs(self) -> Array:
+        """Inputs of the next row, limited by their actuators."""
+        measured = self._measured_outputs()
+        return np.array(
+            [
+                loop.command(measured[loop.controller.output], self.time_min, self._dither(index))
+                if (loop := self._loops.get(name)) is not None
+                else self._actuators[name].limit(self._manual.get(name, self._level(index)))
+                for index, name in enumerate(self._base.input_names)
+            ]
+        )
 
-    def _dither(self) -> float:
-        if self._control is None or not self._control.dither:
-            return 0.0
-        return self._scenario.level(self.time_min, self._config.seed) - self._scenario.mean
+    def _advance_loops(self) -> None:
+        measured = self._measured_outputs()
+        for index, name in enumerate(self._base.input_names):
+            if (loop := self._loops.get(name)) is not None:
+                value = measured[loop.controller.output]
+                self._loops[name] = loop.advance(value, self.time_min, self._dither(index), self._config.period_min)
+
+    def _measured_outputs(self) -> dict[str, float]:
+        """Readings of the next row on which controllers act, by output; empty without controllers."""
+        if not self._loops:
+            return {}
+        # The controlled outputs do not depend on this row's inputs, which are not known yet.
+        outputs = self._true_outputs(self._base_inputs(), self._controller_outputs)
+        sensors = self._sensors[len(self._base.inputs) :]
+        return {
+            sensor.signal: sensor.reading(float(value), self._number)
+            for sensor, value in zip(sensors, outputs, strict=True)
+        }
+
+    def _base_inputs(self) -> Array:
+        """Inputs without feedback: base and dither of controlled ones, levels of the others."""
+        return np.array(
+            [
+                self._loops[name].controller.base + self._dither(index) if name in self._loops else self._level(index)
+                for index, name in enumerate(self._base.input_names)
+            ]
+        )
+
+    def _level(self, index: int) -> float:
+        return self._scenarios[index].level(self.time_min, self._seeds[index])
+
+    def _dither(self, index: int) -> float:
+        loop = self._loops[self._base.input_names[index]]
+        return self._level(index) - self._scenarios[index].mean if loop.controller.dither else 0.0
+
+    def _publish(self, signal: str, value: float) -> float:
+        """Value in the unit in which a signal is published."""
+        scale, offset = self._scales[signal]
+        return (value - offset) / scale
 
     def _start(self) -> Array:
-        if self._control is None:
-            return start_state(self._model, self._input(), self._config.start)
-        base = np.array([self._control.base_flow_l_min + self._dither()])
-        model = self._extend_model(self._physical(self._installed))
-        return start_state(self._control.closed_loop(model, self._valve), base, self._config.start)
+        start = self._config.start
+        if not self._loops:
+            return start_state(self._model, self._inputs(), start)
+        model, loops = self._extend_model(self._physical(self._installed)), tuple(self._loops.values())
+        closed = close_loops(model, loops, integral=isinstance(start, str))
+        state = start_state(closed, self._base_inputs(), start)
+        integral = [loop.controller.input for loop in loops if loop.controller.is_integral]
+        for name, value in zip(integral, state[len(model.states) :].tolist(), strict=False):
+            self._loops[name] = replace(self._loops[name], integral=value)
+        return state[: len(model.states)]
 
     def _true_outputs(self, inputs: Array, function: ArrayFunction | None = None) -> Array:
         function = function or self._outputs
@@ -283,7 +345,7 @@ class Plant:
     def _install(self, faults: list[_Installed]) -> None:
         """Continue from the present state with these faults; nothing changes if they are invalid."""
         model = self._extend_model(faults)
-        held = self._input() if self._held is None else self._held
+        held = self._inputs() if self._held is None else self._held
         self._x = complete_state(model, self.state, held, self.time_min)
         self._installed = faults
         self._use(model)
@@ -308,10 +370,3 @@ class Plant:
         self._stepper, self._outputs = Stepper(model), ArrayFunction(model.function("outputs"))
         physical = self._extend_model(self._physical(self._installed))
         self._controller_outputs = ArrayFunction(physical.function("outputs"))
-
-
-def _with_level(model: ProcessModel, gain_per_min: float) -> ProcessModel:
-    try:
-        return with_level_control(model, gain_per_min)
-    except ValueError as error:
-        raise InputError(f"level_control: {error}") from error

@@ -27,8 +27,8 @@ def start_state(
     Args:
         model: the process, with its initial faults.
         inputs: inputs of the first row, shape (n_u,).
-        start: `operating` or `extinguished` for the hottest or coldest steady state at these inputs, or values of
-            the states by name.
+        start: `operating` or `extinguished` for the steady state at these inputs with the largest or smallest last
+            output, or values of the states by name.
 
     Returns:
         Shape (n_x,).
@@ -49,12 +49,9 @@ def start_state(
     points = steady_states(model, inputs, BEFORE_MIN)
     if not points:
         given = ", ".join(f"{item.name} = {value:g}" for item, value in zip(model.inputs, inputs, strict=True))
-        raise InputError(
-            f"start: {model.name} has no steady state at {given}; give the states, like {{C = 0.1, T = 438.54}}"
-        )
-    temperature = model.state_names.index("T")
-    by_temperature = sorted((item.state for item in points), key=lambda state: float(state[temperature]))
-    return by_temperature[-1 if start == "operating" else 0]
+        example = ", ".join(f"{item.name} = {0.5 * (item.lower + item.upper):g}" for item in model.states)
+        raise InputError(f"start: {model.name} has no steady state at {given}; give the states, like {{{example}}}")
+    return points[-1 if start == "operating" else 0].state
 
 
 def complete_state(model: ProcessModel, known: Mapping[str, float], inputs: Array, time_min: float) -> Array:

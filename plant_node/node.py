@@ -25,7 +25,6 @@ from reactorwatch.contract.messages_pb2 import (
     SetInput,
 )
 from reactorwatch.errors import InputError
-from reactorwatch.process.fault import parse_fault
 from reactorwatch.records.record import to_time_ns
 
 NODE = "plant"
@@ -130,7 +129,7 @@ class PlantNode:
                 text = f"{command.signal} = {command.value:g} {self._plant.units[command.signal]} {when}"
                 return text if self._plant.mode == "open loop" else f"{text}, on {self._plant.mode}"
             case InjectFault():
-                return f"fault {self._plant.inject(parse_fault(command.specification))} is in the plant"
+                return f"fault {self._plant.inject(self._plant.parse_fault(command.specification))} is in the plant"
             case ClearFault():
                 cleared = ", ".join(str(item) for item in self._plant.clear(command.cause))
                 return f"fault {cleared} is taken away {when}"

@@ -8,57 +8,89 @@ from msgspec.structs import replace as with_changes
 
 from plant_node.config import PlantConfig
 from plant_node.core import Plant
-from plant_node.scenario import FromFile, HeldRecord
+from plant_node.process_settings import fit_settings
+from plant_node.scenario import FromFile, HeldRecord, Scenario
+from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.find import find_process
+from reactorwatch.description.process import Process
+from reactorwatch.description.read import convert_to_process
 from reactorwatch.process.effect import TIMING
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.read_table import SignalColumn, read_table
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import read_extended_model
 
 
-def plant_from(config: PlantConfig, model: ProcessModel | None = None, driver: Record | None = None) -> Plant:
-    """Make the simulated plant; reads the record that drives it, if there is one.
+def plant_from(
+    config: PlantConfig, process: Process | ProcessModel | None = None, driver: Record | None = None
+) -> Plant:
+    """Make the simulated plant; reads the files that its settings name.
 
     Args:
         config: settings.
-        model: the process; None: that of the settings.
-        driver: a record whose input drives the plant, instead of the scenario of `config`.
+        process: the process; None: that of the settings.
+        driver: a record whose inputs drive the plant, instead of the scenario of `config`.
 
     Raises:
-        InputError: settings that do not fit the model, or an invalid file.
+        InputError: settings that do not fit the process, a process without equations, or an invalid file.
     """
-    scenario = config.scenario_settings()
-    if model is None:
-        config, model = _load_model(config)
-    if driver is not None:
-        return Plant(config, model, HeldRecord.of(driver))
-    if isinstance(scenario, FromFile):
-        signals = [SignalColumn(name, unit, required=name in model.input_names) for name, unit in model.units.items()]
-        return Plant(config, model, HeldRecord.of(read_table(Path(scenario.path), signals)))
-    return Plant(config, model, scenario)
+    config, found = load_process(config) if process is None else (config, find_process(process))
+    settings = fit_settings(config, found)
+    scenarios: dict[str, Scenario] = {}
+    for item in settings.equations.inputs:
+        programme = settings.scenarios[item.name]
+        if driver is not None:
+            scenarios[item.name] = HeldRecord.of(driver, item)
+        elif isinstance(programme, FromFile):
+            scenarios[item.name] = HeldRecord.of(_read_input(Path(programme.path), item.name, found), item)
+        else:
+            scenarios[item.name] = programme
+    return Plant(config, found, settings, scenarios)
 
 
-def _load_model(config: PlantConfig) -> tuple[PlantConfig, ProcessModel]:
-    """Load the process of the settings; its timing effects become faults."""
-    if config.model is None:
-        return config, cstr()
-    loaded = read_extended_model(Path(config.model))
+def load_process(config: PlantConfig) -> tuple[PlantConfig, Process]:
+    """Load the process of the settings; timing effects of an extended model become faults.
+
+    Raises:
+        InputError: as `find_process`.
+    """
+    choice = ProcessChoice(config.process)
+    if choice.file is None or choice.file.suffix.lower() != ".json":
+        return config, choice.load()
+    loaded = read_extended_model(choice.file)
     timing = [item for item in loaded.effects if item.effect.location == TIMING]
     physical = replace(loaded, effects=tuple(item for item in loaded.effects if item not in timing))
     faults = (*config.faults, *(str(item) for item in timing))
-    return with_changes(config, faults=faults), physical.build()
+    return with_changes(config, faults=faults), find_process(physical.build())
+
+
+def _read_input(path: Path, name: str, process: Process) -> Record:
+    """Read an input from a record of a process, which may hold no other signal of it."""
+    signals = [
+        SignalColumn(
+            signal.name,
+            signal.unit,
+            signal.role,
+            None if signal.column is None else str(signal.column),
+            required=signal.name == name,
+        )
+        for signal in process.signals
+    ]
+    return convert_to_process(read_table(path, signals, process.file_format), process)
 
 
 def simulate_record(
-    config: PlantConfig, rows: int | None = None, model: ProcessModel | None = None, driver: Record | None = None
+    config: PlantConfig,
+    rows: int | None = None,
+    process: Process | ProcessModel | None = None,
+    driver: Record | None = None,
 ) -> Record:
     """Simulate the record that a plant of these settings publishes.
 
     Args:
         config: settings; those about pace are not used.
         rows: number of rows; None: those of the configured duration.
-        model: see `plant_from`.
+        process: see `plant_from`.
         driver: see `plant_from`.
 
     Raises:
@@ -68,7 +100,7 @@ def simulate_record(
     rows = config.rows if rows is None else rows
     if rows is None or rows < 1:
         raise ValueError(f"rows must be at least 1, or the configuration must have a duration, got {rows}")
-    plant = plant_from(config, model, driver)
+    plant = plant_from(config, process, driver)
     measured = [plant.next_row() for _ in range(rows)]
     columns = {signal: np.array([row.readings[signal] for row in measured]) for signal in plant.units}
     times = np.array([row.time_min for row in measured])

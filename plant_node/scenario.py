@@ -1,4 +1,4 @@
-"""Scenarios: the commanded coolant flow as a function of time.
+"""Scenarios: the command of an input as a function of time.
 
 A scenario is a frozen structure of settings, and its level depends on nothing but time and seed. So a run can be cut
 anywhere, sped up or started in the middle, and its input is the same. Random levels are numbered for this: every hold
@@ -8,7 +8,7 @@ The default levels keep the nominal plant on its operating branch; a large or fa
 extinguishes it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import isfinite, pi, sin
@@ -19,41 +19,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.process.model import Variable
+from reactorwatch.process.operation import InputLevels
 from reactorwatch.records.record import Record
 
-SIGNAL = "qc"
+OLD_KEYS = {"level_l_min": "level"}
+"""Keys of earlier versions, by which settings may still name a parameter."""
 
 _STREAM = int.from_bytes(b"scenario")
 _EDGE = 1e-6  # in holds: rounding of a sample's time relative to an edge
 
 
 class Scenario(Protocol):
-    """A coolant flow over time."""
+    """The command of an input over time, in its unit."""
 
     @property
     def mean(self) -> float:
-        """Mean level in l/min."""
+        """Mean level."""
 
     def level(self, time_min: float, seed: int) -> float:
-        """Commanded coolant flow in l/min at a plant time, a deterministic function of the arguments."""
+        """Command at a plant time, a deterministic function of the arguments."""
 
 
 class RandomSteps(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A new level, uniformly distributed, at regular times.
 
     Attributes:
-        low: lowest level, l/min.
-        high: highest level, l/min.
+        low: lowest level.
+        high: highest level.
         hold_min: length of a hold.
     """
 
     kind: ClassVar[str] = "random-steps"
-    low: float = 90.0
-    high: float = 111.0
-    hold_min: float = 1.0
+    low: float
+    high: float
+    hold_min: float
 
     def __post_init__(self) -> None:
-        _check_levels(low=self.low, high=self.high)
         _check_order(self.low, self.high)
         _check_positive("hold_min", self.hold_min)
 
@@ -61,6 +63,11 @@ class RandomSteps(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def mean(self) -> float:
         """See `Scenario`."""
         return 0.5 * (self.low + self.high)
+
+    @property
+    def extremes(self) -> Mapping[str, float]:
+        """Lowest and highest level, by name of what sets them."""
+        return {"low": self.low, "high": self.high}
 
     def level(self, time_min: float, seed: int) -> float:
         """See `Scenario`."""
@@ -71,16 +78,16 @@ class Sines(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A sum of sinusoids about a mean.
 
     Attributes:
-        mean: mean level, l/min.
-        amplitudes: amplitude of each sinusoid, l/min.
+        mean: mean level.
+        amplitudes: amplitude of each sinusoid.
         periods_min: period of each sinusoid. The defaults have no common multiple within hours.
         phases: phase of each sinusoid at plant time 0, in rad; default: zero.
     """
 
     kind: ClassVar[str] = "sines"
-    mean: float = 100.0
-    amplitudes: tuple[float, ...] = (4.0, 3.0, 2.0)
-    periods_min: tuple[float, ...] = (3.1, 7.3, 19.7)
+    mean: float
+    amplitudes: tuple[float, ...]
+    periods_min: tuple[float, ...]
     phases: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -89,10 +96,14 @@ class Sines(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for name, values in (("periods_min", self.periods_min), ("phases", self.phases or self.amplitudes)):
             if len(values) != len(self.amplitudes):
                 raise ValueError(f"{name} must be as many as amplitudes, {len(self.amplitudes)}, got {len(values)}")
-        swing = sum(abs(amplitude) for amplitude in self.amplitudes)
-        _check_levels(**{"mean - amplitudes": self.mean - swing, "mean + amplitudes": self.mean + swing})
         for period in self.periods_min:
             _check_positive("periods_min", period)
+
+    @property
+    def extremes(self) -> Mapping[str, float]:
+        """Lowest and highest level, by name of what sets them."""
+        swing = sum(abs(amplitude) for amplitude in self.amplitudes)
+        return {"mean - amplitudes": self.mean - swing, "mean + amplitudes": self.mean + swing}
 
     def level(self, time_min: float, seed: int) -> float:
         """See `Scenario`."""
@@ -107,18 +118,17 @@ class Square(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Half a period low, half a period high.
 
     Attributes:
-        low: low level, l/min.
-        high: high level, l/min.
+        low: low level.
+        high: high level.
         period_min: period.
     """
 
     kind: ClassVar[str] = "square"
-    low: float = 95.0
-    high: float = 105.0
-    period_min: float = 20.0
+    low: float
+    high: float
+    period_min: float
 
     def __post_init__(self) -> None:
-        _check_levels(low=self.low, high=self.high)
         _check_order(self.low, self.high)
         _check_positive("period_min", self.period_min)
 
@@ -126,6 +136,11 @@ class Square(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def mean(self) -> float:
         """See `Scenario`."""
         return 0.5 * (self.low + self.high)
+
+    @property
+    def extremes(self) -> Mapping[str, float]:
+        """Lowest and highest level, by name of what sets them."""
+        return {"low": self.low, "high": self.high}
 
     def level(self, time_min: float, seed: int) -> float:
         """See `Scenario`."""
@@ -136,30 +151,32 @@ class Constant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A constant level.
 
     Attributes:
-        level_l_min: the level, l/min.
+        value: the level.
     """
 
     kind: ClassVar[str] = "constant"
-    level_l_min: float = 100.0
-
-    def __post_init__(self) -> None:
-        _check_levels(level_l_min=self.level_l_min)
+    value: float = msgspec.field(name="level")
 
     @property
     def mean(self) -> float:
         """See `Scenario`."""
-        return self.level_l_min
+        return self.value
+
+    @property
+    def extremes(self) -> Mapping[str, float]:
+        """The level, by name of what sets it."""
+        return {"level": self.value}
 
     def level(self, time_min: float, seed: int) -> float:
         """See `Scenario`."""
-        return self.level_l_min
+        return self.value
 
 
 class FromFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The coolant flow of a measured record, read into a `HeldRecord`.
+    """The input of a measured record, read into a `HeldRecord`.
 
     Attributes:
-        path: path of the record, a .csv file.
+        path: path of the record, in any format that is read.
     """
 
     kind: ClassVar[str] = "file"
@@ -168,36 +185,37 @@ class FromFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class HeldRecord:
-    """The coolant flow of a record with zero-order hold; the first row is plant time 0, the last is held.
+    """An input of a record with zero-order hold; the first row is plant time 0, the last is held.
 
     Attributes:
         time_min: times from 0, shape (rows,).
-        levels: levels in l/min, shape (rows,).
+        levels: levels, shape (rows,).
     """
 
     time_min: NDArray[np.float64]
     levels: NDArray[np.float64]
 
     @classmethod
-    def of(cls, record: Record) -> "HeldRecord":
-        """Take the coolant flow from a record.
+    def of(cls, record: Record, item: Variable) -> "HeldRecord":
+        """Take an input from a record.
 
         Raises:
-            InputError: it has no coolant flow, or one with gaps.
+            InputError: the record lacks the input, or has gaps or impossible values in it.
         """
-        if SIGNAL not in record.columns or not record.rows:
-            raise InputError(f"{record.name}: must have a column {SIGNAL!r} with at least one row to drive the plant")
+        name = item.name
+        if name not in record.columns or not record.rows:
+            raise InputError(f"{record.name}: must have a column {name!r} with at least one row to drive the plant")
         if record.runs is not None:
             raise InputError(
                 f"{record.name}: must be one run to drive the plant, {record.describe_runs()}; cut one run out of it"
             )
-        levels = record.columns[SIGNAL]
-        bad = ~(np.isfinite(levels) & (levels >= 0))
+        levels = record.columns[name]
+        bad = ~(np.isfinite(levels) & (levels >= item.lower))
         if bad.any():
             row = int(np.argmax(bad))
             raise InputError(
-                f"{record.name}: {SIGNAL} must be a number of at least 0 l/min in every row to drive the plant, "
-                f"got {levels[row]:g} at {record.time_min[row]:g} min"
+                f"{record.name}: {name} must be a number of at least {item.lower:g} {item.unit} in every row to drive "
+                f"the plant, got {levels[row]:g} at {record.time_min[row]:g} min"
             )
         return cls(record.time_min - record.time_min[0], levels)
 
@@ -217,34 +235,76 @@ Settings: TypeAlias = RandomSteps | Sines | Square | Constant | FromFile
 SCENARIOS: tuple[type[Settings], ...] = (RandomSteps, Sines, Square, Constant, FromFile)
 
 
-def scenario_settings(setting: str | Mapping[str, Any]) -> Settings:
-    """Parse the scenario of a setting.
+def split_scenarios(setting: str | Mapping[str, Any], inputs: Sequence[str]) -> dict[str, str | Mapping[str, Any]]:
+    """Scenario of each input: one for all, as text, or a table by input; without an entry, random steps.
+
+    Raises:
+        InputError: a table for one input of several does not say for which, or names no input.
+    """
+    if isinstance(setting, str):
+        return dict.fromkeys(inputs, setting)
+    if len(inputs) == 1 and not set(setting) <= set(inputs):
+        return {inputs[0]: setting}
+    if "kind" in setting:
+        raise InputError(f"scenario must be a table for each input, like [plant.scenario.{inputs[0]}], got {setting}")
+    for name in setting:
+        if name not in inputs:
+            raise InputError(f"scenario: {describe_unknown('input', name, inputs)}")
+    return {name: setting.get(name, RandomSteps.kind) for name in inputs}
+
+
+def scenario_settings(setting: str | Mapping[str, Any], levels: InputLevels) -> Settings:
+    """Parse the scenario of an input.
 
     Args:
-        setting: a kind, for its defaults; the path of a .csv record; or a table with `kind` and its parameters.
+        setting: a kind, for its defaults; the path of a record; or a table with `kind` and its parameters.
+        levels: levels of the input.
 
     Raises:
         InputError: an unknown kind or key, or a value that breaks a rule.
     """
-    if isinstance(setting, str):
-        setting = {"kind": FromFile.kind, "path": setting} if setting.lower().endswith(".csv") else {"kind": setting}
     kinds = {item.kind: item for item in SCENARIOS}
+    if isinstance(setting, str):
+        is_file = "." in setting and setting not in kinds
+        setting = {"kind": FromFile.kind, "path": setting} if is_file else {"kind": setting}
     if "kind" not in setting:
         raise InputError(f"scenario must have a 'kind' (valid: {', '.join(kinds)}), got {dict(setting)}")
-    kind, values = setting["kind"], {key: value for key, value in setting.items() if key != "kind"}
+    kind = setting["kind"]
+    values = {OLD_KEYS.get(key, key): value for key, value in setting.items() if key != "kind"}
     if kind not in kinds:
         raise InputError(f"scenario: {describe_unknown('kind', str(kind), kinds)}")
-    fields = tuple(field.name for field in msgspec.structs.fields(kinds[kind]))
+    fields = tuple(field.encode_name for field in msgspec.structs.fields(kinds[kind]))
     for key in values:
         if key not in fields:
             raise InputError(f"scenario {kind}: {describe_unknown('key', key, fields)}")
     if kind == FromFile.kind and "path" not in values:
-        raise InputError("scenario file: 'path' must say which .csv record drives the plant")
+        raise InputError("scenario file: 'path' must say which record drives the plant")
     try:
-        settings: Settings = msgspec.convert(values, kinds[kind])
+        settings: Settings = msgspec.convert({**levels.defaults(kind), **values}, kinds[kind])
     except msgspec.ValidationError as error:
         raise InputError(f"scenario {kind}: {error}") from error
     return settings
+
+
+def check_levels(settings: Settings, item: Variable) -> None:
+    """Check that the levels of a scenario are within the bounds of its input; those of a record are checked later.
+
+    Raises:
+        InputError: they are not.
+    """
+    if isinstance(settings, FromFile):
+        return
+    for name, level in settings.extremes.items():
+        if not item.lower <= level <= item.upper:
+            raise InputError(
+                f"scenario {settings.kind}: {name} must be in [{item.lower:g}, {item.upper:g}] {item.unit}, "
+                f"got {level:g}"
+            )
+
+
+def seed_of_input(seed: int, index: int) -> int:
+    """Seed of the scenario of an input, by its index; that of the first is the seed of the plant."""
+    return seed if index == 0 else int(np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)[0] >> 1)
 
 
 @lru_cache(maxsize=1024)
@@ -253,15 +313,9 @@ def _uniform(seed: int, index: int) -> float:
     return float(np.random.default_rng(np.random.SeedSequence([seed, _STREAM, index])).random())
 
 
-def _check_levels(**levels: float) -> None:
-    for name, level in levels.items():
-        if not (isfinite(level) and level >= 0):
-            raise ValueError(f"{name} must be at least 0 l/min, got {level:g}")
-
-
 def _check_order(low: float, high: float) -> None:
     if not low <= high:
-        raise ValueError(f"low must not exceed high, got {low:g} and {high:g} l/min")
+        raise ValueError(f"low must not exceed high, got {low:g} and {high:g}")
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -1,26 +1,50 @@
 """Watches a process plant as it runs, and explains it when it misbehaves.
 
-The public names are those of `reactorwatch.api`. They are imported when they are first used: the command needs few of
-them to answer.
+The public names are imported when they are first used: the command needs few of them to answer.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from reactorwatch.api import Monitor, backtest, diagnose, effects, identify, processes, read_record, simulate
+    from reactorwatch.api.backtest import backtest
+    from reactorwatch.api.diagnosis import diagnose
+    from reactorwatch.api.identification import identify
+    from reactorwatch.api.monitor import Monitor
+    from reactorwatch.api.records import Record, effects, processes, read_record
+    from reactorwatch.api.simulation import simulate
+    from reactorwatch.description.process import Process, Signal
     from reactorwatch.errors import InputError
     from reactorwatch.process.model import ProcessModel
-    from reactorwatch.records.record import Record
     from reactorwatch.spc.charts import catalogue as charts
 
 __version__ = "0.1.0"
 
+_MODULES = {
+    "InputError": "reactorwatch.errors",
+    "Monitor": "reactorwatch.api.monitor",
+    "Process": "reactorwatch.description.process",
+    "ProcessModel": "reactorwatch.process.model",
+    "Record": "reactorwatch.api.records",
+    "Signal": "reactorwatch.description.process",
+    "backtest": "reactorwatch.api.backtest",
+    "charts": "reactorwatch.spc.charts.catalogue",
+    "diagnose": "reactorwatch.api.diagnosis",
+    "effects": "reactorwatch.api.records",
+    "identify": "reactorwatch.api.identification",
+    "processes": "reactorwatch.api.records",
+    "read_record": "reactorwatch.api.records",
+    "simulate": "reactorwatch.api.simulation",
+}
+"""Modules of the public names; `charts` is one itself."""
+
 __all__ = [
     "InputError",
     "Monitor",
+    "Process",
     "ProcessModel",
     "Record",
+    "Signal",
     "backtest",
     "charts",
     "diagnose",
@@ -33,9 +57,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in __all__:
-        return getattr(importlib.import_module("reactorwatch.api"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = importlib.import_module(_MODULES[name])
+    return module if name == "charts" else getattr(module, name)
 
 
 def __dir__() -> list[str]:

@@ -10,6 +10,7 @@ import msgspec
 import tomli_w
 
 from reactorwatch.contract import keys
+from reactorwatch.description.plants import PlantProcesses
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime import bus_zenoh
@@ -120,7 +121,13 @@ def open_files(
     limits = Limits(config.keep_mb * _MB, config.keep_days * DAY_NS, config.keep_files)
     synced = config.fsync != "never"
     return RecordingFiles(
-        file_names(config), metadata, limits, synced=synced, open_part=open_part, read_clock=read_clock
+        file_names(config),
+        metadata,
+        limits,
+        synced=synced,
+        open_part=open_part,
+        read_clock=read_clock,
+        find_process=PlantProcesses(config.processes).find,
     )
 
 

@@ -39,6 +39,8 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         black_box_min: minutes before and after each alarm that are copied into a file of their own, which is never
             deleted; 0 copies none.
         resume_mb: free disk space, in megabytes, at which recording resumes after a full disk.
+        processes: process by plant, a name in the catalogue or a file, as which each file describes the plant's
+            signals; a key may be a pattern of plants such as `north_*`. Of other plants nothing is described.
         about: additional metadata of each file, such as the seed of a simulated plant.
         linger_s: after a stop is requested, recording ends when no message has arrived for this long, at most after ten
             times this long, so that the last messages of other nodes are recorded.
@@ -59,6 +61,7 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     black_box_min: float = 10.0
     resume_mb: float = 50.0
     linger_s: float = 0.5
+    processes: dict[str, str] = {}
     about: dict[str, str] = {}
 
     def __post_init__(self) -> None:

@@ -17,6 +17,7 @@ import structlog
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
+from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.core import ReceivedMessage, fingerprint
@@ -32,6 +33,8 @@ from recorder.storage.mcap_scan import RawMessage, Scan, Wanted
 from recorder.storage.mcap_writer import FILE_INDEX, RecordingWriter, check_free, part_of
 from recorder.storage.orphans import find_orphans, list_damaged, repair
 from recorder.storage.part_file import PART, PartFile
+from recorder.storage.process_metadata import PROCESS
+from recorder.storage.process_metadata import to_metadata as process_metadata
 from recorder.tools.cut import cut, receipt_window
 
 log = structlog.get_logger()
@@ -47,6 +50,7 @@ class RecordingFiles:
         synced: True to sync each file when it is completed.
         open_part: opens the file that is written to.
         read_clock: reads the time since boot, which ages the recordings.
+        find_process: returns the process of a plant, which each file with its samples describes; None: unknown.
 
     Raises:
         InputError: the folder does not exist, or the named file exists or is being written.
@@ -61,7 +65,11 @@ class RecordingFiles:
         synced: bool = False,
         open_part: Callable[[Path], PartFile] = PartFile,
         read_clock: Callable[[], BootClock] = read_boot_clock,
+        find_process: Callable[[str], Process | None] = lambda _: None,
     ) -> None:
+        self._find_process = find_process
+        self._keys: set[str] = set()  # in the current file
+        self._plants: set[str] = set()  # with samples in the current file
         self._names = names
         self._metadata = metadata
         self._limits = limits
@@ -123,6 +131,7 @@ class RecordingFiles:
         if self._previous:
             metadata["after"] = self._previous
         self._writer = RecordingWriter(path, metadata, self._open_part)
+        self._keys, self._plants = set(), set()
         self._file_count += 1
         self._previous = path.name
         for entry in latched:
@@ -140,8 +149,21 @@ class RecordingFiles:
             WriteError: the file cannot be written; see `abandon`.
         """
         assert self._writer is not None, "a file was started"
+        if received.recorded.key not in self._keys:
+            self._describe_plant(received.recorded.key)
         self._writer.write(received.recorded, readable=received.is_readable)
         self._last_ns = received.recorded.log_time_ns
+
+    def _describe_plant(self, key: str) -> None:
+        """Describe the process of a plant at the first of its samples in the file."""
+        self._keys.add(key)
+        topic = keys.parse(key)
+        if topic is None or topic.kind != keys.SAMPLE or topic.plant in self._plants:
+            return
+        self._plants.add(topic.plant)
+        process = self._find_process(topic.plant)
+        if process is not None and self._writer is not None:
+            self._writer.add_metadata(PROCESS, process_metadata(topic.plant, process))
 
     def write_gap(self, gap: Gap) -> None:
         """Record a gap in the messages of the bus.

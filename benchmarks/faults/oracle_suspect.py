@@ -13,9 +13,8 @@ from math import inf
 import numpy as np
 
 from benchmarks.faults.bank import BANK, Case
-from benchmarks.faults.runs import NOISE_SD, Truth, measurements_of, profile_changes, simulator_of
+from benchmarks.faults.runs import NOISE_SD, SIGNAL, Truth, measurements_of, profile_changes, simulator_of
 from monitor_node.isolation.causes import CAUSES
-from plant_node.scenario import SIGNAL
 from reactorwatch.arrays import Array
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.integrate import SimulationError

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.faults.bank import PERIOD_MIN, TRAINING_MIN
-from benchmarks.faults.runs import OUTPUTS
+from benchmarks.faults.runs import OUTPUTS, SIGNAL
 from benchmarks.faults.score import Interval
-from plant_node.scenario import SIGNAL
 from reactorwatch.arrays import Array
 from reactorwatch.identification.batch import fit_arx
 from reactorwatch.identification.linear_model import LinearModel

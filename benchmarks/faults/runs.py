@@ -10,13 +10,14 @@ from benchmarks.faults.bank import PERIOD_MIN, Case
 from plant_node.config import PlantConfig
 from plant_node.initial_state import start_state
 from plant_node.record import simulate_record
-from plant_node.scenario import SIGNAL, RandomSteps
+from plant_node.scenario import RandomSteps
 from reactorwatch.arrays import Array
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
 
+SIGNAL = "qc"
 OUTPUTS = ("C", "T")
 NOISE_SD = np.array([0.002, 0.3])
 """Noise of the measurements of C in mol/l and of T in K; the plant's default."""
@@ -82,7 +83,7 @@ def fault_free(seed: int, rows: int, phi: float = 0.0) -> Record:
         phi: coefficient of the AR(1) noise of both measurements, n[k] = phi n[k-1] + e[k]; its standard deviation is
             the same for every phi.
     """
-    scenario = RandomSteps()
+    scenario = RandomSteps(90.0, 111.0, 1.0)
     time_min = np.round(np.arange(rows) * PERIOD_MIN, 6)
     flows = np.array([scenario.level(float(minute), seed) for minute in time_min])
     outputs = _nominal().run(time_min, flows, _start(flows)).outputs

@@ -24,7 +24,6 @@ import msgspec
 
 from benchmarks.soak.memory import GROWTH_MB, Taken, find_growth_mb, most_in_thirds
 from benchmarks.soak.plan import PERIOD_MIN, Plan
-from benchmarks.soak.site import WATCH
 from monitor_node.replay import backtest
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode
@@ -149,7 +148,7 @@ def expected_changes(plan: Plan, plant: str, zero_ns: int) -> list[Change]:
     """Changes of alarms of a monitor that receives all samples of a plant and is never stopped."""
     config = plan.plant(plant, zero_ns)
     published = (encode(item) for item in samples_of(simulate_record(config), plant, zero_ns))
-    return changes_of(backtest.run(published, msgspec.structs.replace(WATCH, plant=plant)).alarm_messages)
+    return changes_of(backtest.run(published, msgspec.structs.replace(plan.monitor, plant=plant)).alarm_messages)
 
 
 def why_not_once(changes: Sequence[Change], onset_ns: int) -> str | None:

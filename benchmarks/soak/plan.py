@@ -7,6 +7,7 @@ that is slow.
 import random
 from typing import Literal, NamedTuple
 
+from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from reactorwatch.errors import InputError
 
@@ -66,6 +67,17 @@ KINDS: tuple[tuple[Kind, Manner], ...] = (
 memory of the first is measured over the whole run."""
 
 
+WATCH = MonitorConfig(
+    training_min=TRAINING_ROWS * PERIOD_MIN,
+    false_alarms_per_30_days=0.05,
+    isolation=False,
+    state_every_s=2.0,
+    health_period_s=2.0,
+)
+"""Settings of the monitors. With 200 plants over two hours chance raises one alarm in fifty runs. Isolation is off: it
+takes a core for a second a plant, and is tested elsewhere."""
+
+
 class Blow(NamedTuple):
     """A disturbance of a process or a link.
 
@@ -101,6 +113,7 @@ class Plan(NamedTuple):
         plants: names of the plants.
         faults: fault of each plant that has one.
         blows: disturbances in order of time.
+        monitor: settings of the monitors.
     """
 
     seed: int
@@ -109,6 +122,7 @@ class Plan(NamedTuple):
     plants: tuple[str, ...]
     faults: dict[str, Fault]
     blows: tuple[Blow, ...]
+    monitor: MonitorConfig = WATCH
 
     def plant(self, name: str, zero_ns: int) -> PlantConfig:
         """Configuration of a plant.

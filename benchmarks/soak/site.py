@@ -16,8 +16,7 @@ import msgspec
 from benchmarks.link_cuts import Proxy, Router
 from benchmarks.soak import garbage, publisher
 from benchmarks.soak.memory import Taken, own_memory_mb
-from benchmarks.soak.plan import PERIOD_MIN, TRAINING_ROWS, Blow, Plan
-from monitor_node.config import MonitorConfig
+from benchmarks.soak.plan import Blow, Plan
 from monitor_node.fleet.config import FleetConfig
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
@@ -30,16 +29,6 @@ FLEET = f"{keys.ROOT}/*"
 PATIENCE_S = 300.0
 KEPT_S = 60.0
 """Time span of messages that each publisher keeps: longer than any blow lasts."""
-
-WATCH = MonitorConfig(
-    training_min=TRAINING_ROWS * PERIOD_MIN,
-    false_alarms_per_30_days=0.05,
-    isolation=False,
-    state_every_s=2.0,
-    health_period_s=2.0,
-)
-"""Settings of the monitors. With 200 plants over two hours chance raises one alarm in fifty runs. Isolation is off: it
-takes a core for a second a plant, and is tested elsewhere."""
 
 
 class Lines:
@@ -182,7 +171,7 @@ class Site:
     def _monitor(self, number: int) -> "subprocess.Popen[bytes]":
         fleet = FleetConfig(plants=FLEET, shard=f"{number + 1}/{MONITORS}", state=str(self._folder / "states"))
         settings = self._folder / f"monitor{number + 1}.toml"
-        write_settings(settings, {"bus": self._via(number), "monitor": WATCH, "fleet": fleet})
+        write_settings(settings, {"bus": self._via(number), "monitor": self._plan.monitor, "fleet": fleet})
         command = [sys.executable, "-m", "reactorwatch", "monitor", "--config", str(settings)]
         with settings.with_suffix(".log").open("ab") as said:
             return subprocess.Popen(command, stderr=said)

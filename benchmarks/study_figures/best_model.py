@@ -1,4 +1,4 @@
-"""Figure 17: which model is best, and whether it is the third order's."""
+"""Chapter 4: which model is best, and whether it is the third order's."""
 
 from __future__ import annotations
 

@@ -1,132 +1,140 @@
-"""The catalogue of figures. A new one: a function that draws it in a file here, and a line below.
+"""The catalogue of the report's figures, by the numbers of their captions. A new one: a file here, and a line below.
 
-What the report says there is as far as the description of that work tells; where it names a subject and no result, so
-does the claim.
+The report's text refers to several figures by a number one lower than their caption has. Its figures 1 and 2 show no
+result: a block diagram and a drawing of the reactor.
 """
 
 from benchmarks.study_figures import (
     best_model,
-    control_limits,
     controllers,
+    data_flow,
     excitation,
     fault_records,
     flow_chart_branches,
     linear_against_plant,
-    model_fits,
+    model_orders,
     phase_plane,
+    report_arx,
     sampling_rate,
     steady_state_curve,
     step_responses,
 )
 from benchmarks.study_figures.figure import Figure
 
+_ORDERS = {1: "first", 2: "second", 3: "third"}
+_RECORDS = {
+    "17": ("Concentration without a fault", "No fault is detected, and none is there."),
+    "18": ("Concentration with input leakage", "The residual shows the fault, a leak of the input."),
+    "19": ("Concentration with a changed internal parameter", "The residual shows a change inside the plant."),
+    "20": ("Concentration with another changed parameter", "The residual shows another change inside the plant."),
+}
+
+
+def _model(key: str, family: str, order: int) -> Figure:
+    title = f"{'ARX' if family == 'arx' else 'OE'}({order},{order}) against the plant"
+    claim = f"A model of the {_ORDERS[order]} order predicts the plant's output."
+    if order == max(_ORDERS):
+        claim += " Of the three orders it predicts best, and its probability of noise is higher."
+    return Figure(key, title, claim, model_orders.compare(family, order))
+
+
 FIGURES: tuple[Figure, ...] = (
     Figure(
-        4,
+        "3",
+        "The plant's responses over the coolant flow",
+        "At 85 to 95 l/min the response is of first order; beyond 100 l/min it oscillates before it settles.",
+        step_responses.draw,
+        height_px=640,
+    ),
+    Figure(
+        "4",
         "Steady states over the coolant flow",
         "The plant has several steady states; its operating point is qc = 100 l/min, T = 438.54 K, C = 0.103 mol/l.",
         steady_state_curve.draw,
         height_px=640,
     ),
+    Figure("5", "Identification of the ARX(3,3) model", "A scheme of its estimation.", report_arx.estimate),
     Figure(
-        5,
+        "6", "Simulation of the ARX(3,3) model", "An acceptable estimate of the plant's response.", report_arx.simulate
+    ),
+    Figure(
+        "7",
+        "The diagnosis scheme",
+        "Data, sampling rate good?, model, SPC, mismatch?, parameters accurate?, fault or fault free.",
+        flow_chart_branches.draw,
+    ),
+    Figure(
+        "8",
+        "C after a unit step at 100 l/min, plant and linear model",
+        "The linear model estimates the response around the steady state.",
+        linear_against_plant.step_of_c,
+    ),
+    Figure(
+        "9",
+        "T after a unit step at 100 l/min, plant and linear model",
+        "The linear model estimates the response around the steady state; T behaves in a nonlinear way.",
+        linear_against_plant.step_of_t,
+    ),
+    Figure(
+        "10",
+        "One linear model at 85, 100 and 110 l/min",
+        "After a large step the linear model is off, after a short time it is accurate; at 110 l/min it is not. It is "
+        "accurate at the operating point only.",
+        linear_against_plant.compare,
+        height_px=560,
+    ),
+    *(_model(str(10 + order), "arx", order) for order in _ORDERS),
+    *(_model(str(13 + order), "oe", order) for order in _ORDERS),
+    *(Figure(key, title, claim, fault_records.draw_record(key)) for key, (title, claim) in _RECORDS.items()),
+    Figure(
+        "21-27",
+        "Block diagrams of identification and simulation",
+        "Simulink diagrams of the models.",
+        data_flow.draw,
+        360,
+    ),
+    Figure(
+        "section-conclusion",
+        "The report's scheme beside the monitor",
+        "The diagnosis performance is good, and the approach detects, isolates and identifies a fault.",
+        fault_records.compare,
+    ),
+    Figure(
+        "section-best-model",
+        "The best model",
+        "The third order predicts best. As further work the report recommends a neural network.",
+        best_model.draw,
+    ),
+    Figure(
+        "section-steady-states",
         "Phase plane",
         "The nonlinear plant has several steady states.",
         phase_plane.draw,
     ),
     Figure(
-        6,
-        "Open-loop answers to steps of the coolant flow",
-        "Simulates the nonlinear plant.",
-        step_responses.draw,
-    ),
-    Figure(
-        7,
+        "section-temperature-control",
         "Proportional temperature controller",
         "A proportional controller of the temperature moves the coolant flow.",
         controllers.temperature,
     ),
     Figure(
-        8,
+        "section-level-control",
         "Level controller",
-        "A level controller moves the outlet flow; the volume is taken as constant in the equations.",
+        "A level controller moves the outlet flow; the equations take the volume as constant.",
         controllers.level,
     ),
     Figure(
-        9,
-        "Linear model against the plant at 85 l/min",
-        linear_against_plant.claim(85.0),
-        linear_against_plant.at_85,
-    ),
-    Figure(
-        10,
-        "Linear model against the plant at 100 l/min",
-        linear_against_plant.claim(100.0),
-        linear_against_plant.at_100,
-    ),
-    Figure(
-        11,
-        "Linear model against the plant at 110 l/min",
-        linear_against_plant.claim(110.0),
-        linear_against_plant.at_110,
-    ),
-    Figure(
-        12,
+        "section-excitation",
         "Excitation",
-        "A single sinusoid is refused; sums of sinusoids and square waves are good.",
+        "A single sinusoid must be avoided; sums of sinusoids and square waves are good.",
         excitation.draw,
         height_px=640,
     ),
     Figure(
-        13,
+        "section-sampling-rate",
         "Sampling rate",
-        "Sampling too fast makes the regressor singular; every 6th row from the 100th on is taken, with lags in "
-        "samples "
-        "of the fast clock.",
+        "Sampling too fast makes neighbouring outputs equal and the regressor matrix singular; the M-files take every "
+        "6th row from the 100th on, with lags in samples of the fast clock.",
         sampling_rate.draw,
-    ),
-    Figure(
-        14,
-        "ARX models of orders 1 to 3, one-step-ahead prediction",
-        "Fits ARX models of order 1, 2 and 3 by least squares; the third order is said to be best.",
-        model_fits.arx_one_step,
-    ),
-    Figure(
-        15,
-        "ARX models of orders 1 to 3, simulation",
-        "As figure 14, the models left to run on their own outputs; the third order is said to be best.",
-        model_fits.arx_free_run,
-    ),
-    Figure(
-        16,
-        "Output-error models of orders 1 to 3, simulation",
-        "Fits output-error models of order 1, 2 and 3; the third order is said to be best.",
-        model_fits.oe_free_run,
-    ),
-    Figure(
-        17,
-        "The best model",
-        "The third order is best. As further work it recommends a neural-network predictor.",
-        best_model.draw,
-    ),
-    Figure(
-        18,
-        "Control limits of the residual",
-        "SPC limits mean +- 3 sigma on the model's residual tell fault-free operation from a mismatch.",
-        control_limits.draw,
-    ),
-    Figure(
-        19,
-        "The four fault records",
-        "Fault free, input leakage and two changes of internal parameters; the faults are detected by the residual.",
-        fault_records.draw,
-        height_px=720,
-    ),
-    Figure(
-        20,
-        "The flow chart",
-        "Data, sampling rate good?, model, SPC, mismatch?, parameters accurate?, fault or fault free; then isolation, "
-        "identification and reconstruction of the fault.",
-        flow_chart_branches.draw,
     ),
 )

@@ -1,4 +1,4 @@
-"""Figures 7 and 8: the plant under its proportional controllers of temperature and level."""
+"""Section 3.1: the plant under its proportional controllers of temperature and level."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from scipy.optimize import brentq
 from benchmarks.study_figures.canvas import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, label, legend_below, panels
 from benchmarks.study_figures.figure import Finding
 from benchmarks.study_figures.study import NAMES, Study
-from plant_node.config import NoiseSd, PlantConfig
-from plant_node.controllers import GAIN, TemperatureControl
+from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.process.level_control import GAIN as LEVEL_GAIN
-from reactorwatch.process.level_control import with_level_control
+from reactorwatch.process.library.cstr.controllers import GAIN, TemperatureControl
+from reactorwatch.process.library.cstr.level_control import GAIN as LEVEL_GAIN
+from reactorwatch.process.library.cstr.level_control import with_level_control
 from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, OPERATING_STATE
 from reactorwatch.process.simulate import Simulator
 
@@ -37,7 +37,7 @@ def temperature(study: Study, drawing: Drawing) -> Finding:
     for gain, colour, style in _GAINS:
         config = PlantConfig(
             seed=study.seed,
-            noise_sd=NoiseSd(C=0.0, T=0.0),
+            noise_sd={"C": 0.0, "T": 0.0},
             temperature_control=TemperatureControl(set_point_K=steps, gain_l_min_K=gain),
         )
         record = simulate_record(config, round(_END_MIN / config.period_min) + 1)
@@ -93,8 +93,7 @@ def level(study: Study, drawing: Drawing) -> Finding:
     text = (
         f"The inflow rises by {_INFLOW_STEP:g} l/min at {OPERATING_COOLANT_FLOW} l/min of coolant; the volume is a "
         "state.\n\n| gain, 1/min | rise of the volume at the end, l | by the balance, l | largest distance of T from "
-        "the plant of "
-        "constant volume, K |\n|---|---|---|---|\n" + "\n".join(rows) + "\n\n"
+        "the plant of constant volume, K |\n|---|---|---|---|\n" + "\n".join(rows) + "\n\n"
         "From the slowest controller to the fastest the distance to the plant of constant volume, which the report's "
         f"equations suppose, goes from {distances[0]:.2f} to {distances[-1]:.2f} K. Run and balance of the volume "
         f"differ by at most {max(off):.0e} l."

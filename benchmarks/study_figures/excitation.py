@@ -1,4 +1,4 @@
-"""Figure 12: which inputs excite a model enough to be learned."""
+"""Section 3.5: which inputs excite a model enough to be learned."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
 _INPUTS: tuple[tuple[str, Scenario], ...] = (
-    ("single sinusoid", Sines(amplitudes=(6.0,), periods_min=(5.0,))),
-    ("sum of three sinusoids", Sines()),
-    ("square wave", Square()),
-    ("random steps", RandomSteps()),
+    ("single sinusoid", Sines(100.0, (6.0,), (5.0,))),
+    ("sum of three sinusoids", Sines(100.0, (4.0, 3.0, 2.0), (3.1, 7.3, 19.7))),
+    ("square wave", Square(95.0, 105.0, 20.0)),
+    ("random steps", RandomSteps(90.0, 111.0, 1.0)),
 )
 _ROWS, _PERIOD_MIN, _SHOWN_MIN = 4000, 0.1, 40.0
 

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 class Verdict(Enum):
     """Agreement of a finding with the report."""
 
-    AGREES = "agrees"
-    IN_PART = "agrees in part"
-    DISAGREES = "disagrees"
-    NO_CLAIM = "no result of the report is known"
+    AGREES = "confirmed"
+    IN_PART = "confirmed in part"
+    DISAGREES = "corrected"
+    NO_CLAIM = "the report states no result"
 
 
 @dataclass(frozen=True)
@@ -37,26 +37,33 @@ class Finding:
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure of the report.
+    """One figure of the report, or one of its sections that has a claim and no figure.
 
     Attributes:
-        number: number in the study, in the report's order.
+        key: number of the report's caption, such as `8`; `section-` and a word for a section.
         title: subject of the figure.
-        claim: statement of the report, as far as it is known.
+        claim: statement of the report, in our words.
         draw: function that puts it on an empty drawing and returns the finding.
         height_px: height of the picture, which is 900 px wide.
     """
 
-    number: int
+    key: str
     title: str
     claim: str
     draw: Callable[[Study, Drawing], Finding]
     height_px: int = 500
 
     @property
+    def heading(self) -> str:
+        """Heading of its entry."""
+        if self.key.startswith("section-"):
+            return self.title
+        return f"{'Figures' if '-' in self.key else 'Figure'} {self.key.replace('-', ' to ')}: {self.title}"
+
+    @property
     def file_name(self) -> str:
         """File name of the picture."""
-        return f"figure-{self.number:02d}.png"
+        return f"{self.key}.png" if self.key.startswith("section-") else f"figure-{self.key.zfill(2)}.png"
 
 
 def verdict(agrees: bool) -> Verdict:

@@ -1,4 +1,4 @@
-"""Figure 20: the flow chart from data to verdict, for the four records and for three that end elsewhere."""
+"""Figure 7: the flow chart from data to verdict, for the four records and for three that end elsewhere."""
 
 from __future__ import annotations
 
@@ -7,26 +7,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.study_figures.canvas import GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, panels
-from benchmarks.study_figures.control_limits import ORDER, monitor_record
 from benchmarks.study_figures.figure import Finding, Verdict
 from benchmarks.study_figures.flow_chart import Conclusion, follow
 from benchmarks.study_figures.study import FAST_PERIOD_MIN, TRAINING_ROWS, Study, levels, row_times
-from monitor_node.config import MonitorConfig
-from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
-from plant_node.presets import PRESETS
 from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps
-from reactorwatch.contract.codec import encode
+from reactorwatch.identification.report_scheme import ORDER
 from reactorwatch.identification.structure import Structure
-from reactorwatch.records.record import Record, to_minutes
-from recorder.tools.player import samples_of
+from reactorwatch.process.library.cstr.operation import OPERATION
+from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawing
 
-_OUTPUT, _PLANT = "T", "cstr"
+_OUTPUT = "T"
 _QUESTIONS = ("is the sampling rate good?", "is there a mismatch?", "are the parameters accurate?")
 _COLOURS = {"fault free": GREEN, "fault": VERMILION, "sample again": ORANGE, "identify again": PURPLE}
 _PERIOD_MIN = 0.1
@@ -36,8 +32,8 @@ _WATCHED_ROWS = 2000
 def draw(study: Study, drawing: Drawing) -> Finding:
     """A row for each record: the answers, and where the chart ended."""
     ends = {
-        preset.name: (monitor_record(study.fault_record(preset.name), _OUTPUT)[0], bool(preset.faults))
-        for preset in PRESETS
+        preset.name: (_follow(study.fault_record(preset.name), TRAINING_ROWS), bool(preset.settings["faults"]))
+        for preset in OPERATION.presets
     }
     fast = study.fast(noise=False)
     extra = {
@@ -57,8 +53,7 @@ def draw(study: Study, drawing: Drawing) -> Finding:
     text = (
         f"Third-order ARX of {_OUTPUT}. Right in {right} of {len(ends)} named records. The last three have no fault "
         "and are there for the other ends of the chart: one sampled too fast, two learned from small moves of the "
-        "coolant and "
-        "then watched under moves of +-10 l/min.\n\n" + "\n".join(lines) + "\n\n"
+        "coolant and then watched under moves of +-10 l/min.\n\n" + "\n".join(lines) + "\n\n"
     )
     if misled:
         text += (
@@ -67,28 +62,10 @@ def draw(study: Study, drawing: Drawing) -> Finding:
             "deviations know nothing of that. So a model must be learned where the plant will be watched.\n\n"
         )
     text += (
-        "The report goes on to isolation, identification and reconstruction of the fault. The monitor does that, on "
-        "the innovations of a filter of the equations instead of the residuals of a linear model. On the same records "
-        "it says:\n\n| record | first alarm | likeliest cause at the end | since |\n|---|---|---|---|\n"
+        "The report goes on to isolation, identification and reconstruction of the fault and shows none of them. "
+        "Beside the monitor, which does: [the scheme and the monitor](#the-reports-scheme-beside-the-monitor)."
     )
-    text += "\n".join(_isolation_row(preset.name, study.fault_record(preset.name)) for preset in PRESETS)
-    text += "\n\nWhere the cause is a sensor, it also tells what that sensor should read (`docs/watching.md`)."
     return Finding(text, Verdict.IN_PART if right else Verdict.DISAGREES)
-
-
-def _isolation_row(name: str, record: Record) -> str:
-    """Row of the table with the monitor's suspects of a record."""
-    result = backtest.run([encode(item) for item in samples_of(record, _PLANT)], MonitorConfig(plant=_PLANT))
-    if not result.raised_alarms:
-        return f"| {name} | none | | |"
-    first = min((alarm for alarm, _ in result.raised_alarms), key=lambda alarm: alarm.raised_ns)
-    raised = f"{to_minutes(first.raised_ns, result.first_ns):.1f} min"
-    if not first.suspects:
-        return f"| {name} | {raised} | no suspect | |"
-    likeliest = first.suspects[0]
-    size = "" if not likeliest.profile else f", {likeliest.profile} of {likeliest.size:.3g}"
-    since = f"{to_minutes(likeliest.onset_ns, result.first_ns):.1f} min" if likeliest.onset_ns else ""
-    return f"| {name} | {raised} | {likeliest.cause} ({100 * likeliest.probability:.0f} %{size}) | {since} |"
 
 
 def _follow(record: Record, trusted_rows: int) -> Conclusion:
@@ -100,7 +77,7 @@ def _small_then_large(study: Study, small: float, rows: int) -> Record:
     """A plant without a fault, driven by small random steps about 100 l/min for some rows, then by large ones."""
     time_min = row_times(rows + _WATCHED_ROWS, _PERIOD_MIN)
     parts = [
-        levels(RandomSteps(100.0 - size, 100.0 + size), times, study.seed)
+        levels(RandomSteps(100.0 - size, 100.0 + size, 1.0), times, study.seed)
         for size, times in ((small, time_min[:rows]), (10.0, time_min[rows:]))
     ]
     driver = Record(time_min, {"qc": np.concatenate(parts)}, "random steps")

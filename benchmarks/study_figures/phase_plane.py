@@ -1,4 +1,4 @@
-"""Figure 5: where the reactor goes from many starts at one coolant flow."""
+"""Section 3.2: where the reactor goes from many starts at one coolant flow."""
 
 from __future__ import annotations
 

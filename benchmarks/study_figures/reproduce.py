@@ -10,7 +10,7 @@ from benchmarks.study_figures.figure import Figure, Finding
 from benchmarks.study_figures.page import FOLDER, page
 from benchmarks.study_figures.study import Study
 from reactorwatch.cli.batch import run_in_order
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import fill_folder, make_folder
 from reactorwatch.records.output import check_output_folder
@@ -26,13 +26,13 @@ class Job:
     """A figure to be drawn.
 
     Attributes:
-        number: number of the figure.
+        key: key of the figure.
         picture: file of the picture.
         seed: seed of every simulated record.
         measured: a record that models are identified from, or None.
     """
 
-    number: int
+    key: str
     picture: Path
     seed: int
     measured: Record | None
@@ -52,8 +52,8 @@ def reproduce(
     Args:
         out: folder; made if it is not there.
         seed: seed of every simulated record.
-        only: numbers of figures, such as `7,12`; all, if not given.
-        measured: a record that figures 14 to 17 identify their models from.
+        only: keys of figures, such as `7,12`; all, if not given.
+        measured: a record that figures 5, 6 and 11 to 16 identify their models from.
         processes: number of processes; None: one a core.
         scheduler: address of a cluster that draws them, or None.
 
@@ -71,10 +71,10 @@ def reproduce(
     found: list[tuple[Figure, Finding]] = []
     with fill_folder(out, "--out") as folder:
         pictures = make_folder(folder / FOLDER).absolute()
-        jobs = [Job(figure.number, pictures / figure.file_name, seed, measured) for figure in figures]
+        jobs = [Job(figure.key, pictures / figure.file_name, seed, measured) for figure in figures]
         for figure, finding in zip(figures, run_in_order(draw, jobs, "reproducing", processes, scheduler), strict=True):
             if isinstance(finding, Failed):
-                raise (RuntimeError if finding.is_internal else InputError)(f"figure {figure.number}: {finding.reason}")
+                raise (RuntimeError if finding.is_internal else InputError)(f"{figure.heading}: {finding.reason}")
             found.append((figure, finding))
         text = page(found, seed, measured.name if measured else "")
         with atomic_write(folder / PAGE) as temporary:
@@ -94,7 +94,7 @@ def check_out(out: Path, only: str | None, sources: Iterable[Path | None], *, fo
 
 def draw(job: Job) -> Finding:
     """Draw a figure."""
-    (figure,) = (item for item in FIGURES if item.number == job.number)
+    (figure,) = (item for item in FIGURES if item.key == job.key)
     with paper(job.picture, figure.height_px) as drawing:
         return figure.draw(Study(job.seed, job.measured), drawing)
 
@@ -102,16 +102,14 @@ def draw(job: Job) -> Finding:
 def _select_figures(only: str | None) -> Sequence[Figure]:
     if only is None:
         return FIGURES
-    numbers = [figure.number for figure in FIGURES]
+    keys = {figure.key: figure for figure in FIGURES}
     wanted = [part.strip() for part in only.split(",")]
     for part in wanted:
-        if part not in map(str, numbers):
-            raise InputError(
-                f"--only must be numbers of figures from {numbers[0]} to {numbers[-1]}, such as 7,12, got {part!r}"
-            )
-    return [figure for figure in FIGURES if str(figure.number) in wanted]
+        if part not in keys:
+            raise InputError(f"--only: {describe_unknown('figure', part, keys)}")
+    return [figure for figure in FIGURES if figure.key in wanted]
 
 
 def _report(out: Path, found: Sequence[tuple[Figure, Finding]]) -> str:
-    lines = [f"  {figure.number:>2}  {figure.title}: {finding.verdict.value}" for figure, finding in found]
-    return printable_lines([f"wrote {out / PAGE} and {len(found)} pictures; compared with the report:", *lines])
+    lines = [f"  {figure.heading}: {finding.verdict.value}" for figure, finding in found]
+    return printable_lines([f"wrote {out / PAGE} and {len(found)} pictures; the report's claims are:", *lines])

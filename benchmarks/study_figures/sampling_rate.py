@@ -1,4 +1,4 @@
-"""Figure 13: how the regressors and the response look at different sampling periods."""
+"""Section 3.5.2: how the regressors and the response look at different sampling periods."""
 
 from __future__ import annotations
 

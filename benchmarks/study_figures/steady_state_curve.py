@@ -1,4 +1,4 @@
-"""Figure 4: all steady states over the coolant flow, and where the report's operating point lies."""
+"""Figure 4: all steady states over the coolant flow, the report's operating point, and the linear model there."""
 
 from __future__ import annotations
 
@@ -71,5 +71,10 @@ def draw(study: Study, drawing: Drawing) -> Finding:
         f"rests at T = {rests[1]:.2f} K and C = {rests[0]:.4f} mol/l. T = {REPORTED_T:g} K belongs to **{belongs:.2f} "
         f"l/min**, where C = {there[0]:.4f} mol/l; C = {REPORTED_C:g} mol/l belongs to yet another flow, "
         f"{for_concentration:.2f} l/min, where T = {study.operating(for_concentration).state[1]:.2f} K."
+    )
+    text += (
+        "\n\nCaption and text of the report differ here: the text finds the several steady states in this figure, the "
+        "caption names the simulation of the linear model. Both are shown: the linear model's response in figures 8 "
+        "and 9."
     )
     return Finding(text, Verdict.AGREES if on_the_curve else Verdict.IN_PART)

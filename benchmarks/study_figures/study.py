@@ -10,14 +10,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from plant_node.config import NoiseSd, PlantConfig
-from plant_node.presets import PRESETS
+from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import Scenario
 from reactorwatch.arrays import Array
+from reactorwatch.identification import report_scheme
 from reactorwatch.identification.families import LINEAR_FAMILIES, Model
+from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.structure import Structure
 from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, cstr
+from reactorwatch.process.library.cstr.operation import NOISE_SD, OPERATION
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import SteadyState, steady_states
@@ -29,7 +31,7 @@ NAMES = {"C": "C, mol/l", "T": "T, K", "qc": "qc, l/min"}
 TRAINING_ROWS = 1000
 """Fault-free rows at the start of the fault records: 100 minutes."""
 
-_NO_NOISE = NoiseSd(C=0.0, T=0.0)
+_NO_NOISE = {"C": 0.0, "T": 0.0}
 IDENTIFICATION_HOLD_MIN, FAST_HOLD_MIN = 1.0, 2.4
 _IDENTIFICATION = {"kind": "random-steps", "low": 85.0, "high": 111.0, "hold_min": IDENTIFICATION_HOLD_MIN}
 _FAST = {"kind": "random-steps", "low": 90.0, "high": 108.0, "hold_min": FAST_HOLD_MIN}
@@ -51,6 +53,7 @@ class Study:
         self.measured = measured
         self._points: dict[float, list[SteadyState]] = {}
         self._fits: dict[tuple[str, int, str], Model] = {}
+        self._report_fits: dict[tuple[str, int, str], LinearModel] = {}
         self._fault_records: dict[str, Record] = {}
 
     @cached_property
@@ -99,16 +102,16 @@ class Study:
 
     @property
     def source(self) -> str:
-        """Description of the identification record of figures 14 to 17."""
+        """Description of the identification record of figures 5, 6 and 11 to 16."""
         record = self.identification
         period = float(np.median(np.diff(record.time_min)))
         if self.measured is not None:
             return f"the record {record.name}, {record.rows} rows {period:g} min apart"
-        low, high, noise = _IDENTIFICATION["low"], _IDENTIFICATION["high"], NoiseSd()
+        low, high, noise = _IDENTIFICATION["low"], _IDENTIFICATION["high"], NOISE_SD
         return (
             f"{record.rows} simulated rows {period:g} min apart, a new coolant flow between {low:g} and {high:g} "
-            f"l/min every {IDENTIFICATION_HOLD_MIN:g} min, noise of {noise.C:g} mol/l and {noise.T:g} K (standard "
-            "deviations)"
+            f"l/min every {IDENTIFICATION_HOLD_MIN:g} min, noise of {noise['C']:g} mol/l and {noise['T']:g} K "
+            "(standard deviations)"
         )
 
     def signals(self, output: str) -> tuple[Array, Array, Array]:
@@ -126,10 +129,25 @@ class Study:
             self._fits[key] = kind.fit(Structure.of_order(order), u[:half], y[:half], t[:half])
         return self._fits[key]
 
+    def report_fit(self, family: str, order: int, output: str) -> LinearModel:
+        """Fit a model to the first half of the identification record by the report's scheme; `arx` or `oe`."""
+        key = (family, order, output)
+        if key not in self._report_fits:
+            u, y, t = self.signals(output)
+            half = y.size // 2
+            fit = report_scheme.MODELS[family]
+            self._report_fits[key] = fit(Structure.of_order(order), u[:half], y[:half], t[:half])
+        return self._report_fits[key]
+
+    def spread(self, signal: str) -> float:
+        """Standard deviation of a signal over the first half of the identification record, in its unit."""
+        values = self.identification.columns[signal]
+        return float(np.nanstd(values[: values.size // 2]))
+
     def fault_record(self, preset: str) -> Record:
         """One of the four named records."""
         if preset not in self._fault_records:
-            (settings,) = (item.settings for item in PRESETS if item.name == preset)
+            (settings,) = (item.settings for item in OPERATION.presets if item.name == preset)
             self._fault_records[preset] = simulate_record(msgspec.convert({"seed": self.seed, **settings}, PlantConfig))
         return self._fault_records[preset]
 

@@ -48,6 +48,7 @@ class SuspectedCause(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     onset_ns: TimeNs = 0
     onset_sd_min: float = 0.0
     kind: str = ""
+    text: str = ""
 
 
 class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):

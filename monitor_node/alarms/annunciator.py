@@ -4,7 +4,7 @@ Alarms change with samples, with an operator's actions, and when shelving ends. 
 without an operator's action follow from the samples alone.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from math import isfinite
 from typing import Literal
 
@@ -23,7 +23,7 @@ from monitor_node.alarms.alarms import (
 from monitor_node.alarms.incidents import Incident, Incidents
 from monitor_node.alarms.kpis import AlarmStatus, KpiCounter, KpiState
 from monitor_node.alarms.on_off_delay import OnOffDelay
-from monitor_node.alarms.states import Event, State, is_consistent
+from monitor_node.alarms.states import UNACKNOWLEDGED_STATES, Event, State, is_consistent
 from monitor_node.config import MonitorConfig, PriorityName
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
@@ -99,6 +99,8 @@ class Annunciator:
         self.time_ns: int | None = None
         self.changes = 0
         self.has_unexplained = False
+        self.describe_operation: Callable[[int], str] = lambda time_ns: ""
+        """Operation of the plant at a time, which the text of a raised alarm then states; empty: as usual."""
 
     def declare(
         self,
@@ -147,6 +149,8 @@ class Annunciator:
         Arguments as for `ChartAlarm.record`.
         """
         before = alarm.memory.state
+        if explanation is not None and (operation := self.describe_operation(time_ns)):
+            explanation = explanation._replace(text=f"{explanation.text}; {operation}")
         event = alarm.record(time_ns, judgement, unit, explanation)
         self._on_change(alarm, event, before, time_ns)
         return self._publication(alarm, event, time_ns)
@@ -220,6 +224,26 @@ class Annunciator:
         alarm, time_ns = self._find(name), self._now_ns()
         self._change_by(alarm, event, time_ns, by, comment)
         return [self._publication(alarm, event, time_ns), self._publish_kpis(time_ns)]
+
+    def acknowledge_incident(self, number: int, by: str, comment: str) -> list[Publication]:
+        """Acknowledge all alarms of an incident, one after the other.
+
+        Args:
+            number: number of the incident.
+            by: name of the operator.
+            comment: reason; empty: the last comment stays.
+
+        Raises:
+            InputError: no sample has come yet, or the incident has no alarm that is unacknowledged.
+        """
+        due = [
+            name
+            for name, alarm in self._alarms.items()
+            if alarm.memory.incident == number and alarm.memory.state in UNACKNOWLEDGED_STATES
+        ]
+        if not due:
+            raise InputError(f"incident {number} has no alarm to acknowledge (the latest incident is {self.incident})")
+        return [item for name in due for item in self.act(name, Event.ACKNOWLEDGE, by, comment)]
 
     def shelve(self, name: str, minutes: float, by: str, comment: str) -> list[Publication]:
         """Shelve an alarm, or change the time for which it is shelved.

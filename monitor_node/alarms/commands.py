@@ -8,7 +8,8 @@ from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.alarms.states import Event
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.commands import check_signature, decode_command
-from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms, ShelveAlarm
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, CommandReply, ListAlarms, ShelveAlarm
+from reactorwatch.errors import InputError
 
 EVENTS: Mapping[str, Event] = {
     event.replace(" ", "_"): event
@@ -46,6 +47,8 @@ def execute_command(board: Annunciator, question: Encoded) -> tuple[CommandReply
         return CommandReply(accepted=True, text=f"{len(alarms)} alarms", alarms=alarms), []
     assert isinstance(command, AlarmCommand | ShelveAlarm), "the catalogue holds no others"
     by, comment = check_signature(command.by, command.comment)
+    if isinstance(command, AlarmCommand) and command.incident:
+        return _act_on_incident(board, name, command, by, comment)
     if isinstance(command, ShelveAlarm):
         publications = board.shelve(command.alarm, command.minutes, by, comment)
     elif name == "comment":
@@ -54,3 +57,16 @@ def execute_command(board: Annunciator, question: Encoded) -> tuple[CommandReply
         publications = board.act(command.alarm, EVENTS[name], by, comment)
     alarm = board.alarm(command.alarm)
     return CommandReply(accepted=True, text=f"alarm {command.alarm}: {name} by {by}", alarms=[alarm]), publications
+
+
+def _act_on_incident(
+    board: Annunciator, name: str, command: AlarmCommand, by: str, comment: str
+) -> tuple[CommandReply, list[Publication]]:
+    if command.alarm:
+        raise InputError(f"name an alarm or an incident, not both; got {command.alarm!r} and {command.incident}")
+    if name != Event.ACKNOWLEDGE:
+        raise InputError(f"an incident can be acknowledged and nothing else, got {name}; name an alarm")
+    publications = board.acknowledge_incident(command.incident, by, comment)
+    alarms = [item.message for item in publications if isinstance(item.message, Alarm)]
+    text = f"incident {command.incident}: {name} by {by}, {len(alarms)} alarms"
+    return CommandReply(accepted=True, text=text, alarms=alarms), publications

@@ -74,6 +74,9 @@ Outcome: TypeAlias = State | ByCondition | Refused
 OUT_OF_SIGHT = frozenset({State.SHELVED, State.SUPPRESSED_BY_DESIGN, State.OUT_OF_SERVICE})
 """States that are not annunciated."""
 
+UNACKNOWLEDGED_STATES = frozenset({State.UNACKNOWLEDGED, State.RETURNED_UNACKNOWLEDGED})
+"""States that an operator can acknowledge."""
+
 _IN_SIGHT_AGAIN = ByCondition(State.UNACKNOWLEDGED, State.NORMAL)
 _NOT_SHELVED = Refused("is not shelved")
 _NOT_SUPPRESSED = Refused("is not suppressed")

@@ -8,7 +8,7 @@ same.
 from collections import deque
 from typing import NamedTuple
 
-from monitor_node.baseline.predictor import ArxPredictor
+from monitor_node.baseline.predictor import ArxPredictor, arx_structure
 from monitor_node.baseline.references import ProcessReference
 from monitor_node.baseline.training import Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, Finding, read_equations
@@ -57,7 +57,7 @@ class ModelUpdate:
         """
         if self.rows is None or self.changes:
             return None
-        return DiagnosisJob(self.rows, (self._config.input, *self._config.outputs), equations)
+        return DiagnosisJob(self.rows, self._config.signals, equations)
 
     @property
     def is_pending(self) -> bool:
@@ -112,8 +112,7 @@ class ModelUpdate:
         assert self.rows is not None
         rows, self.rows = self.rows, None
         copies = [
-            ArxPredictor(self._config.order, self._config.delay, self._config.forgetting, with_snapshots=False)
-            for _ in predictors
+            ArxPredictor(arx_structure(self._config), self._config.forgetting, with_snapshots=False) for _ in predictors
         ]
         for copy, predictor in zip(copies, predictors, strict=True):
             copy.restore(predictor.state)

@@ -3,6 +3,9 @@
 The adaptive model is updated with every row. The reference is fitted to the whole training at its end and then frozen.
 Until then the prediction is that of the adaptive model before the update.
 
+If the training has too few rows for the parameters, the models get fewer lags of the inputs, then no inputs, then fewer
+lags of the output (`simpler_structures`), and the adaptive model is updated with the rows of the training again.
+
 Where these models are not the monitor's reference, rows are buffered, and the adaptive model is updated with all of
 them when it is read.
 
@@ -10,12 +13,15 @@ Signals are scaled by mean and spread of the first rows, so that the estimator w
 Snapshots are in the signals' own units.
 """
 
+from collections.abc import Iterator, Sequence
 from math import inf, isfinite, nan
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from monitor_node.baseline.training_record import check_training
+from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
@@ -24,6 +30,7 @@ from reactorwatch.identification.recursion import RlsState
 from reactorwatch.identification.regressor import BufferState, RegressorBuffer, Rows, rows_of
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
+from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.parameters import ParameterState, ParameterT2
 from reactorwatch.spc.parameter_drift import learn
@@ -37,10 +44,13 @@ SCALING_ROWS = 50
 ROWS_A_PARAMETER = 10
 """Least number of rows per parameter of the reference."""
 
+MOSTLY = 0.5
+"""Least share of the output's values that a simpler structure must predict; it is no cure for irregular rows."""
+
 MOST_BUFFERED = 1000
 """Buffered rows; memory stays bounded."""
 
-_BREAK = (-(2**63), nan, nan)
+_BREAK: tuple[int, Sequence[float], float] = (-(2**63), (), nan)
 """Marks a gap between two buffered rows."""
 
 
@@ -50,7 +60,7 @@ class PredictorState(StoredState, frozen=True):
     Attributes:
         buffer: rows of the next regressor.
         rls: the adaptive model.
-        first_rows: rows from which the scaling will be made: doubles, input and output of each.
+        first_rows: rows from which the scaling will be made: doubles, inputs and output of each.
         scaling: scaling of the signals; None before it is known.
         reference: parameters of the reference, doubles; None before the fit.
         told: snapshot of the reference, a serialized `ModelSnapshot`; None without snapshots.
@@ -72,26 +82,48 @@ class ArxPredictor:
     """Predicts one output.
 
     Args:
-        order: order of the models.
-        delay: delay of the input in samples.
+        structure: structure of the models.
         forgetting: forgetting factor of the adaptive model.
         with_snapshots: True if a snapshot of the reference will be read.
     """
 
-    def __init__(self, order: int, delay: int, forgetting: float, *, with_snapshots: bool = True) -> None:
-        self._structure = Structure.of_order(order, delay)
-        self._rls = RecursiveLeastSquares(self._structure.parameters, forgetting)
-        self._buffer = RegressorBuffer(self._structure)
-        self._first_rows: list[tuple[float, float]] = []
-        self._with_snapshots = with_snapshots
-        self._buffered: list[tuple[int, float, float]] = []
-        self._scaling: Scaling | None = None
-        self._scales = (0.0, 1.0, 0.0, 1.0)
+    def __init__(self, structure: Structure, forgetting: float, *, with_snapshots: bool = True) -> None:
+        self._wanted, self._forgetting, self._with_snapshots = structure, forgetting, with_snapshots
+        self._start(structure)
         self._reference: Array | None = None
         self._reference_model: ModelSnapshot | None = None
         self._fitted: Rows | None = None
         self._drift: ParameterT2 | None = None
         self._newest_drift: Judgement | None = None
+
+    def _start(self, structure: Structure) -> None:
+        """Start the adaptive model, and the scaling, with the next row."""
+        self._structure = structure
+        self._rls = RecursiveLeastSquares(structure.parameters, self._forgetting)
+        self._buffer = RegressorBuffer(structure)
+        self._first_rows: list[tuple[float, ...]] = []
+        self._buffered: list[tuple[int, Sequence[float], float]] = []
+        self._scaling: Scaling | None = None
+        self._input_scales: list[tuple[float, float]] = []
+        self._output_scale = 0.0, 1.0
+
+    @property
+    def uses_inputs(self) -> bool:
+        """True if the models have inputs."""
+        return self._structure.inputs > 0
+
+    @property
+    def simplification(self) -> str:
+        """Terms that the models lack because the training had too few rows; empty: none."""
+        has, wanted = self._structure, self._wanted
+        parts = []
+        if has.output_lags < wanted.output_lags:
+            parts.append(f"{has.output_lags} instead of {wanted.output_lags} lags of the output")
+        if has.inputs < wanted.inputs:
+            parts.append("no input")
+        elif has.inputs and has.input_lags < wanted.input_lags:
+            parts.append(f"{has.input_lags} instead of {wanted.input_lags} lags of the inputs")
+        return " and ".join(parts)
 
     @property
     def state(self) -> PredictorState:
@@ -114,11 +146,12 @@ class ArxPredictor:
         Raises:
             ValueError: the state is damaged.
         """
-        if state.buffer.structure != self._structure:
-            raise ValueError(f"the state must be of {self._structure}, got {state.buffer.structure}")
+        if state.buffer.structure not in (self._wanted, *simpler_structures(self._wanted)):
+            raise ValueError(f"the state must be of {self._wanted}, got {state.buffer.structure}")
+        self._start(state.buffer.structure)
         self._buffer = RegressorBuffer.from_state(state.buffer)
         self._rls = RecursiveLeastSquares.from_state(state.rls)
-        self._first_rows = [(first, second) for first, second in unpack_numbers(state.first_rows, 2).tolist()]
+        self._first_rows = [tuple(row) for row in unpack_numbers(state.first_rows, 1 + self._structure.inputs).tolist()]
         if state.scaling is not None:
             self._scale(state.scaling)
         if state.reference is not None:
@@ -128,25 +161,25 @@ class ArxPredictor:
         self._drift = None if state.drift is None else ParameterT2.from_state(state.drift)
         self._newest_drift = state.drifted
 
-    def update(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> float:
+    def update(self, time_ns: int, inputs: Sequence[float], value: float, *, follows: bool) -> float:
         """Update with a row; returns the prediction made before it, NaN if there is none.
 
         Args:
             time_ns: time of the row; later than the last row's if it follows.
-            input_value: input; NaN if missing.
+            inputs: one value an input; NaN if missing.
             value: output; NaN if missing.
             follows: True if the row before was one period ago.
         """
         if self._scaling is None:
-            self._learn_scaling(input_value, value)
+            self._learn_scaling(inputs, value)
             return nan
         if self._buffered:
             self.replay_buffer()
-        input_centre, input_spread, centre, spread = self._scales
+        centre, spread = self._output_scale
         if not follows:
             self._buffer.restart()
         scaled = (value - centre) / spread
-        regressor = self._buffer.update(time_ns, [(input_value - input_centre) / input_spread], [scaled])
+        regressor = self._buffer.update(time_ns, self._scale_inputs(inputs), [scaled])
         if regressor is None:
             return nan
         innovation = self._rls.update(regressor, scaled)
@@ -160,23 +193,23 @@ class ArxPredictor:
 
         Args:
             time_min: times in minutes, shape (rows,).
-            inputs: input values, shape (rows,); NaN if missing.
+            inputs: input values, shape (rows, inputs); NaN if missing.
             outputs: output values, shape (rows,); NaN if missing or left out.
 
         Returns:
             Residuals, shape (rows,), scaled to the size of out-of-sample residuals; NaN if missing. With too few rows
-            there is no reference, and all are NaN.
+            for any structure there is no reference, and all are NaN.
         """
         residual = np.full(time_min.size, nan)
+        self._simplify(time_min, inputs, outputs)
         if self._scaling is None:
             return residual
-        input_centre, input_spread, centre, spread = self._scales
-        rows = rows_of(self._structure, (inputs - input_centre) / input_spread, (outputs - centre) / spread)
+        inputs, parameters = inputs[:, : self._structure.inputs], self._structure.parameters
+        rows = rows_of(self._structure, self._scaling.inputs(inputs), self._scaling.outputs(outputs[:, None]))
         rows = _consecutive_rows(rows, time_min, self._structure.history)
-        parameters = self._structure.parameters
         if len(rows.outputs) < ROWS_A_PARAMETER * parameters:
             return residual
-        y = rows.outputs[:, 0]
+        y, spread = rows.outputs[:, 0], self._output_scale[1]
         theta: Array = np.asarray(np.linalg.lstsq(rows.regressors, y, rcond=1e-10)[0], dtype=np.float64)
         # With n parameters fitted to N rows, in-sample residuals are sqrt((N - n) / (N + n)) of out-of-sample ones.
         in_sample = np.sqrt((len(y) - parameters) / (len(y) + parameters))
@@ -190,6 +223,26 @@ class ArxPredictor:
             self._reference_model = self._snapshot(theta, covariance, condition, len(y), 1.0)
             self._reference_model.checks.extend(checks)
         return residual
+
+    def _simplify(self, time_min: Array, inputs: Array, outputs: Array) -> None:
+        """Change to the largest structure for which the rows of the training suffice; the present one if none is."""
+        if _count_rows(self._structure, time_min, inputs, outputs) >= ROWS_A_PARAMETER * self._structure.parameters:
+            return
+        least = MOSTLY * np.count_nonzero(np.isfinite(outputs))
+        for structure in simpler_structures(self._structure):
+            rows = _count_rows(structure, time_min, inputs, outputs)
+            if rows >= max(least, ROWS_A_PARAMETER * structure.parameters):
+                self._structure = structure
+                self.learn_again(time_min, inputs, outputs)
+                return
+
+    def learn_again(self, time_min: Array, inputs: Array, outputs: Array) -> None:
+        """Update a new adaptive model with the rows of a training; arguments as for `fit_reference`."""
+        self._start(self._structure)
+        follows = [False, *regular_intervals(time_min).tolist()]
+        times_ns = [round(minutes * MINUTE_NS) for minutes in time_min.tolist()]
+        for row in zip(times_ns, inputs.tolist(), outputs.tolist(), follows, strict=True):
+            self.buffer(*row[:3], follows=row[3])
 
     def start_drift_chart(self, arl0: float) -> None:
         """Start the chart of the difference between the parameters of the adaptive model and the reference.
@@ -221,28 +274,28 @@ class ArxPredictor:
         if self._drift is not None and self._reference is not None:
             self._newest_drift = self._drift.update(self._rls.parameters - self._reference, regressor)
 
-    def buffer(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> None:
+    def buffer(self, time_ns: int, inputs: Sequence[float], value: float, *, follows: bool) -> None:
         """Buffer a row for a later update; arguments as for `update`."""
         if self._scaling is None:
-            self._learn_scaling(input_value, value)
+            self._learn_scaling(inputs, value)
             return
         if not follows:
             self._buffered.append(_BREAK)
-        self._buffered.append((time_ns, input_value, value))
+        self._buffered.append((time_ns, inputs, value))
         if len(self._buffered) >= MOST_BUFFERED:
             self.replay_buffer()
 
     def replay_buffer(self) -> None:
         """Update with the buffered rows."""
         rows, self._buffered = self._buffered, []
-        input_centre, input_spread, centre, spread = self._scales
+        centre, spread = self._output_scale
         buffer, learn_row = self._buffer, self._rls.update
-        for time_ns, input_value, value in rows:
+        for time_ns, inputs, value in rows:
             if time_ns == _BREAK[0]:
                 buffer.restart()
                 continue
             scaled = (value - centre) / spread
-            regressor = buffer.update(time_ns, [(input_value - input_centre) / input_spread], [scaled])
+            regressor = buffer.update(time_ns, self._scale_inputs(inputs), [scaled])
             if regressor is not None:
                 learn_row(regressor, scaled)
                 self._compare(regressor)
@@ -263,23 +316,24 @@ class ArxPredictor:
         snapshot.CopyFrom(self._reference_model)
         return snapshot
 
-    def _learn_scaling(self, input_value: float, value: float) -> None:
-        if not (isfinite(input_value) and isfinite(value)):
+    def _learn_scaling(self, inputs: Sequence[float], value: float) -> None:
+        row = (*inputs[: self._structure.inputs], value)
+        if not all(map(isfinite, row)):
             return
-        self._first_rows.append((input_value, value))
+        self._first_rows.append(row)
         if len(self._first_rows) == SCALING_ROWS:
             rows = np.array(self._first_rows)
-            self._scale(Scaling.of(rows[:, 0], rows[:, 1]))
+            self._scale(Scaling.of(rows[:, :-1], rows[:, -1]))
             self._first_rows.clear()
 
     def _scale(self, scaling: Scaling) -> None:
         self._scaling = scaling
-        self._scales = (
-            scaling.input_centres[0],
-            scaling.input_spreads[0],
-            scaling.output_centres[0],
-            scaling.output_spreads[0],
-        )
+        self._input_scales = list(zip(scaling.input_centres, scaling.input_spreads, strict=True))
+        self._output_scale = scaling.output_centres[0], scaling.output_spreads[0]
+
+    def _scale_inputs(self, inputs: Sequence[float]) -> list[float]:
+        """Scaled inputs that the models have: all or none."""
+        return [(value - centre) / spread for value, (centre, spread) in zip(inputs, self._input_scales, strict=False)]
 
     def _snapshot(
         self, scaled: Array, scaled_covariance: Array, condition: float, rows: int, forgetting: float
@@ -303,15 +357,36 @@ class ArxPredictor:
         )
 
 
-def fewest_rows(order: int, delay: int) -> int:
-    """Least number of consecutive rows for a reference.
+def arx_structure(config: MonitorConfig) -> Structure:
+    """Structure of the identified models that the settings ask for."""
+    return Structure.of_order(config.order, config.delay, inputs=len(config.inputs))
 
-    Args:
-        order: order of the models.
-        delay: delay of the input in samples.
+
+def simpler_structures(structure: Structure) -> Iterator[Structure]:
+    """Structures with fewer parameters, the largest first.
+
+    They have fewer lags of the inputs, then no inputs, then fewer lags of the output.
+
+    >>> [(item.output_lags, item.inputs and item.input_lags) for item in simpler_structures(Structure.of_order(2))]
+    [(2, 1), (2, 0), (1, 0)]
     """
-    structure = Structure.of_order(order, delay)
+    if structure.inputs:
+        for lags in range(structure.input_lags - 1, 0, -1):
+            yield replace(structure, input_lags=lags)
+        yield (structure := replace(structure, inputs=0))
+    for lags in range(structure.output_lags - 1, 0, -1):
+        yield replace(structure, output_lags=lags)
+
+
+def fewest_rows(structure: Structure) -> int:
+    """Least number of consecutive rows for a reference of a structure."""
     return structure.history + ROWS_A_PARAMETER * structure.parameters
+
+
+def _count_rows(structure: Structure, time_min: Array, inputs: Array, outputs: Array) -> int:
+    """Number of rows of a training that a model can be fitted to."""
+    rows = rows_of(structure, inputs[:, : structure.inputs], outputs)
+    return len(_consecutive_rows(rows, time_min, structure.history).outputs)
 
 
 def _consecutive_rows(rows: Rows, time_min: Array, history: int) -> Rows:

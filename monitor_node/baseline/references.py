@@ -1,13 +1,14 @@
-"""Reference that predicts rows; residuals are taken against it. It is frozen when the training ends.
+"""Reference that predicts rows; residuals are taken against it.
 
 `ProcessReference` is the extended Kalman filter of the process model: it is nonlinear, so inputs beyond the training
-and irregular rows are no problem. `ArxReference` is the identified linear model: it serves any plant, but only within
-the inputs of its training; other rows are not evaluated.
+and irregular rows are no problem. `ArxReference` is the identified linear model, frozen when the training ends: it
+serves any plant, but only within the inputs of its training; other rows are not evaluated. A black box of few signals:
+`black_box_reference`.
 """
 
 from collections.abc import Sequence
 from math import isfinite, nan
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ MOST_UNKNOWN = 1
 """Rows in succession whose input may be unknown; after more, the filter restarts."""
 
 MARGIN = 0.1
-"""Share of the input's range in training by which an input may be beyond it."""
+"""Share of an input's range in training by which it may be beyond it."""
 
 
 class RowPrediction(NamedTuple):
@@ -50,46 +51,53 @@ class ProcessReferenceState(StoredState, frozen=True, tag="process"):
     Attributes:
         noise: noise of the plant and its sensors.
         filter: state of the filter.
-        last_input: the newest input that was not missing.
-        guessed: True if the input of the filter's newest row was missing.
+        last_inputs: the newest value of each input that was not missing; NaN before the first.
+        guessed: one flag an input: it was missing in the filter's newest row.
         typical_sd: see `ProcessReference`.
         held_rows: number of rows since then, which the filter did not use.
-        reach: see `input_reach`.
+        reach: see `input_reach`, one an input.
     """
 
     noise: NoiseLevels
     filter: FilterState
-    last_input: float
-    guessed: bool
+    last_inputs: list[float]
+    guessed: list[bool]
     typical_sd: list[float]
-    held_rows: int = 0
-    reach: float = 0.0
+    held_rows: int
+    reach: list[float]
 
 
 class ArxReferenceState(StoredState, frozen=True, tag="arx"):
-    """State of an `ArxReference`: the range of the input in which it is valid."""
+    """State of an `ArxReference`.
 
-    low: float
-    high: float
+    Attributes:
+        low: lower end of the range in which the models hold, one an input.
+        high: upper end of it.
+        uses_inputs: one flag an output: its model has the inputs.
+    """
+
+    low: list[float]
+    high: list[float]
+    uses_inputs: list[bool]
 
 
 class Reference(Protocol):
     """Predicts rows.
 
     Attributes:
-        kind: `equations` or `arx`, as published.
+        kind: `equations`, `black-box` or `arx`, as published.
     """
 
     kind: str
 
     def update(
-        self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...], missing: int = 0
+        self, time_ns: int, inputs: Sequence[float], values: list[float], accept: tuple[bool, ...], missing: int = 0
     ) -> RowPrediction:
         """Predict a row, then update with it.
 
         Args:
             time_ns: time of the row.
-            input_value: input; NaN if missing.
+            inputs: one value an input; NaN if missing.
             values: outputs; NaN if missing.
             accept: outputs that correct the reference whatever their residual.
             missing: number of rows missing just before this one.
@@ -99,8 +107,8 @@ class Reference(Protocol):
         """Restart with the next row: the plant's clock was set, or there was a gap."""
 
     @property
-    def state(self) -> ProcessReferenceState | ArxReferenceState:
-        """The state, without the model."""
+    def state(self) -> Any:
+        """The state, without the equations."""
 
 
 class ProcessReference:
@@ -123,8 +131,9 @@ class ProcessReference:
         self._indices = output_indices(model, outputs)
         self._count = len(model.outputs)
         self._accept_all = len(outputs) == self._count and self._indices == list(range(self._count))
-        self.last_input, self._guessed, self._held_rows = nan, False, 0
-        self._reach = 0.0
+        self._all_known = (False,) * len(model.inputs)
+        self.last_inputs, self._guessed, self._held_rows = (nan,) * len(model.inputs), self._all_known, 0
+        self._reach = [0.0] * len(model.inputs)
         self.typical_sd = [1.0] * len(outputs)
         """Median standard deviation of each residual in the last `run`, in the outputs' units."""
 
@@ -141,8 +150,8 @@ class ProcessReference:
         if len(state.filter.inputs) not in (0, len(model.inputs)):
             raise ValueError(f"the filter's state must have {len(model.inputs)} inputs, got {state.filter.inputs}")
         reference._filter.state = state.filter
-        reference.last_input, reference._guessed = state.last_input, state.guessed
-        reference._held_rows, reference._reach = state.held_rows, state.reach
+        reference.last_inputs, reference._guessed = tuple(state.last_inputs), tuple(state.guessed)
+        reference._held_rows, reference._reach = state.held_rows, list(state.reach)
         reference.typical_sd = list(state.typical_sd)
         return reference
 
@@ -160,98 +169,120 @@ class ProcessReference:
         return ProcessReferenceState(
             self.noise,
             self._filter.state,
-            self.last_input,
-            self._guessed,
+            list(self.last_inputs),
+            list(self._guessed),
             list(self.typical_sd),
             self._held_rows,
-            self._reach,
+            list(self._reach),
         )
 
     def update(
-        self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...], missing: int = 0
+        self, time_ns: int, inputs: Sequence[float], values: list[float], accept: tuple[bool, ...], missing: int = 0
     ) -> RowPrediction:
         """See `Reference`.
 
-        An input is held until the next row. So where a row or its input is missing, there is no prediction until the
-        next input. After one such row the prediction includes the uncertainty of the input: it was as before or as
-        after, plus or minus the largest pulse of one row in the training.
+        An input is held until the next row. So where a row or one of its inputs is missing, there is no prediction
+        until the next row with all inputs. After one such row the prediction includes the uncertainty of the inputs:
+        they were as before or as after, one of them plus or minus its largest pulse of one row in the training.
         """
         time_min, between = time_ns / MINUTE_NS, None
-        unknown = self._guessed + self._held_rows + missing
-        if isfinite(input_value):
+        unknown = any(self._guessed) + self._held_rows + missing
+        if all(map(isfinite, inputs)):
             if unknown > MOST_UNKNOWN:
                 self._filter.restart()
             elif unknown:
-                between = self._unknown_input(time_min, input_value)
-            self.last_input, self._guessed, self._held_rows = input_value, False, 0
-        elif unknown or not isfinite(self.last_input):
+                between = self._unknown_inputs(time_min, tuple(inputs))
+            self.last_inputs, self._guessed, self._held_rows = tuple(inputs), self._all_known, 0
+        elif unknown or not all(map(isfinite, self.last_inputs)):
+            pairs = zip(inputs, self.last_inputs, strict=True)
+            if not all(map(isfinite, self.last_inputs)):
+                self.last_inputs = tuple(value if isfinite(value) else last for value, last in pairs)
             self._held_rows += missing + 1
             unknown_values = [nan] * len(values)
             return RowPrediction(unknown_values, unknown_values)
         else:
-            self._guessed = True
+            pairs = zip(inputs, self.last_inputs, strict=True)
+            self._guessed = tuple(not isfinite(value) for value in inputs)
+            self.last_inputs = tuple(value if isfinite(value) else last for value, last in pairs)
         if self._accept_all:
-            step = self._filter.update(time_min, (self.last_input,), values, gate=GATE, accept=accept, between=between)
+            step = self._filter.update(time_min, self.last_inputs, values, gate=GATE, accept=accept, between=between)
             return RowPrediction(step.prediction, step.sd)
         measured, accepted = [nan] * self._count, [False] * self._count
         for i, value, is_accepted in zip(self._indices, values, accept, strict=True):
             measured[i], accepted[i] = value, is_accepted
         step = self._filter.update(
-            time_min, (self.last_input,), measured, gate=GATE, accept=tuple(accepted), between=between
+            time_min, self.last_inputs, measured, gate=GATE, accept=tuple(accepted), between=between
         )
         return RowPrediction([step.prediction[i] for i in self._indices], [step.sd[i] for i in self._indices])
 
     def is_normal(self, time_min: float) -> bool:
-        """True if the filter's newest row has this time, and its input was not missing."""
+        """True if the filter's newest row has this time, and no input of it was missing."""
         state = self._filter.state
-        known = not self._guessed and not self._held_rows and state.time_min == time_min
-        return self._accept_all and known and state.inputs == (self.last_input,)
+        known = not any(self._guessed) and not self._held_rows and state.time_min == time_min
+        return self._accept_all and known and state.inputs == self.last_inputs
 
     @property
     def numbers(self) -> tuple[Array, Array]:
         """Belief of the filter, and its variances: its own numbers, see `Filter`."""
         return self._filter.belief, self._filter.variances
 
-    def accept_row(self, time_min: float, input_value: float) -> None:
+    def accept_row(self, time_min: float, inputs: tuple[float, ...]) -> None:
         """Note a row that a kernel has filtered in `numbers`."""
-        self.last_input = input_value
-        self._filter.accept_row(time_min, (input_value,))
+        self.last_inputs = inputs
+        self._filter.accept_row(time_min, inputs)
 
-    def _unknown_input(self, time_min: float, input_value: float) -> tuple[float, list[tuple[float]]] | None:
-        """Start of the time in which the input is unknown, and its possible values: a row, or its input, is missing.
+    def _unknown_inputs(
+        self, time_min: float, inputs: tuple[float, ...]
+    ) -> tuple[float, list[tuple[float, ...]]] | None:
+        """Start of the time in which inputs are unknown, and their possible values.
 
-        None: the input was as before and after, or the filter starts with this row.
+        A row, or inputs of it, are missing. None: they were as before and after, or the filter starts with this row.
         """
-        before_min, ends = self._filter.state.time_min, {self.last_input, input_value}
-        if before_min is None or (len(ends) == 1 and not self._reach):
+        before_min, last, guessed = self._filter.state.time_min, self.last_inputs, any(self._guessed)
+        unknown = self._guessed if guessed else (True,) * len(inputs)
+        after = tuple(now if is_unknown else old for now, old, is_unknown in zip(inputs, last, unknown, strict=True))
+        ends = {last, after}
+        moving = [i for i, reach in enumerate(self._reach) if reach and unknown[i]]
+        if before_min is None or (len(ends) == 1 and not moving):
             return None
-        lower, upper = self.model.inputs[0].lower, self.model.inputs[0].upper
-        by = (-self._reach, self._reach) if self._reach else (0.0,)
-        inputs = [(min(max(end + reach, lower), upper),) for end in sorted(ends) for reach in by]
-        return (before_min if self._guessed else 0.5 * (before_min + time_min)), inputs
+        possible = [
+            self._within_bounds(end, i, by)
+            for end in sorted(ends)
+            for i in moving
+            for by in (-self._reach[i], self._reach[i])
+        ] or [self._within_bounds(end, None, 0.0) for end in sorted(ends)]
+        return (before_min if guessed else 0.5 * (before_min + time_min)), possible
+
+    def _within_bounds(self, inputs: tuple[float, ...], moved: int | None, by: float) -> tuple[float, ...]:
+        """Inputs, one of them moved by a pulse, within their bounds."""
+        variables = self.model.inputs
+        return tuple(
+            min(max(value + by if i == moved else value, variable.lower), variable.upper)
+            for i, (value, variable) in enumerate(zip(inputs, variables, strict=True))
+        )
 
     def restart(self) -> None:
         """See `Reference`."""
         self._filter.restart()
-        self._guessed, self._held_rows = False, 0
+        self._guessed, self._held_rows = self._all_known, 0
 
     def run(self, time_min: Array, inputs: Array, measured: Array) -> tuple[Array, Array]:
         """Run over many rows; returns residuals and normalised residuals, each of shape (n, outputs).
 
-        The reach of the input is learned (`input_reach`). The filter restarts after missing rows.
+        The reach of the inputs is learned (`input_reach`). The filter restarts after missing rows.
 
         Args:
             time_min: times in minutes, shape (n,).
-            inputs: input values, shape (n,).
+            inputs: input values, shape (n, inputs).
             measured: output values, shape (n, outputs).
         """
-        self._reach = input_reach(time_min, inputs)
+        self._reach = [input_reach(time_min, column) for column in inputs.T]
         if self._accept_all and np.isfinite(inputs).all():
             times = np.round(time_min * MINUTE_NS) / MINUTE_NS
             steps = self._filter.run(times, _mask_before_missing(time_min, inputs), measured, gate=GATE)
             z = steps.residual / steps.sd
             if not np.any(np.abs(z) > GATE):  # no acceptance depended on the row before
-                self.last_input, self._guessed, self._held_rows = float(inputs[-1]), False, 0
+                self.last_inputs, self._guessed, self._held_rows = tuple(inputs[-1].tolist()), self._all_known, 0
                 self.typical_sd = _median_sds(steps.sd)
                 return steps.residual, z
             self._filter.restart()
@@ -261,7 +292,7 @@ class ProcessReference:
         for row, values in enumerate(measured.tolist()):
             if missing[row]:
                 self.restart()
-            predicted = self.update(round(time_min[row] * MINUTE_NS), float(inputs[row]), values, accept)
+            predicted = self.update(round(time_min[row] * MINUTE_NS), inputs[row].tolist(), values, accept)
             residual = [value - prediction for value, prediction in zip(values, predicted.prediction, strict=True)]
             residuals[row], sds[row] = residual, predicted.sd
             z[row] = [size / sd for size, sd in zip(residual, predicted.sd, strict=True)]
@@ -280,38 +311,49 @@ class ArxReference:
     """Identified models, one an output; the caller sets their predictions.
 
     Args:
-        inputs: inputs of the training, shape (n,).
+        state: the state.
     """
 
     kind = "arx"
 
-    def __init__(self, inputs: Array) -> None:
-        finite = inputs[np.isfinite(inputs)]
-        low, high = (float(finite.min()), float(finite.max())) if finite.size else (-np.inf, np.inf)
-        margin = MARGIN * (high - low)
-        self._low, self._high = low - margin, high + margin
+    def __init__(self, state: ArxReferenceState) -> None:
+        self.state = state
+        self._sds = [1.0] * len(state.uses_inputs)
         self.predictions: list[float] = []
         """Predictions of the next row, one an output."""
 
     @classmethod
-    def from_state(cls, state: ArxReferenceState) -> "ArxReference":
-        """Resume from a state."""
-        reference = cls(np.zeros(0))
-        reference._low, reference._high = state.low, state.high
-        return reference
+    def of_training(cls, inputs: Array, uses_inputs: list[bool]) -> "ArxReference":
+        """Reference after a training.
 
-    @property
-    def state(self) -> ArxReferenceState:
-        """See `Reference`."""
-        return ArxReferenceState(self._low, self._high)
+        Args:
+            inputs: inputs of the training, shape (n, inputs).
+            uses_inputs: one flag an output: its model has the inputs.
+        """
+        lows, highs = [], []
+        for column in inputs.T:
+            finite = column[np.isfinite(column)]
+            low, high = (float(finite.min()), float(finite.max())) if finite.size else (-np.inf, np.inf)
+            margin = MARGIN * (high - low)
+            lows.append(low - margin)
+            highs.append(high + margin)
+        return cls(ArxReferenceState(lows, highs, uses_inputs))
 
     def update(
-        self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...], missing: int = 0
+        self, time_ns: int, inputs: Sequence[float], values: list[float], accept: tuple[bool, ...], missing: int = 0
     ) -> RowPrediction:
         """See `Reference`. There is no prediction with an input beyond the training, nor after a missing row."""
-        if self._low <= input_value <= self._high:
-            return RowPrediction(self.predictions, [1.0] * len(values))
-        return RowPrediction([nan] * len(values), [1.0] * len(values))
+        if not self.find_beyond(inputs):
+            return RowPrediction(self.predictions, self._sds)
+        pairs = zip(self.predictions, self.state.uses_inputs, strict=True)
+        return RowPrediction([nan if uses_inputs else prediction for prediction, uses_inputs in pairs], self._sds)
+
+    def find_beyond(self, inputs: Sequence[float]) -> list[int]:
+        """Indices of the inputs that are beyond the training, for models that have them."""
+        if True not in self.state.uses_inputs:
+            return []
+        ranges = zip(self.state.low, inputs, self.state.high, strict=True)
+        return [i for i, (low, value, high) in enumerate(ranges) if value < low or value > high]
 
     def restart(self) -> None:
         """Do nothing: the models restart by themselves."""
@@ -326,20 +368,20 @@ def output_indices(model: ProcessModel, outputs: tuple[str, ...]) -> list[int]:
     for output in outputs:
         if output not in model.output_names:
             raise InputError(
-                f"reference 'process' needs outputs of the reactor, {', '.join(model.output_names)}, got {output!r}; "
+                f"reference 'equations' needs outputs of the process, {', '.join(model.output_names)}, got {output!r}; "
                 f'set reference = "arx"'
             )
     return [model.output_names.index(output) for output in outputs]
 
 
 def input_reach(time_min: Array, inputs: Array) -> float:
-    """Largest pulse of the input that lasts one row: distance from the nearer of the rows before and after.
+    """Largest pulse of an input that lasts one row: distance from the nearer of the rows before and after.
 
     It is 0 if each move lasts for two rows at least. Then the input of a missing row was that of a neighbour.
 
     Args:
         time_min: times in minutes, shape (n,).
-        inputs: input values, shape (n,); NaN if missing.
+        inputs: values of the input, shape (n,); NaN if missing.
     """
     moved, is_next = np.abs(np.diff(inputs)), missing_in_intervals(time_min) == 0
     nearer = np.where(is_next[:-1] & is_next[1:], np.minimum(moved[:-1], moved[1:]), 0.0)
@@ -348,7 +390,7 @@ def input_reach(time_min: Array, inputs: Array) -> float:
 
 def _mask_before_missing(time_min: Array, inputs: Array) -> Array:
     """The inputs, with NaN in rows before missing rows, so that a filter restarts after these."""
-    return np.where(np.append(missing_in_intervals(time_min), 0) > 0, nan, inputs)
+    return np.where((np.append(missing_in_intervals(time_min), 0) > 0)[:, None], nan, inputs)
 
 
 def estimate_training_noise(
@@ -365,7 +407,7 @@ def estimate_training_noise(
         model: process model.
         outputs: names of the monitored outputs.
         time_min: times in minutes, shape (n,).
-        inputs: input values, shape (n,).
+        inputs: input values, shape (n, inputs).
         measured: output values, shape (n, outputs); NaN if missing or left out.
         smallest_sd: least standard deviation of each sensor.
     """

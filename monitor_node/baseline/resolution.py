@@ -11,6 +11,8 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.codegen.numba_kernel import jit
+
 SAME = 1e-12
 """Share of the largest value: a smaller difference is a rounding error."""
 
@@ -30,10 +32,21 @@ def resolution(values: NDArray[np.float64]) -> float:
     return float(steps.min()) if steps.size else 0.0
 
 
-def resolution_sd(values: NDArray[np.float64]) -> float:
+def resolution_sd(values: NDArray[np.float64], stated: float | None = None) -> float:
     """Standard deviation of a signal's residual due to its steps alone.
 
     Args:
         values: values of the signal, shape (n,); NaN where missing.
+        stated: resolution of the signal; None: it is learned.
     """
-    return resolution(values) / sqrt(12.0)
+    return (resolution(values) if stated is None else stated) / sqrt(12.0)
+
+
+@jit
+def quantise(value: float, step: float) -> float:
+    """Nearest multiple of a resolution; the value itself if that is 0.
+
+    >>> quantise(20.831, 0.25), quantise(20.831, 0.0)
+    (20.75, 20.831)
+    """
+    return np.floor(value / step + 0.5) * step if step > 0.0 else value

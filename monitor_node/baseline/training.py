@@ -5,26 +5,30 @@ model is fitted, as the settings ask. Disturbed intervals are left out. The prew
 residuals. A training with too much disturbance is refused and starts again. After `MOST_REFUSALS` the next is used in
 full: a plant that never rests is monitored as well.
 
-A signal with too few values is left out with the reason, and the others are monitored. Without values of the input the
-identified models predict each output from its own past alone.
+A signal with too few values is left out with the reason, and the others are monitored. The identified models predict
+without the inputs that are left out.
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import compress
 from math import isfinite, log10
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
-from monitor_node.baseline.predictor import ArxPredictor, fewest_rows
+from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_structure, fewest_rows
 from monitor_node.baseline.references import ArxReference, ProcessReference, Reference, estimate_training_noise
 from monitor_node.baseline.resolution import resolution_sd
-from monitor_node.baseline.signal_range import signal_ranges
+from monitor_node.baseline.signal_range import possible_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals
 from reactorwatch.contract.messages_pb2 import Check
+from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.prewhitening import Prewhitening, learn
@@ -92,7 +96,7 @@ class TrainingState(StoredState, frozen=True):
 
     Attributes:
         times_ns: times of the rows, 64 bits each.
-        rows: doubles: the input and the outputs of each row.
+        rows: doubles: the inputs and the outputs of each row.
         known: number of values of each output.
     """
 
@@ -114,15 +118,18 @@ class Training:
         self._config = config
         self._model = model
         self._predictors = predictors
-        self._rows: deque[tuple[int, float, list[float]]] = deque(maxlen=MOST_ROWS)
+        self._without_black_box = ""
+        self._rows: deque[tuple[int, Sequence[float], list[float]]] = deque(maxlen=MOST_ROWS)
         self._counts = [0] * len(config.outputs)
-        of_identified = max(fewest_rows(config.order, config.delay), FEWEST_ROWS)
-        self._fewest_rows = FEWEST_ROWS if model is not None else of_identified
+        of_one_input = replace(structure := arx_structure(config), inputs=min(structure.inputs, 1))
+        of_identified = max(fewest_rows(of_one_input), FEWEST_ROWS)
+        self.fewest_rows = FEWEST_ROWS if model is not None else of_identified
+        """Least number of values of each output that a training needs."""
 
     @property
     def state(self) -> TrainingState:
         """A copy of the state."""
-        rows = [(input_value, *values) for _, input_value, values in self._rows]
+        rows = [(*inputs, *values) for _, inputs, values in self._rows]
         return TrainingState(pack_times(row[0] for row in self._rows), pack_numbers(rows), list(self._counts))
 
     def restore(self, state: TrainingState) -> None:
@@ -131,27 +138,40 @@ class Training:
         Raises:
             ValueError: the state is damaged.
         """
-        outputs = len(self._config.outputs)
-        times_ns, rows = unpack_times(state.times_ns), unpack_numbers(state.rows, 1 + outputs).tolist()
+        inputs, outputs = len(self._config.inputs), len(self._config.outputs)
+        times_ns, rows = unpack_times(state.times_ns), unpack_numbers(state.rows, inputs + outputs).tolist()
         if len(times_ns) != len(rows) or len(state.known) != outputs:
             raise ValueError(f"a training must have a time a row and {outputs} counts, got {len(times_ns)} times")
-        self._rows.extend((time_ns, row[0], row[1:]) for time_ns, row in zip(times_ns, rows, strict=True))
+        if len(times_ns) > MOST_ROWS:
+            self.keep_all_rows()
+        self._rows.extend(
+            (time_ns, tuple(row[:inputs]), row[inputs:]) for time_ns, row in zip(times_ns, rows, strict=True)
+        )
         self._counts = list(state.known)
 
-    def add(self, time_ns: int, input_value: float, values: list[float]) -> None:
+    def add(self, time_ns: int, inputs: Sequence[float], values: list[float]) -> None:
         """Add a row.
 
         Args:
             time_ns: time of the row.
-            input_value: input; NaN if missing.
+            inputs: one value an input; NaN if missing.
             values: outputs; NaN if missing.
         """
         if self._rows and time_ns <= self._rows[-1][0]:  # the publisher was restarted: so is the record
             self._rows.clear()
             self._counts = [0] * len(values)
-        self._rows.append((time_ns, input_value, values))
+        self._rows.append((time_ns, inputs, values))
         for index, value in enumerate(values):
             self._counts[index] += isfinite(value)
+
+    @property
+    def rows(self) -> int:
+        """Number of rows so far."""
+        return len(self._rows)
+
+    def keep_all_rows(self) -> None:
+        """Use all rows of the training, however many they are."""
+        self._rows = deque(self._rows)
 
     def is_enough(self, timed_out: list[bool]) -> bool:
         """True if there are enough rows, without regard to outputs whose data timeout is active.
@@ -160,7 +180,7 @@ class Training:
             timed_out: one flag an output.
         """
         counts = [count for count, is_out in zip(self._counts, timed_out, strict=True) if not is_out]
-        return min(counts, default=0) >= self._fewest_rows
+        return min(counts, default=0) >= self.fewest_rows
 
     def finish(self, *, last_chance: bool) -> TrainingResult:
         """Learn from the rows, and drop them.
@@ -169,19 +189,23 @@ class Training:
             last_chance: True to use the training even if it is disturbed.
         """
         rows, self._rows = list(self._rows), deque(maxlen=MOST_ROWS)
+        self._counts = [0] * len(self._config.outputs)
         time_min = np.array([row[0] for row in rows]) / MINUTE_NS
-        inputs = np.array([row[1] for row in rows])
+        inputs = np.array([row[1] for row in rows], dtype=np.float64).reshape(len(rows), len(self._config.inputs))
         measured = np.array([row[2] for row in rows])
         outputs = self._config.outputs
-        steps = [resolution_sd(column) for column in measured.T]
+        steps = [
+            resolution_sd(column, self._config.resolution.get(name))
+            for name, column in zip(outputs, measured.T, strict=True)
+        ]
         smallest = [
             max(self._config.smallest_sd.get(name, 0.0), sd, 1e-12) for name, sd in zip(outputs, steps, strict=True)
         ]
         left_out = _too_few_values(outputs, measured) | self._constant_outputs(measured, steps)
         measured[:, [name in left_out for name in outputs]] = np.nan
         reference, z, screenings = self._reference(time_min, inputs, measured, smallest, steps)
-        if isinstance(reference, ArxReference) and (why := _too_few_values((self._config.input,), inputs[:, None])):
-            left_out |= why
+        if not isinstance(reference, ProcessReference):
+            left_out |= _too_few_values(self._config.inputs, inputs)
         left_out |= _too_few_residuals(outputs, z, time_min, inputs, left_out)
         evaluated = [name not in left_out for name in outputs]
         refused = (
@@ -191,7 +215,7 @@ class Training:
             refused, screenings = "", [Screening(np.isfinite(column), [], [], 0) for column in z.T]
         usable = np.column_stack([item.usable for item in screenings]) & np.array(evaluated)
         z = np.where(usable, z, np.nan)
-        if isinstance(reference, ProcessReference):
+        if isinstance(reference, ProcessReference | BlackBoxReference):
             smallest = [sd / typical for sd, typical in zip(smallest, reference.typical_sd, strict=True)]
         learned = [
             learn(column, sd) if is_evaluated else NOTHING_LEARNED
@@ -203,13 +227,30 @@ class Training:
                 name="training", result=refused or _screening_summary(outputs, time_min, screenings, evaluated) or "ok"
             )
         ]
+        if isinstance(reference, BlackBoxReference) and reference.weakness:
+            checks.append(Check(name=reference.kind, result=reference.weakness))
+        if self._without_black_box:
+            checks.append(Check(name=BlackBoxReference.kind, result=f"the ARX models judge: {self._without_black_box}"))
+        if isinstance(reference, ArxReference):
+            checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
         return TrainingResult(reference, learned, e, np.where(usable, measured, np.nan), checks, refused, left_out)
+
+    def _simplifications(self, evaluated: list[bool]) -> list[str]:
+        """Terms that the identified models lack, each with the outputs."""
+        outputs: dict[str, list[str]] = {}
+        for name, predictor in compress(zip(self._config.outputs, self._predictors, strict=True), evaluated):
+            outputs.setdefault(predictor.simplification, []).append(name)
+        return [
+            f"{', '.join(names)}: predicted with {text}, as there are fewer than {ROWS_A_PARAMETER} rows a parameter"
+            for text, names in outputs.items()
+            if text
+        ]
 
     def _constant_outputs(self, measured: Array, steps: list[float]) -> dict[str, str]:
         """Outputs that never vary, and have no smallest relevant deviation in the settings, with the reason."""
         return {
-            name: f"it reads {np.nanmax(column):.6g} in the whole training; smallest_sd could say what matters of it"
+            name: f"it reads {np.nanmax(column):.6g} in the whole training; smallest_sd or resolution may help"
             for name, column, step in zip(self._config.outputs, measured.T, steps, strict=True)
             if not step and not self._config.smallest_sd.get(name) and np.isfinite(column).any()
         }
@@ -219,48 +260,76 @@ class Training:
     ) -> tuple[Reference, Array, list[Screening]]:
         """Choose the reference; returns it with its normalised residuals and their screening."""
         minor = [max(MINOR * sd, step) for sd, step in zip(smallest, steps, strict=True)]
-        has_input = np.count_nonzero(np.isfinite(inputs)) >= FEWEST_ROWS
-        given_inputs = inputs if has_input else np.zeros(inputs.size)
-        if not has_input:
-            self._predict_without_input(time_min, measured)
+        has_values = np.count_nonzero(np.isfinite(inputs), axis=0) >= FEWEST_ROWS
+        given_inputs = np.where(has_values, inputs, 0.0)
+        if not has_values.all():
+            for predictor, column in zip(self._predictors, measured.T, strict=True):
+                predictor.learn_again(time_min, given_inputs, column)
         identified, screenings = _refit_without_outliers(
             lambda rows: (self._arx_residuals(time_min, given_inputs, rows), minor), measured
         )
-        possible = self._mask_impossible(inputs, measured) if self._model is not None and has_input else None
-        if possible is None:
-            return ArxReference(given_inputs), identified, screenings
-        possible_inputs, outputs = possible
+        has_equations = self._model is not None and bool(has_values.all())
+        possible = self._mask_impossible(inputs, measured) if has_equations else None
+        if possible is not None:
+            reference, z, judged = self._equations(time_min, *possible, smallest, steps)
+            residuals = z * np.array(reference.typical_sd)
+            if self._config.reference == "equations" or _predicts_as_well(residuals, identified):
+                return reference, z, judged
+        black_box = None
+        is_driven = bool(inputs.shape[1] and has_values.all())  # without inputs there is nothing to simulate
+        if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven):
+            black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
+        if black_box is not None:
+            residuals = black_box[1] * np.array(black_box[0].typical_sd)
+            if self._config.reference == "black-box" or _predicts_as_well(residuals, identified):
+                return black_box
+        return self._arx_reference(given_inputs), identified, screenings
+
+    def _equations(
+        self, time_min: Array, inputs: Array, outputs: Array, smallest: list[float], steps: list[float]
+    ) -> tuple[ProcessReference, Array, list[Screening]]:
+        """Equations as reference, with its normalised residuals and their screening."""
         process: list[ProcessReference] = []
 
         def innovations(rows: Array) -> Residuals:
-            process.append(self._process_reference(time_min, possible_inputs, rows, smallest))
-            z = process[-1].run(time_min, possible_inputs, outputs)[1]
-            return z, [max(MINOR, step / sd) for step, sd in zip(steps, process[-1].typical_sd, strict=True)]
+            process.append(self._process_reference(time_min, inputs, rows, smallest))
+            z = process[-1].run(time_min, inputs, outputs)[1]
+            return z, _minor(steps, process[-1].typical_sd)
 
-        z, process_screenings = _refit_without_outliers(innovations, outputs)
-        residuals = z * np.array(process[-1].typical_sd)
-        if self._config.reference == "process" or _predicts_as_well(residuals, identified):
-            return process[-1], z, process_screenings
-        return ArxReference(given_inputs), identified, screenings
+        z, screenings = _refit_without_outliers(innovations, outputs)
+        return process[-1], z, screenings
 
-    def _predict_without_input(self, time_min: Array, measured: Array) -> None:
-        """Update the identified models with the rows once more, with a constant input."""
-        follows = [False, *regular_intervals(time_min).tolist()]
-        times_ns = [round(minutes * MINUTE_NS) for minutes in time_min.tolist()]
-        for predictor, column in zip(self._predictors, measured.T.tolist(), strict=True):
-            for time_ns, value, is_next in zip(times_ns, column, follows, strict=True):
-                predictor.buffer(time_ns, 0.0, value, follows=is_next)
+    def _black_box(
+        self, time_min: Array, inputs: Array, outputs: Array, smallest: list[float], steps: list[float]
+    ) -> tuple[BlackBoxReference, Array, list[Screening]] | None:
+        """Black box as reference; None if the signals are too many or the rows too few."""
+        self._without_black_box = ""
+        learned: list[BlackBoxReference] = []
+
+        def innovations(rows: Array) -> Residuals:
+            reference, z = BlackBoxReference.learn(time_min, inputs, rows, outputs, smallest, self._config.delay)
+            learned.append(reference)
+            return z, _minor(steps, reference.typical_sd)
+
+        try:
+            z, screenings = _refit_without_outliers(innovations, outputs)
+        except InputError as error:
+            self._without_black_box = str(error)
+            return None
+        return learned[-1], z, screenings
 
     def _mask_impossible(self, inputs: Array, measured: Array) -> tuple[Array, Array] | None:
         """Inputs and outputs with NaN for impossible values; None if there are too many: the process is another one."""
-        signals = (self._config.input, *self._config.outputs)
-        columns = np.column_stack([inputs, measured])
-        lower, upper = np.array([(item.lower, item.upper) for item in signal_ranges(self._model, signals)]).T
+        columns, ranges = np.column_stack([inputs, measured]), possible_ranges(self._config, self._model)
+        lower, upper = np.array([(item.lower, item.upper) for item in ranges]).T
         out = np.isfinite(columns) & ((columns < lower) | (columns > upper))
-        if self._config.reference != "process" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):
+        if self._config.reference != "equations" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):
             return None
         columns = np.where(out, np.nan, columns)
-        return columns[:, 0], columns[:, 1:]
+        return columns[:, : inputs.shape[1]], columns[:, inputs.shape[1] :]
+
+    def _arx_reference(self, inputs: Array) -> ArxReference:
+        return ArxReference.of_training(inputs, [predictor.uses_inputs for predictor in self._predictors])
 
     def _arx_residuals(self, time_min: Array, inputs: Array, measured: Array) -> Array:
         """Fit the identified models; returns their residuals, shape (n, outputs)."""
@@ -290,6 +359,11 @@ def _refit_without_outliers(residuals: Callable[[Array], Residuals], measured: A
         return z, screenings
     kept = np.column_stack([item.usable for item in screenings]) | ~np.isfinite(z)
     return residuals(np.where(kept, measured, np.nan))[0], screenings
+
+
+def _minor(steps: list[float], sds: list[float]) -> list[float]:
+    """Largest normalised deviation of each output that does not matter."""
+    return [max(MINOR, step / sd) for step, sd in zip(steps, sds, strict=True)]
 
 
 def _prewhiten(z: Array, learned: Prewhitening) -> Array:
@@ -342,9 +416,9 @@ def _prediction_obstacle(time_min: Array, inputs: Array) -> str:
     regular = np.count_nonzero(follows)
     if regular < USUAL_SHARE * follows.size:
         return f"do rows come one by one period? {regular} of {follows.size} spacings are within a tenth of the usual"
-    known = int(np.count_nonzero(np.isfinite(inputs)))
-    if FEWEST_ROWS <= known < USUAL_SHARE * inputs.size:
-        return f"the input has a value in {known} of them"
+    known = int(np.count_nonzero(np.isfinite(inputs).all(axis=1)))
+    if FEWEST_ROWS <= known < USUAL_SHARE * len(inputs):
+        return f"{'the input has a value' if inputs.shape[1] == 1 else 'all inputs have values'} in {known} of them"
     return "too often a value is missing in the rows before"
 
 

@@ -21,7 +21,7 @@ def check_training(
     Args:
         structure: structure of the model.
         time_min: times in minutes, shape (rows,).
-        inputs: input values, shape (rows,).
+        inputs: input values, shape (rows, inputs).
         outputs: output values, shape (rows,).
         residual: one-step-ahead residuals, shape (rows,); NaN if missing.
     """
@@ -31,7 +31,8 @@ def check_training(
         ]
         if checks[-1].name != "variation":
             checks.append(_residual_check(whiteness(residual, fitted=structure.output_lags)))
-            checks.append(_residual_check(independence(residual, inputs, structure.delay, time=time_min)))
+            if structure.inputs:
+                checks.append(_residual_check(independence(residual, inputs, structure.delay, time=time_min)))
     except InputError as error:  # too few rows without a gap: no fault of the plant's, but worth reporting
         checks = [Check(name="record", result=str(error))]
     return checks

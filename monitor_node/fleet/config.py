@@ -13,6 +13,8 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         plants: key expression of the plants, such as `reactor/*`; None: one plant, that of the monitor's settings.
         shard: own shard, such as `2/5`: its plants, and those of shards whose monitors are gone.
+        processes: process by plant, a name in the catalogue or a file; a key may be a pattern of plants such as
+            `north_*`, and a plant's own entry goes before patterns. Other plants have that of the monitor's settings.
         state: folder of the plants' states, stored as often as the monitor's settings say. A restarted monitor, and one
             that takes a plant over with the same folder, resumes from it. None: nothing is stored.
         points: True to publish estimates, chart points and models for every row; each plant then costs as much as in a
@@ -21,6 +23,7 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     plants: str | None = None
     shard: str = "1/1"
+    processes: dict[str, str] = {}  # msgspec copies the default
     state: str | None = None
     points: bool = False
 

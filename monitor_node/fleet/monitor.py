@@ -19,7 +19,7 @@ have (`resume`). For those it resumes from their states.
 Nothing here reads a clock or does I/O.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
@@ -29,6 +29,7 @@ from monitor_node.fleet.admission import PROVEN_MESSAGES, PROVEN_ROWS, Unverifie
 from monitor_node.fleet.handed_over_alarms import HandedOverAlarms, alarm_of
 from monitor_node.fleet.recently_adopted import RecentlyAdopted
 from monitor_node.fleet.sharding import ShardGroup
+from monitor_node.fleet.watched_kinds import ANY, PlantKind, WatchedKinds
 from monitor_node.fleet.watched_plants import State, WatchedPlants
 from monitor_node.ingest.pending import PendingPlants, PlantHistory, truncate
 from monitor_node.replay.recorded_sessions import TIMEOUT_ALARM
@@ -85,6 +86,7 @@ class FleetMonitor:
         callbacks: functions of the node.
         model: see `Monitor`.
         points: see `Monitor`.
+        kinds: plants of other processes; all others have `config` and `model`.
 
     Raises:
         InputError: the settings are inconsistent.
@@ -99,14 +101,21 @@ class FleetMonitor:
         *,
         model: ProcessModel | None = None,
         points: bool = False,
+        kinds: Sequence[PlantKind] = (),
     ) -> None:
         self._shards, self._callbacks = shards, callbacks
-        self._watched = WatchedPlants(config, start_ns, model, points=points, diagnose=callbacks.diagnose)
+        all_kinds = (*kinds, PlantKind(ANY, config, model))
+        self._watched: WatchedPlants | WatchedKinds = (
+            WatchedKinds(all_kinds, start_ns, points=points, diagnose=callbacks.diagnose)
+            if kinds
+            else WatchedPlants(config, start_ns, model, points=points, diagnose=callbacks.diagnose)
+        )
         self._pending = PendingPlants()
         self._presume_gone_ns: int | None = start_ns + PRESUME_GONE_NS
         self._registered: dict[str, None] = {}  # all plants, with any owner
         self._unverified = UnverifiedPlants()
-        self._signals = (config.input, *config.outputs)
+        configs = [kind.config for kind in all_kinds]
+        self._signals = tuple(dict.fromkeys(name for item in configs for name in (*item.signals, *item.carried)))
         self._plants: dict[str, str] = {}  # plants that are not quiet, by key of a sample
         self._handed_over, self._recent = HandedOverAlarms(self._watched.alarms), RecentlyAdopted()
         self._paused_messages: list[Encoded] | None = None  # buffered in a pause

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import structlog
 
 from monitor_node.alarms.commands import COMMANDS
@@ -17,7 +18,7 @@ from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.monitor import Callbacks, FleetMonitor
 from monitor_node.fleet.partition import LeaseMonitor
 from monitor_node.fleet.sharding import ShardGroup
-from monitor_node.fleet.watched_plants import WatchedPlants
+from monitor_node.fleet.watched_kinds import ANY, PlantKind, WatchedKinds
 from monitor_node.health import NODE
 from monitor_node.ingest.pending import PlantHistory
 from monitor_node.ingest.rejects import RejectCounter
@@ -27,6 +28,7 @@ from monitor_node.state.seal import ForeignFileError
 from monitor_node.storage.fleet_states import FleetStates
 from monitor_node.storage.kept_aside import DAMAGED, OTHER_SETTINGS
 from monitor_node.storage.state_recovery import StateRecovery
+from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, Baseline, CommandReply
@@ -36,7 +38,6 @@ from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.metrics import FleetMetrics, serve_metrics
-from reactorwatch.runtime.model_file import read_model_on_bus_clock
 from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
 
 log = structlog.get_logger()
@@ -110,7 +111,8 @@ class FleetNode(FleetMonitor):
         name = f"{start_ns:020d}-{secrets.token_hex(4)}"
         self.shards = ShardGroup(self.expression, sharding.parse_shard(fleet.shard), name)
         self._others = OtherMonitors(self.shards.token, lambda: self.plants)
-        model = read_model_on_bus_clock(config.model)
+        kinds = load_kinds(config, fleet)
+        config, model = load_process(config)
         super().__init__(
             config,
             start_ns,
@@ -126,6 +128,7 @@ class FleetNode(FleetMonitor):
             ),
             model=model,
             points=fleet.points,
+            kinds=kinds,
         )
         for plant in sorted({*states.plants, *states.plants_aside}) if states is not None else []:
             if keys.matches(self.expression, f"{keys.ROOT}/{plant}"):
@@ -368,7 +371,8 @@ def run(
         if getattr(config, setting) is not None:
             raise InputError(f"{setting} holds what is known of one plant; a fleet takes [fleet] state, a folder")
     # Inconsistent settings are refused here, and machine code is compiled before plants wait.
-    WatchedPlants(config, 0, read_model_on_bus_clock(config.model), points=fleet.points).prepare()
+    kinds = (*load_kinds(config, fleet), PlantKind(ANY, *load_process(config)))
+    WatchedKinds(kinds, 0, points=fleet.points).prepare()
     states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
     with serve_metrics(metrics_config, FleetMetrics(NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop, uncached=UNCACHED, many_keys=True)
@@ -378,6 +382,23 @@ def run(
             watch(FleetNode(config, fleet, bus, time.time_ns(), states, metrics), bus, stop)
         finally:
             bus.close()
+
+
+def load_kinds(config: MonitorConfig, fleet: FleetConfig) -> tuple[PlantKind, ...]:
+    """Plants whose process the settings of the fleet name.
+
+    Args:
+        config: settings of each plant's monitor.
+        fleet: settings of the fleet.
+
+    Raises:
+        InputError: a process cannot be loaded, or does not fit the settings of the monitor.
+    """
+    watched = {
+        name: load_process(msgspec.structs.replace(config, process=name))
+        for name in dict.fromkeys(fleet.processes.values())
+    }
+    return tuple(PlantKind(pattern, *watched[name]) for pattern, name in fleet.processes.items())
 
 
 def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:

@@ -12,6 +12,7 @@ The policy uses sample times alone, so that a replay reproduces the live run exa
   explain means a restart of the publisher: pending rows are emitted, and a new run starts.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import nan
 from typing import NamedTuple
@@ -44,7 +45,7 @@ class MeasuredRow:
 
     Attributes:
         time_ns: sample time.
-        input_value: value of the input; NaN if missing.
+        inputs: one value an input; NaN if missing.
         values: one value an output; NaN if missing, or if the signal checks found that it is no measurement.
         units: units of the outputs.
         interval: interval before the row.
@@ -53,7 +54,7 @@ class MeasuredRow:
     """
 
     time_ns: int
-    input_value: float
+    inputs: Sequence[float]
     values: list[float]
     units: list[str]
     interval: Interval

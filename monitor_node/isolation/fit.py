@@ -208,9 +208,14 @@ class _Segment:
     def _hypothesis(self, candidate: Candidate) -> Hypothesis:
         return self._fitter.hypothesis(candidate.effect, self._profiles[candidate.profile])
 
+    def _like_of(self, candidate: Candidate) -> Fit:
+        """Run without a fault, as a fit of the candidate's profile."""
+        (parameters,) = _no_fault(self._run)
+        return replace(self._like, parameters=(parameters[: self._profiles[candidate.profile].n_shape],))
+
     def evaluate(self, candidate: Candidate, parameters: Array) -> Fit:
         """Run the filter of a cause with this size and onset."""
-        return self._hypothesis(candidate).evaluate(self._run, (parameters,), self._like)
+        return self._hypothesis(candidate).evaluate(self._run, (parameters,), self._like_of(candidate))
 
     def _centre_onset(self, candidate: Candidate) -> Array:
         """Parameters with the onset of a sensor's step in the middle of its interval, away from both jumps."""
@@ -227,7 +232,7 @@ class _Segment:
             if self.loss_without_fault - at_start.loss < _KEPT * candidate.gain:
                 trials = [self.evaluate(candidate, np.array([share * start[0], start[1]])) for share in _SHRINKS]
                 start = min((at_start, *trials), key=lambda item: item.loss).parameters[0]
-        fit = self._hypothesis(candidate).fit(self._run, (start,), steps, self._like)
+        fit = self._hypothesis(candidate).fit(self._run, (start,), steps, self._like_of(candidate))
         gain = self.loss_without_fault - fit.loss
         return replace(candidate, parameters=fit.parameters[0], gain=gain, w=np.nan_to_num(fit.w), fit=fit)
 

@@ -49,7 +49,7 @@ LEAST = 0.01
 CONVINCED = 0.5
 """Probability from which a suspected sensor is reconstructed."""
 
-UNITS = {effect.name: effect.unit for effect in CAUSES}
+EFFECTS = {effect.name: effect for effect in CAUSES}
 OUTPUTS = {effect.name: effect.output for effect in CAUSES if isinstance(effect, SensorEffect)}
 
 
@@ -277,14 +277,16 @@ class Suspicion:
 def _suspected_cause(suspect: Suspect) -> SuspectedCause:
     if suspect.cause == UNKNOWN:
         return SuspectedCause(UNKNOWN, suspect.probability)
+    effect = EFFECTS[suspect.cause]
     return SuspectedCause(
         suspect.cause,
         suspect.probability,
         suspect.profile,
         suspect.size,
         suspect.size_sd,
-        UNITS[suspect.cause],
+        effect.unit,
         round(suspect.onset_min * MINUTE_NS),
         suspect.onset_sd_min,
         suspect.kind,
+        effect.describe(suspect.size),
     )

@@ -1,19 +1,36 @@
 """Back-test: run the monitor's core over a recording at full speed."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from monitor_node.alarms.states import Event
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
+from monitor_node.replay.row_log import RowLog
+from monitor_node.state.pipeline_state import PipelineState
+from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Baseline
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.runtime.model_file import read_model_on_bus_clock
 
 RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
+
+
+class TrainedPlant(NamedTuple):
+    """A plant after its training, to be judged on other records.
+
+    Attributes:
+        rows: number of rows of the training.
+        state: the trained pipeline.
+        notes: notes on the training.
+    """
+
+    rows: int
+    state: PipelineState
+    notes: list[str]
 
 
 @dataclass
@@ -21,7 +38,7 @@ class Backtest:
     """Result of a back-test.
 
     Attributes:
-        input: name of the input.
+        inputs: names of the inputs.
         outputs: names of the outputs.
         rows: number of rows.
         first_ns: time of the first row; 0 without rows.
@@ -38,11 +55,12 @@ class Backtest:
         reference: kind of the reference, `equations` or `arx`; None if no row was evaluated.
         noise_levels: standard deviations of the equations' filter: of each sensor in its unit (`sensors`), of each
             state in its unit per square root of a minute (`states`); None with another reference.
+        training_rows: number of rows of the training; 0 if no row was evaluated.
         baseline: change of the model after the diagnosis of the training; None: rows were evaluated by the equations as
             given.
     """
 
-    input: str
+    inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     rows: int
     first_ns: int
@@ -59,6 +77,7 @@ class Backtest:
     reference: str | None = None
     noise_levels: dict[str, dict[str, float]] | None = None
     baseline: Baseline | None = None
+    training_rows: int = 0
 
     @property
     def raised_alarms(self) -> list[tuple[Alarm, int | None]]:
@@ -82,8 +101,30 @@ class Backtest:
         return alarms
 
 
-def run(
+def train(
     messages: Iterable[Encoded], config: MonitorConfig, zero_ns: int = 0, model: ProcessModel | None = None
+) -> TrainedPlant:
+    """Train a monitor on all rows of a record; arguments as for `run`.
+
+    Raises:
+        InputError: as `run`; or the record has too few rows, or no output that can be watched.
+    """
+    monitor = _make_monitor(config, zero_ns, model)
+    monitor.pipeline.open_training()
+    for message in _samples(messages, config.plant):
+        monitor.on_message(message, message.received_ns)
+    monitor.finish()
+    monitor.pipeline.end_training(monitor.last_ns or 0)
+    return TrainedPlant(monitor.pipeline.training_rows, monitor.pipeline.state, [*monitor.notes])
+
+
+def run(
+    messages: Iterable[Encoded],
+    config: MonitorConfig,
+    zero_ns: int = 0,
+    model: ProcessModel | None = None,
+    trained: TrainedPlant | None = None,
+    log: RowLog | None = None,
 ) -> Backtest:
     """Run the monitor over messages in the order of receipt.
 
@@ -92,28 +133,38 @@ def run(
         config: settings of the monitor.
         zero_ns: zero of the model's minutes, if its file does not have it.
         model: model with the equations, with minutes from 1970-01-01 UTC; None: the one that the settings name.
+        trained: result of a training with the same settings and model, by which all rows are judged; None: the rows
+            begin with a training.
+        log: log to which the rows are added; None: they are not logged.
 
     Raises:
         InputError: the settings are inconsistent, or the model's file is unusable.
     """
-    prefix = keys.key(config.plant, keys.SAMPLE, "")
-    model = model or read_model_on_bus_clock(config.model, zero_ns)
-    monitor = Monitor(config, start_ns=0, points=False, model=model, diagnose=find_deviations)
+    monitor = _make_monitor(config, zero_ns, model)
+    if trained is not None:
+        monitor.pipeline.restore(trained.state, 0)
+        monitor.pipeline.start_run()
     alarms: list[Alarm] = []
     first_ns: int | None = None
+    if log is not None:
+        rows = log  # the same log for the checker of types
+
+        def log_row(time_ns: int, publications: list[Publication]) -> None:
+            rows.add(time_ns, publications, judged=monitor.watching_since_ns is not None)
+
+        monitor.on_row_end = log_row
 
     def keep(publications: list[Publication]) -> None:
         alarms.extend(item.message for item in publications if isinstance(item.message, Alarm))
 
-    for message in messages:
-        if message.key.startswith(prefix) and (publications := monitor.on_message(message, message.received_ns)):
-            keep(publications)
+    for message in _samples(messages, config.plant):
+        keep(monitor.on_message(message, message.received_ns))
         if first_ns is None:
             first_ns = monitor.first_ns
     keep(monitor.finish())
     return Backtest(
-        input=config.input,
-        outputs=config.outputs,
+        inputs=monitor.config.inputs,
+        outputs=monitor.config.outputs,
         rows=monitor.rows,
         first_ns=(monitor.first_ns or 0) if first_ns is None else first_ns,
         last_ns=monitor.last_ns or 0,
@@ -123,10 +174,22 @@ def run(
         expected_false_alarms=monitor.expected_false_alarms,
         alarm_messages=alarms,
         refused=dict(monitor.rejects.by_reason),
-        notes=monitor.notes,
+        notes=[*(trained.notes if trained is not None else ()), *monitor.notes],
         left_out=monitor.excluded_signals,
         refused_trainings=monitor.refused_trainings,
         reference=monitor.reference or None,
         noise_levels=monitor.noise_levels,
         baseline=monitor.baseline,
+        training_rows=monitor.pipeline.training_rows if trained is None else trained.rows,
     )
+
+
+def _make_monitor(config: MonitorConfig, zero_ns: int, model: ProcessModel | None) -> Monitor:
+    if model is None:
+        config, model = load_process(config, zero_ns)
+    return Monitor(config, start_ns=0, points=False, model=model, diagnose=find_deviations)
+
+
+def _samples(messages: Iterable[Encoded], plant: str) -> Iterator[Encoded]:
+    prefix = keys.key(plant, keys.SAMPLE, "")
+    return (message for message in messages if message.key.startswith(prefix))

@@ -20,13 +20,14 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.replay.message_diff import MessageDiff
 from monitor_node.replay.recorded_sessions import Session, find_sessions, is_timeout
+from monitor_node.watched_process import load_process, watch_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
+from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.runtime.model_file import read_model_on_bus_clock
 
 COMPARED = frozenset(
     {keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.ALARM_KPIS, keys.RECONSTRUCTION, keys.BASELINE}
@@ -59,18 +60,21 @@ class Verification:
         return not self.diff.differing
 
 
-def verify(read: Callable[[], Iterable[Encoded]], config: MonitorConfig) -> Verification:
+def verify(
+    read: Callable[[], Iterable[Encoded]], config: MonitorConfig, process: Process | None = None
+) -> Verification:
     """Verify a recording.
 
     Args:
         read: returns the messages of the recording in order of receipt, without latched messages, at each call.
         config: settings of the recorded monitor.
+        process: process of the plant; None: the one that the settings name.
 
     Raises:
         InputError: nothing in the recording can be verified, or the settings are inconsistent.
     """
     sessions = find_sessions(read(), config.plant)
-    model = read_model_on_bus_clock(config.model)
+    config, model = load_process(config) if process is None else watch_process(config, process)
     found = Verification(MessageDiff())
     stored: bytes | None = None
     verified = 0
@@ -134,7 +138,7 @@ class _Replay:
         self._diff = diff
         self._waited_for = dict(session.heard_from_ns)
         self._newest: dict[str, dict[bytes, None]] = {}
-        signals = (config.input, *config.outputs)
+        signals = (*config.signals, *config.carried)
         self._signals = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in signals}
 
     def run(self, messages: Iterable[Encoded]) -> None:

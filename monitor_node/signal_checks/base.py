@@ -27,7 +27,7 @@ class SignalCheck:
     Args:
         config: configuration of the monitor.
         board: the alarms of the plant; the check declares its own there.
-        ranges: ranges of the input and of each output.
+        ranges: ranges of each input and of each output.
 
     Attributes:
         name: name of its alarms.
@@ -67,13 +67,13 @@ class SignalCheck:
         """
 
     def on_row(self, time_ns: int, values: tuple[float, ...]) -> list[Publication]:
-        """Check a row, input first; values are NaN where missing."""
+        """Check a row, inputs first; values are NaN where missing."""
         return []
 
     def measured_values(
         self, time_ns: int, values: tuple[float, ...], publications: list[Publication]
     ) -> tuple[float, ...]:
-        """Values of a row, input first, with NaN in place of those that are no measurements."""
+        """Values of a row, inputs first, with NaN in place of those that are no measurements."""
         return values
 
     def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:

@@ -18,13 +18,13 @@ OUT_OF_RANGE = "out_of_range"
 
 
 class RangeCheck(SignalCheck):
-    """Compares the input and each output with what the process can have."""
+    """Compares each input and each output with what the process can have."""
 
     name = "range"
 
     def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
         super().__init__(config, board, ranges)
-        self._ranges, self._names = ranges, (config.input, *config.outputs)
+        self.ranges, self._names = ranges, config.signals
         self._alarms = [
             board.declare(self.name, signal, without_on_delay=True, dead_band=0.0, names_cause=True)
             if item.is_bounded
@@ -39,7 +39,7 @@ class RangeCheck(SignalCheck):
         for index, (value, alarm) in enumerate(zip(values, self._alarms, strict=True)):
             if alarm is None or value != value:
                 continue
-            lower, upper, unit = self._ranges[index]
+            lower, upper, unit = self.ranges[index]
             out, rule = not lower <= value <= upper, alarm.memory.rule
             if not (out or rule.standing or rule.recent):
                 continue

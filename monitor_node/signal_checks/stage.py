@@ -17,6 +17,7 @@ from monitor_node.baseline.signal_range import ANY, SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import Flags, SignalCheck
 from monitor_node.signal_checks.catalogue import CHECKS
+from monitor_node.signal_checks.range import RangeCheck
 from monitor_node.signal_checks.spike import SpikeCheck, SpikeState
 from monitor_node.signal_checks.stuck import StuckCheck, StuckState
 from monitor_node.signal_checks.timeout import DataTimeoutState, SilenceCheck
@@ -28,7 +29,7 @@ class SignalChecksState(StoredState, frozen=True, omit_defaults=True):
     """State of the checks of a plant's signals.
 
     Attributes:
-        silences: state of the plant, of the input and of each output.
+        silences: state of the plant, of each input and of each output.
         stuck: state of each output; empty before the training ends.
         spikes: state of each output; None for an output without the check; empty before the training ends.
         others: the states of the other checks, by name.
@@ -50,7 +51,7 @@ class SignalChecks:
     Args:
         config: configuration of the monitor.
         board: the alarms of the plant; those of the signals are declared here.
-        ranges: ranges of the input and of each output; None: no bounds are known.
+        ranges: ranges of each input and of each output; None: no bounds are known.
         numbers: numbers of the plant's stages, see `row_step.row_type`; None: the checks have their own.
     """
 
@@ -64,8 +65,8 @@ class SignalChecks:
         ranges: Sequence[SignalRange] | None = None,
         numbers: NDArray[np.void] | None = None,
     ) -> None:
-        self._outputs = config.outputs
-        known = ranges or [ANY] * (1 + len(config.outputs))
+        self._outputs, self._inputs = config.outputs, config.inputs
+        known = ranges or [ANY] * len(config.signals)
         self._checks = [check(config, board, known) for check in CHECKS]
         self.silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
         """The check for missing data, which a receive time can decide as well."""
@@ -107,6 +108,12 @@ class SignalChecks:
         """See `StuckCheck.trainings`."""
         return self._stuck.trainings
 
+    def use_ranges(self, ranges: Sequence[SignalRange]) -> None:
+        """Take values beyond these ranges for no measurements from now on."""
+        for check in self._checks:
+            if isinstance(check, RangeCheck):
+                check.ranges = ranges
+
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """Learn from the training; arguments as for `SignalCheck.start`."""
         for check in self._checks:
@@ -132,7 +139,11 @@ class SignalChecks:
             ValueError: the state is damaged, or of other checks.
         """
         outputs = len(self._outputs)
-        counts = (len(state.silences) - 2, len(state.stuck) or outputs, len(state.spikes) or outputs)
+        counts = (
+            len(state.silences) - 1 - len(self._inputs),
+            len(state.stuck) or outputs,
+            len(state.spikes) or outputs,
+        )
         if counts != (outputs,) * 3:
             raise ValueError(f"the state must be of {outputs} outputs, got {counts}")
         others = {check.name for check in self._checks if check.name not in FIELDS and check.state != b""}

@@ -24,6 +24,8 @@ the plant is at rest; the charts of the residual detect it when the plant moves.
 than twice the noise: such a sensor repeats as often as the plant is calm, and if the plant is calmer than ever in the
 training, a sound sensor can be called stuck.
 
+Readings in the same step of a stated resolution are equal, however the numbers were rounded on their way.
+
 A run continues over missing samples, since equal values are no likelier across a gap than within. After `restart` it
 counts from one. Signals that operators set, like a valve position, rest for any time: check measurements only.
 """
@@ -38,6 +40,7 @@ from scipy.special import betaincinv
 
 from monitor_node.alarms.alarms import STUCK_SENSOR
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.baseline.resolution import quantise
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import SignalCheck
@@ -381,6 +384,7 @@ class StuckCheck(SignalCheck):
         self._alarms = [
             board.declare(self.name, name, without_on_delay=True, names_cause=True) for name in self.outputs
         ]
+        self._resolutions = [config.resolution.get(name, 0.0) for name in self.outputs]
         self.numbers = np.zeros(len(self.outputs), STUCK)
         self._stuck: list[Stuck] = []
         self._note_alarms()
@@ -399,10 +403,10 @@ class StuckCheck(SignalCheck):
         """See `SignalCheck`."""
         self._stuck = [Stuck(arl0, self.numbers[i : i + 1]) for i in range(len(values))]
         self._note_alarms()
-        for stuck, readings in zip(self._stuck, values, strict=True):
+        for stuck, readings, step in zip(self._stuck, values, self._resolutions, strict=True):
             for reading in readings:
                 if isfinite(reading):
-                    stuck.learn(reading)
+                    stuck.learn(quantise(reading, step) if step else reading)
 
     def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
         """See `SignalCheck`."""
@@ -410,7 +414,8 @@ class StuckCheck(SignalCheck):
         for index, value in enumerate(values):
             if not isfinite(value):
                 continue
-            alarm, judgement = self._alarms[index], self._stuck[index].update(value)
+            step = self._resolutions[index]
+            alarm, judgement = self._alarms[index], self._stuck[index].update(quantise(value, step) if step else value)
             if judgement.out or alarm.memory.rule.standing or alarm.memory.rule.recent:
                 name, times = self.outputs[index], judgement.statistic
                 reading = format_quantity(value, units[index], ".6g")

@@ -394,7 +394,7 @@ class SilenceCheck(SignalCheck):
 
     def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
         super().__init__(config, board, ranges)
-        self._names = (PLANT, config.input, *config.outputs)
+        self._names = (PLANT, *config.signals)
         self.numbers = no_timeouts(len(self._names))
         self._silences = [
             DataTimeout(config.silence_periods, numbers=self.numbers[i : i + 1]) for i in range(len(self._names))
@@ -413,12 +413,12 @@ class SilenceCheck(SignalCheck):
 
     @property
     def silent(self) -> list[bool]:
-        """Flags of the signals without data, the input first."""
+        """Flags of the signals without data, the inputs first."""
         return [silence.standing for silence in self._silences[1:]]
 
     @property
     def state(self) -> list[DataTimeoutState]:
-        """State of the plant, of the input and of each output."""
+        """State of the plant, of each input and of each output."""
         return [silence.state for silence in self._silences]
 
     def restore(self, state: list[DataTimeoutState]) -> None:

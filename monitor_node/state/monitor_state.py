@@ -13,7 +13,7 @@ import msgspec
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import AlignmentState
 from monitor_node.ingest.sequence_check import SequenceCheck
-from monitor_node.state import version_2
+from monitor_node.state import version_2, version_3
 from monitor_node.state.pipeline_state import PipelineState
 from monitor_node.state.seal import DIGEST_BYTES, Seal
 from reactorwatch.errors import InputError
@@ -23,12 +23,20 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import StoredState
 
 MAGIC = b"reactorwatch monitor"
-SEAL = Seal(MAGIC, 3, "state of a monitor", {2: version_2.upgrade})
+UPGRADES = {2: lambda body: version_3.upgrade(version_2.upgrade(body)), 3: version_3.upgrade}
+SEAL = Seal(MAGIC, 4, "state of a monitor", UPGRADES)
 
 NOT_LEARNED_BY = frozenset(
-    {"model", "alarm_state_file", "state_file", "state_every_s", "health_period_s", "diagnose_training"}
+    {"process", "alarm_state_file", "state_file", "state_every_s", "health_period_s", "diagnose_training"}
 )
 """Settings that do not change what was learned; the model is identified by its equations, not by its file."""
+
+TRAINING = ("training_min", "training_rows")
+"""Settings that are compared only where they are stated."""
+
+
+ROLES = ("setpoints", "modes", "labels", "bounds", "resolution")
+"""Settings of signals that a state has only where there are any; earlier versions had none."""
 
 
 class OtherSettingsError(InputError):
@@ -40,7 +48,7 @@ class MonitorState(StoredState, frozen=True):
 
     Attributes:
         settings: settings of the training, see `learning_settings`.
-        runs: sequence checks of the signals, the input first.
+        runs: sequence checks of the signals, the inputs first.
         alignment: state of the alignment.
         board: state of the alarms, see `Annunciator.to_bytes`.
         watch: state of the pipeline.
@@ -82,6 +90,14 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
         points: see `Monitor`.
     """
     fields = {field: value for field, value in msgspec.structs.asdict(config).items() if field not in NOT_LEARNED_BY}
+    for name in TRAINING:
+        if fields[name] is None:
+            del fields[name]
+    for name in ROLES:
+        if not fields[name]:
+            del fields[name]
+    if model is not None:
+        del fields["units"]  # the equations have their own
     fields |= {"points": points, "equations": fingerprint(model)}
     settings: dict[str, Any] = msgspec.msgpack.decode(msgspec.msgpack.encode(fields))  # as they are read back
     return settings
@@ -132,8 +148,9 @@ def open_state(data: bytes, settings: dict[str, Any]) -> MonitorState:
         state = MonitorState.from_bytes(body)
     except ValueError as error:
         raise InputError(f"is no state of this software's monitor: {error}") from error
-    if state.settings != settings:
-        raise OtherSettingsError(f"was learned with other settings: {_difference(state.settings, settings)}")
+    stored = {name: value for name, value in state.settings.items() if name in settings or name not in TRAINING}
+    if stored != settings:
+        raise OtherSettingsError(f"was learned with other settings: {_difference(stored, settings)}")
     return state
 
 

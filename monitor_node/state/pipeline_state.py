@@ -1,11 +1,15 @@
 """State of a plant's pipeline, composed of its parts' states."""
 
+import msgspec
+
+from monitor_node.baseline.black_box_reference import BlackBoxReferenceState
 from monitor_node.baseline.predictor import PredictorState
 from monitor_node.baseline.references import ArxReferenceState, ProcessReferenceState
 from monitor_node.baseline.training import TrainingState
 from monitor_node.chart_stage import ChartsState
 from monitor_node.ingest.sampling import SamplingState
 from monitor_node.isolation.stage import SuspicionState
+from monitor_node.operation import CarriedState
 from monitor_node.signal_checks.stage import SignalChecksState
 from reactorwatch.spc.prewhitening import PrewhitenerState
 from reactorwatch.stored_state import StoredState
@@ -28,7 +32,7 @@ class TrainedState(StoredState, frozen=True):
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
     """
 
-    reference: ProcessReferenceState | ArxReferenceState
+    reference: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
     checks: list[tuple[str, str]]
     left_out: dict[str, str]
     whiteners: list[PrewhitenerState]
@@ -52,6 +56,7 @@ class PipelineState(StoredState, frozen=True):
         began_ns: start of the present or last training; None before its first row.
         training: rows of the training; after it while its diagnosis is pending, then empty.
         watched: state after the training; None before its end.
+        operation: states of modes and set points, by signal.
     """
 
     sampling: SamplingState
@@ -61,3 +66,4 @@ class PipelineState(StoredState, frozen=True):
     began_ns: int | None
     training: TrainingState
     watched: TrainedState | None
+    operation: dict[str, CarriedState] = msgspec.field(default_factory=dict)

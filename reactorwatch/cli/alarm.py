@@ -1,18 +1,20 @@
 """`alarm`: an operator's commands for alarms of the running monitor, and of the recorder for its own."""
 
-import contextlib
+import time
+from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reactorwatch.cli.command_client import TIMEOUT_S, NoReplyError, send_command
+from reactorwatch.cli.command_client import TIMEOUT_S, LateReplyError, NoReplyError, send_command
 from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Settings, check_encodable
 from reactorwatch.cli.printing import print_lines
 from reactorwatch.contract.keys import ACKNOWLEDGE_RECORDER, LIST_RECORDER_ALARMS, RECORDING
 from reactorwatch.errors import InputError
 
 if TYPE_CHECKING:
-    from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
+    from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand
 
 Name = Annotated[
     str, typer.Argument(help="As `alarm list` names it: shewhart/T.", callback=check_encodable, show_default=False)
@@ -29,6 +31,7 @@ alarms = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.add_typer(alarms, name="alarm", help="List, acknowledge, shelve, suppress or comment the alarms of a plant.")
+    app.command("ack", help="Acknowledge alarms: short for `alarm acknowledge`.")(acknowledge)
 
 
 @alarms.command("list")
@@ -37,15 +40,98 @@ def list_alarms(
     endpoint: Endpoint = None,
     name: Plant = None,
     timeout: Timeout = TIMEOUT_S,
+    normal: Annotated[bool, typer.Option("--normal", help="Normal ones, too.")] = False,
     json: Json = False,
 ) -> None:
-    """Show the current state of all alarms."""
+    """Show the alarms that are not normal, the most urgent first; --json has all of them."""
+    alarms = _list(config, endpoint, name, timeout)
+    if json:
+        _show(alarms, json=True)
+        return
+    from reactorwatch.cli.alarm_rows import Now, advise_acknowledgement, alarm_rows
+    from reactorwatch.cli.display import FAINT, RIGHT, print_headline, print_rows
+    from reactorwatch.contract.messages_pb2 import AlarmState
+
+    shown = [alarm for alarm in alarms if normal or alarm.state != AlarmState.ALARM_STATE_NORMAL]
+    if not shown:
+        print_headline(f"no alarms; {len(alarms)} are watched, and normal", RIGHT)
+        return
+    plant_ns = max((alarm.time_ns for alarm in alarms if not _is_recorders(alarm.alarm)), default=0)
+    print_rows(alarm_rows(shown, Now(plant_ns, time.time_ns())))
+    advice = advise_acknowledgement(shown, name)
+    if advice:
+        print_headline(advice, FAINT)
+
+
+@alarms.command("acknowledge")
+def acknowledge(
+    by: By,
+    alarm: Annotated[
+        str | None,
+        typer.Argument(help="As `alarm list` names it: shewhart/T.", callback=check_encodable, show_default=False),
+    ] = None,
+    incident: Annotated[
+        int | None, typer.Option("--incident", help="All alarms of this incident.", min=1, max=2**63 - 1)
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="All alarms, of every incident.")] = False,
+    comment: Comment = "",
+    config: Settings = None,
+    endpoint: Endpoint = None,
+    name: Plant = None,
+    timeout: Timeout = TIMEOUT_S,
+    json: Json = False,
+) -> None:
+    """Acknowledge an alarm, those of an incident, or all."""
+    from reactorwatch.contract.messages_pb2 import AlarmCommand
+
+    if (alarm is not None) + (incident is not None) + every != 1:
+        raise InputError("name one of: an alarm such as shewhart/T, --incident N, or --all")
+    if alarm is not None:
+        chosen = [AlarmCommand(alarm=alarm)]
+    elif incident is not None:
+        chosen = [AlarmCommand(incident=incident)]
+    else:
+        chosen = _acknowledge_all(_list(config, endpoint, name, timeout))
+    changed: list[Alarm] = []
+    for command in chosen:
+        command.by, command.comment = by, comment
+        node, command_name = _route(command.alarm, "acknowledge")
+        changed += send_command(node, config, endpoint, name, timeout, command_name, command).alarms
+    _show(changed, json=json)
+
+
+alarms.command("ack", help="Short for acknowledge.")(acknowledge)
+
+
+def _list(config: Path | None, endpoint: str | None, name: str | None, timeout: float) -> "list[Alarm]":
+    """Alarms of the monitor and of the recorder."""
     from reactorwatch.contract.messages_pb2 import ListAlarms
 
-    reply = send_command(MONITOR, config, endpoint, name, timeout, "list_alarms", ListAlarms())
-    _show(reply, json=json)
-    with contextlib.suppress(NoReplyError):  # a plant may be watched and not be recorded
-        _show(send_command(RECORDER, config, endpoint, name, timeout, LIST_RECORDER_ALARMS, ListAlarms()), json=json)
+    listed = list(send_command(MONITOR, config, endpoint, name, timeout, "list_alarms", ListAlarms()).alarms)
+    try:
+        listed += send_command(RECORDER, config, endpoint, name, timeout, LIST_RECORDER_ALARMS, ListAlarms()).alarms
+    except LateReplyError as late:
+        typer.echo(f"the alarms of the recorder are missing: {late}", err=True)
+    except NoReplyError:
+        pass  # a plant may be watched and not be recorded
+    return listed
+
+
+def _acknowledge_all(alarms: "list[Alarm]") -> "list[AlarmCommand]":
+    """Commands that acknowledge all alarms: one an incident, and one for each alarm outside of incidents.
+
+    Raises:
+        InputError: there is none to acknowledge.
+    """
+    from reactorwatch.cli.alarm_rows import UNACKNOWLEDGED
+    from reactorwatch.contract.messages_pb2 import AlarmCommand
+
+    unseen = [alarm for alarm in alarms if alarm.state in UNACKNOWLEDGED]
+    if not unseen:
+        raise InputError("there is no alarm to acknowledge")
+    incidents = sorted({alarm.incident for alarm in unseen if alarm.incident})
+    single = [AlarmCommand(alarm=alarm.alarm) for alarm in unseen if not alarm.incident]
+    return [*(AlarmCommand(incident=number) for number in incidents), *single]
 
 
 @alarms.command("shelve")
@@ -65,7 +151,7 @@ def shelve(
 
     node, command_name = _route(alarm, "shelve")
     command = ShelveAlarm(alarm=alarm, by=by, comment=comment, minutes=minutes)
-    _show(send_command(node, config, endpoint, name, timeout, command_name, command), json=json)
+    _show(send_command(node, config, endpoint, name, timeout, command_name, command).alarms, json=json)
 
 
 def _register(word: str, command: str, description: str) -> None:
@@ -85,13 +171,12 @@ def _register(word: str, command: str, description: str) -> None:
 
         node, command_name = _route(alarm, command)
         message = AlarmCommand(alarm=alarm, by=by, comment=comment)
-        _show(send_command(node, config, endpoint, name, timeout, command_name, message), json=json)
+        _show(send_command(node, config, endpoint, name, timeout, command_name, message).alarms, json=json)
 
     alarms.command(word, help=description)(act)
 
 
 for _word, _command, _description in (
-    ("acknowledge", "acknowledge", "Acknowledge an alarm."),
     ("unshelve", "unshelve", "Show a shelved alarm again before its time is over."),
     ("suppress", "suppress", "Hide an alarm while it has no meaning, as in a start-up."),
     ("unsuppress", "unsuppress", "Show a suppressed alarm again."),
@@ -108,18 +193,22 @@ def _route(alarm: str, command: str) -> tuple[str, str]:
     Raises:
         InputError: the recorder's own alarm, and a command other than to acknowledge.
     """
-    if not alarm.startswith(f"{RECORDING}/"):
+    if not _is_recorders(alarm):
         return MONITOR, command
     if command != "acknowledge":
         raise InputError(f"alarm {alarm} is the recorder's own, and can be acknowledged and nothing else")
     return RECORDER, ACKNOWLEDGE_RECORDER
 
 
-def _show(reply: "CommandReply", *, json: bool) -> None:
-    """Print the alarms of a reply, one JSON object or text a line."""
+def _is_recorders(alarm: str) -> bool:
+    return alarm.startswith(f"{RECORDING}/")
+
+
+def _show(alarms: "Iterable[Alarm]", *, json: bool) -> None:
+    """Print alarms, one JSON object or text a line."""
     import msgspec
 
-    for alarm in reply.alarms:
+    for alarm in alarms:
         print_lines(msgspec.json.encode(_object(alarm)).decode() if json else _line(alarm))
 
 
@@ -136,14 +225,16 @@ def _object(alarm: "Alarm") -> dict[str, object]:
         "incident": alarm.incident or None,
         "first_in": alarm.first_in,
         "text": alarm.text,
-        "suspect": [{"cause": item.cause, "probability": item.probability} for item in alarm.suspects],
+        "suspect": [
+            {"cause": item.cause, "probability": item.probability, "text": item.text} for item in alarm.suspects
+        ],
         "by": alarm.by,
         "comment": alarm.comment,
     }
 
 
 def _line(alarm: "Alarm") -> str:
-    from reactorwatch.contract.alarm_text import format_moment, priority_word, state_word, suspects_text
+    from reactorwatch.contract.alarm_text import describe_suspects, format_moment, priority_word, state_word
 
     parts = [f"{alarm.alarm} ({priority_word(alarm.priority)}): {state_word(alarm.state)}"]
     if alarm.shelved_until_ns:
@@ -153,9 +244,9 @@ def _line(alarm: "Alarm") -> str:
         parts.append(f"raised {format_moment(alarm.raised_ns)} (incident {alarm.incident}{first})")
     if alarm.text:
         parts.append(alarm.text)
-    suspects = suspects_text(alarm.suspects)
+    suspects = describe_suspects(alarm.suspects)
     if suspects:
-        parts.append(f"suspect: {suspects}")
+        parts.append(f"likely cause: {suspects}")
     if alarm.by:
         parts.append(f"{alarm.by}: {alarm.comment}" if alarm.comment else alarm.by)
     return "; ".join(parts)

@@ -15,9 +15,10 @@ from typing import Any, Generic, TypeVar
 import msgspec
 import typer
 
-from reactorwatch.cli.printing import print_lines, print_text
+from reactorwatch.api.files import expand_folder
+from reactorwatch.cli.display import print_report
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.progress import bar, task
-from reactorwatch.cli.read_record import expand_folder
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import fill_folder
@@ -42,12 +43,14 @@ class JobResult:
         row: row of the summary.
         remark: remark on the file for standard error; empty: none.
         not_written: error of writing the result's files; empty: none.
+        extra: what else the command needs of the file.
     """
 
     text: str
     row: Row
     remark: str = ""
     not_written: str = ""
+    extra: Any = None
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,7 @@ def run_jobs(
     processes: int | None,
     scheduler: str | None,
     as_json: bool,
+    on_end: Callable[[list[Any]], None] | None = None,
 ) -> None:
     """Run the jobs and print the result of each file in their order, and a summary of several.
 
@@ -115,6 +119,7 @@ def run_jobs(
         processes: number of processes; None: one a core.
         scheduler: address of a cluster, or None.
         as_json: print one JSON object a line, without a summary.
+        on_end: called with the `extra` of the files that could be used, in their order; None: not called.
 
     Raises:
         InputError: the single file cannot be used, or there are no such workers.
@@ -123,28 +128,34 @@ def run_jobs(
     if len(jobs) == 1 and scheduler is None:
         with task(f"{kind.doing} {files[0].name}"):
             result = kind.work(jobs[0])
-        print_text(result.text)
+        print_report(result.text, as_json=as_json)
         write_remark(files[0], result.remark)
         if result.not_written:
             raise InputError(result.not_written)
+        if on_end is not None:
+            on_end([result.extra])
         return
     rows: list[Row] = []
+    extras: list[Any] = []
     for file, outcome in zip(files, run_in_order(kind.work, jobs, kind.doing, processes, scheduler), strict=True):
         if isinstance(outcome, Failed):
             reason = _strip_name(outcome.reason, file)
             print_lines(f"reactorwatch: {file}: {reason}", err=True)
             rows.append({"file": str(file), **dict.fromkeys(kind.columns), "error": reason})
         else:
-            print_text(outcome.text)
+            print_report(outcome.text, as_json=as_json)
             write_remark(file, outcome.remark)
             if outcome.not_written:
                 print_lines(f"reactorwatch: {file}: {outcome.not_written}", err=True)
             rows.append(outcome.row)
+            extras.append(outcome.extra)
     failed = sum(bool(row["error"]) for row in rows)
     if len(rows) > 1 and not as_json:
-        print_text(f"\n{kind.summary(rows)}")
+        print_report(f"\n{kind.summary(rows)}")
     if len(rows) > 1 and out is not None and failed < len(rows):
         write_summary(out, rows)
+    if on_end is not None and extras:
+        on_end(extras)
     if failed:
         raise typer.Exit(2)
 

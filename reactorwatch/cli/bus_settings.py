@@ -21,7 +21,14 @@ from reactorwatch.runtime.security.provisioning import ROUTER, ROUTER_SETTINGS, 
 from recorder.config import RecorderConfig
 
 VIEWER = "viewer"
-ROLES = {"plant": "plant", "monitor": "monitor", "diagnosis": "monitor", "recorder": "recorder", VIEWER: VIEWER}
+ROLES = {
+    "plant": "plant",
+    "replay": "plant",
+    "monitor": "monitor",
+    "diagnosis": "monitor",
+    "recorder": "recorder",
+    VIEWER: VIEWER,
+}
 """Roles in a site, by node; and the role of an observer."""
 
 BusSettings = Mapping[str, BusConfig]

@@ -18,6 +18,10 @@ class NoReplyError(InputError):
     """No such node replied."""
 
 
+class LateReplyError(NoReplyError):
+    """Such a node runs, and did not reply in time."""
+
+
 def send_command(
     node: str,
     config: Path | None,
@@ -40,9 +44,11 @@ def send_command(
 
     Raises:
         InputError: no router within the time, or the node refuses the command.
-        NoReplyError: no reply within the time.
+        NoReplyError: no such node replied.
+        LateReplyError: a node that runs did not reply within the time.
     """
     import threading
+    import time
 
     from reactorwatch.cli.observer import load_settings
     from reactorwatch.contract import keys
@@ -65,12 +71,18 @@ def send_command(
         timer.cancel()
     if bus is None:
         raise InputError(f"no router at {bus_config.endpoint} within {timeout_s:g} s; is it running?")
+    asked_s = time.monotonic()
     try:
         answers = bus.query(Encoded(keys.key(plant, keys.COMMAND, name), *encode_message(message)), timeout_s)
+        waited_s = time.monotonic() - asked_s
     finally:
         bus.close()
     replies = [decode(answer.payload, answer.encoding) for answer in answers]
     reply = next((item for item in replies if isinstance(item, CommandReply)), None)
+    if reply is None and waited_s >= timeout_s:  # the router ends a query at once that no node takes
+        raise LateReplyError(
+            f"the {node} of plant {plant!r} did not answer within {timeout_s:g} s; give it a longer --timeout"
+        )
     if reply is None:
         refused = ", and may this certificate ask it?" if bus_config.ca is not None else "?"  # refusals are silent
         raise NoReplyError(f"no {node} of plant {plant!r} answered within {timeout_s:g} s; is it running{refused}")

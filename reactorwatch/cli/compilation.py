@@ -34,7 +34,7 @@ def compile_kernels() -> None:
 
     record = simulate_record(PlantConfig(seed=1, faults=(FAULT,)), ROWS)
     with task("compiling"):
-        for reference in ("auto", "arx"):
+        for reference in ("auto", "black-box", "arx"):
             config = MonitorConfig(training_min=TRAINING_MIN, reference=reference)
             backtest.run(map(encode, samples_of(record, config.plant)), config)
         WatchedPlants(MonitorConfig(), 0, None, points=False).prepare()

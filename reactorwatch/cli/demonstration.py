@@ -7,11 +7,13 @@ the alarms, a comparison with the alarms of a back-test, value for value, and a 
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
+from reactorwatch.api.files import messages, open_messages
 from reactorwatch.cli.bus_settings import (
     VIEWER,
     load_bus_settings,
@@ -19,16 +21,18 @@ from reactorwatch.cli.bus_settings import (
     restrict_to_plant,
     write_node_settings,
 )
+from reactorwatch.cli.plant_settings import WAIT_FOR, complete_plant_settings
 from reactorwatch.cli.printing import print_lines, print_text
 from reactorwatch.cli.processes import Processes, settings_text
 from reactorwatch.cli.progress import bar, task
-from reactorwatch.cli.read_record import messages
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Fault, Sample
+from reactorwatch.description.find import DEFAULT_PROCESS, find_process
+from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
-from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
@@ -43,6 +47,8 @@ from recorder.config import RecorderConfig
 PLANT = "demo"
 NODES = ("recorder", "monitor", "plant")
 """Nodes in the order of their start."""
+ONSET_MIN = 150.0
+"""Onset of the fault: the training ends after 100 minutes."""
 START_WITHIN_S = 60.0
 DRAIN_WITHIN_S = 60.0
 POLL_S = 0.1
@@ -65,8 +71,8 @@ class Progress:
         self._first_ns: int | None = None
         self._plant_ns = 0
         self._evaluated_ns = 0
-        bus.subscribe(keys.key(PLANT, keys.SAMPLE, "T"), self._on_sample)
-        bus.subscribe(keys.key(PLANT, keys.ESTIMATE, "T"), self._on_estimate)
+        bus.subscribe(keys.all_keys(PLANT, keys.SAMPLE), self._on_sample)
+        bus.subscribe(keys.all_keys(PLANT, keys.ESTIMATE), self._on_estimate)
 
     @property
     def started(self) -> bool:
@@ -99,15 +105,46 @@ class Progress:
             self._evaluated_ns = max(self._evaluated_ns, estimate.time_ns)
 
 
-def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: int, site: Path | None = None) -> int:
+@dataclass(frozen=True)
+class Demonstration:
+    """Process, fault and pace of a demonstration.
+
+    Attributes:
+        process: name or file of the process; None: the reactor.
+        duration_min: minutes of plant time.
+        speed: plant time over wall time.
+        fault: specification of the fault; None: that of the process, from `ONSET_MIN` on.
+        seed: seed of inputs and noise.
+    """
+
+    process: str | None
+    duration_min: float
+    speed: float
+    fault: str | None
+    seed: int
+
+    def find_fault(self, process: Process) -> FaultSpecification:
+        """Fault to inject.
+
+        Raises:
+            InputError: it is invalid, or the process has no equations.
+        """
+        text = self.fault
+        if text is None and process.operation.fault:
+            text = f"{process.operation.fault}@{ONSET_MIN:g}min"
+        elif text is None:
+            process.require_model()
+            effect = process.faults[0]
+            text = f"{effect.name}:step:{effect.typical!r}@{ONSET_MIN:g}min"
+        return parse_fault(text, process.faults)
+
+
+def run(demonstration: Demonstration, out: Path | None, site: Path | None = None) -> int:
     """Run the demonstration.
 
     Args:
+        demonstration: the process, its fault and the pace.
         out: folder to make; None: one named after the time.
-        duration_min: minutes of plant time.
-        speed: plant time over wall time.
-        fault: specification of the fault.
-        seed: seed of input and noise.
         site: folder of a site, for its router and the nodes' certificates; None: without TLS.
 
     Returns:
@@ -118,33 +155,41 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
         InputError: invalid arguments, or a node that failed.
     """
     configure()
-    specification = parse_fault(fault)
+    process = find_process(demonstration.process or DEFAULT_PROCESS)
+    fault = str(demonstration.find_fault(process))
     join = load_bus_settings(site, PLANT, {}, free_endpoint() if site is None else None)
     folder = _free_folder(out)
     recording = folder / f"{PLANT}.mcap"
     of_plant = {
         "name": PLANT,
-        "speed": speed,
-        "duration_min": duration_min,
-        "seed": seed,
-        "faults": (str(specification),),
-        "wait_for": ("monitor", "recorder"),
+        "process": demonstration.process,
+        "speed": demonstration.speed,
+        "duration_min": demonstration.duration_min,
+        "seed": demonstration.seed,
+        "faults": (fault,),
+        "wait_for": WAIT_FOR,
     }
-    plant = section(PlantConfig, "plant", {}, of_plant)
-    monitor = MonitorConfig(plant=PLANT)
+    plant = complete_plant_settings(section(PlantConfig, "plant", {}, of_plant))
+    monitor = section(MonitorConfig, "monitor", {}, {"plant": PLANT, "process": demonstration.process})
     nodes = {"plant": plant, "monitor": monitor}
-    about = {"seed": str(seed), "settings": settings_text({"bus": join[VIEWER], **nodes})}
-    recorder = RecorderConfig(plant=PLANT, out=str(recording), linger_s=DRAIN_TIMEOUT_S, black_box_min=0.0, about=about)
+    recorder = RecorderConfig(
+        plant=PLANT,
+        out=str(recording),
+        linger_s=DRAIN_TIMEOUT_S,
+        black_box_min=0.0,
+        processes={PLANT: demonstration.process or DEFAULT_PROCESS},
+        about={"seed": str(plant.seed), "settings": settings_text({"bus": join[VIEWER], **nodes})},
+    )
     with open_router(site, join) as bus:
         make_folder(folder, "--out")
         tables = {**nodes, "recorder": restrict_to_plant(recorder, site)}
         settings = write_node_settings(folder / SETTINGS_FILE, tables, join, NODES)
         print_lines(f"to see it as it runs: reactorwatch view --web --config {folder / SETTINGS_FILE}", err=True)
         with stop_on_signals() as stop:
-            if not _run_nodes(bus, stop, settings, folder, plant):
+            if not _run_nodes(bus, stop, settings, folder, plant, process.name):
                 print_lines(f"stopped; what was recorded until then is in {folder}", err=True)
                 return 130
-    return _conclude(folder, recording, monitor, str(specification))
+    return _conclude(folder, recording, monitor, fault)
 
 
 def _free_folder(out: Path | None) -> Path:
@@ -154,7 +199,9 @@ def _free_folder(out: Path | None) -> Path:
     return folder
 
 
-def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folder: Path, plant: PlantConfig) -> bool:
+def _run_nodes(
+    bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folder: Path, plant: PlantConfig, process: str
+) -> bool:
     """Run the nodes until the plant has finished; returns False if a signal stopped it before."""
     woken = threading.Event()
     stop.call_on_set(woken.set)
@@ -175,7 +222,7 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folde
                 break
             if not progress.started and time.monotonic() - started > START_WITHIN_S:
                 raise InputError(f"no sample within {START_WITHIN_S:g} s of the start; see the .log files in {folder}")
-            advance(progress.plant_min, "starting the nodes" if not progress.started else "running the reactor")
+            advance(progress.plant_min, "starting the nodes" if not progress.started else f"running {process}")
         deadline = time.monotonic() + DRAIN_WITHIN_S
         while not stop.is_set and not progress.all_evaluated and time.monotonic() < deadline:
             woken.wait(POLL_S)
@@ -207,7 +254,9 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         diagnosis, seconds = run_diagnosis(case)
         write_report(diagnosis, case, seconds)
     with task("drawing"):
-        write_rrd(read_segments(messages(recording, PLANT)), drawing, diagnosis=folder / DIAGNOSIS_FOLDER / DRAWING)
+        source = open_messages(recording, PLANT)
+        run_columns = read_segments(source.messages, process=source.process)
+        write_rrd(run_columns, drawing, diagnosis=folder / DIAGNOSIS_FOLDER / DRAWING)
     same = [alarm.SerializeToString() for alarm in alarms] == [
         alarm.SerializeToString() for alarm in again.alarm_messages
     ]

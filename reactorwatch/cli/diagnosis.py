@@ -2,14 +2,16 @@
 
 import time
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeAlias
 
 import msgspec
 import numpy as np
 
+from reactorwatch.api.files import described_process, process_on_clock, record
+from reactorwatch.api.report_origin import report_origin
 from reactorwatch.cli.options import check_recording
-from reactorwatch.cli.read_record import record
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.parameter_priors import parse_priors
@@ -76,6 +78,7 @@ class Case:
         folder: folder for the report; None: no report.
         effects: possible causes.
         uncertain: standard deviations of uncertain parameters, by name.
+        asked: options of the diagnosis.
     """
 
     file: Path
@@ -84,6 +87,7 @@ class Case:
     effects: tuple[Effect, ...]
     folder: Path | None
     uncertain: dict[str, float] = field(default_factory=dict)
+    asked: DiagnosisOptions = field(default_factory=DiagnosisOptions)
 
 
 def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path | None = None) -> Case:
@@ -98,15 +102,16 @@ def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path
     Raises:
         InputError: the file cannot be read or diagnosed, or an uncertain parameter does not exist.
     """
-    described = asked.process.load()
-    measured = record(check_recording(at or file), asked.plant, asked.columns, described, stated=asked.stated)
-    simulated = asked.process.load(measured.zero_ns)
+    path = check_recording(at or file)
+    described = described_process(path, asked.plant, asked.process)
+    measured = record(path, asked.plant, asked.columns, described, stated=asked.stated)
+    simulated = process_on_clock(asked.process, described, measured.zero_ns)
     model = simulated.require_model()
     known = described.uncertain
     if asked.uncertain is not None:
         known = known | parse_priors(asked.uncertain, model)
     make_run(measured, model)
-    return Case(file, measured, model, simulated.select_causes(asked.without), folder, known)
+    return Case(file, measured, model, simulated.select_causes(asked.without), folder, known, asked)
 
 
 def run_diagnosis(
@@ -129,14 +134,24 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
         InputError: the folder cannot be made or written to.
     """
     # Imported only for a report: Rerun and Jinja take longer to import than most records to diagnose.
-    from reactorwatch.cli.diagnosis_drawing import write_drawing
     from reactorwatch.diagnosis.report.page import as_page
 
     assert case.folder is not None
     folder = case.folder
     on_the_bus = case.model.name == PLANT
     files = (str(case.file), str(folder / MODEL), str(folder / EXPERIMENT))
-    page = as_page(diagnosis, case.model, case.effects, *files, on_the_bus=on_the_bus)
+    asked = case.asked
+    settings = {
+        "process": asked.process.process or "cstr",
+        "plant": asked.plant,
+        "without": ", ".join(asked.without),
+        "uncertain": asked.uncertain,
+        "tolerance": asked.tolerance,
+        "limits": asked.limits,
+        "columns": asked.columns,
+    }
+    origin = report_origin(case.file, settings)
+    page = as_page(diagnosis, case.model, case.effects, *files, on_the_bus=on_the_bus, origin=origin)
     plain = msgspec.json.format(
         msgspec.json.encode(report_object(diagnosis, str(case.file), seconds, case.measured.zero)), indent=2
     )
@@ -144,7 +159,10 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
         write_extended_model(temporary / MODEL, diagnosis.extended_model)
         if diagnosis.experiment is not None:
             _write_experiment(diagnosis.experiment, temporary / EXPERIMENT)
-        write_drawing(diagnosis, case.model, case.measured, temporary / DRAWING)
+        if find_spec("rerun") is not None:  # an image of nodes that never draw is without
+            from reactorwatch.cli.diagnosis_drawing import write_drawing
+
+            write_drawing(diagnosis, case.model, case.measured, temporary / DRAWING)
         for name, content in ((OBJECT, plain + b"\n"), (PAGE, page.encode())):
             with atomic_write(temporary / name) as file:
                 file.write_bytes(content)

@@ -28,6 +28,7 @@ from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import Cause, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.records.output import check_output_folder
+from reactorwatch.records.source_text import is_table
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,8 @@ def make_jobs(
     Raises:
         InputError: invalid options.
     """
-    if len(files) > 1 or elsewhere:
+    describes_itself = asked.process.is_default and not all(map(is_table, files))
+    if not describes_itself and (len(files) > 1 or elsewhere):
         _check(asked)
     paths = list(files)
     if elsewhere:

@@ -59,9 +59,9 @@ def dashboard(
     stated: FileFormat = GUESS,
 ) -> None:
     """Draw a recording into a Rerun file, without a screen."""
+    from reactorwatch.api.files import open_messages
     from reactorwatch.cli.diagnosis import DRAWING
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.read_record import open_messages
     from recorder.columns.run_reader import read_segments
     from recorder.dashboard.file import write_rrd
     from recorder.dashboard.picture import picture_names, render_tabs

@@ -1,45 +1,59 @@
-"""`linearise`: linear models of the reactor at a coolant flow, and their error in a step response."""
+"""`linearise`: linear models of a process at constant inputs, and their error in a step response."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.linearise import linearise
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, steady_states
 from reactorwatch.process.step_response import compare_step
 
+STEP_SHARE = 0.1
+"""Default step of an input, as a share of its scale."""
 
-def describe(qc: float, step: float, *, as_json: bool) -> str:
-    """Format all steady states at a flow with their linear models.
+
+def describe(model: ProcessModel, levels: Sequence[float], step: float | None, *, as_json: bool) -> str:
+    """Format all steady states at constant inputs with their linear models.
 
     Args:
-        qc: coolant flow, l/min.
-        step: step of the flow with which plant and linear model are compared at the stable states, l/min.
+        model: the process.
+        levels: levels of the inputs, in their order and units.
+        step: step of each input with which plant and linear model are compared at the stable states, in its unit; None:
+            `STEP_SHARE` of its scale.
         as_json: format as a JSON object.
 
     Raises:
-        InputError: a flow outside the valve's range.
+        InputError: too few or too many levels, or a level outside the bounds of its input.
     """
-    model = cstr()
-    valve = model.inputs[0]
-    for name, value in (("qc", qc), ("qc + step", qc + step)):
-        if not valve.lower <= value <= valve.upper:
-            raise InputError(f"{name} must be in [{valve.lower:g}, {valve.upper:g}] {valve.unit}, got {value:g}")
+    if len(levels) != len(model.inputs):
+        raise InputError(
+            f"{model.name}: one level for each input is needed ({', '.join(model.input_names)}), got {len(levels)}"
+        )
     if step == 0:
         raise InputError("--step must not be 0")
-    points = [_point(model, point, qc, step) for point in steady_states(model, np.array([qc]))]
+    steps = {item.name: STEP_SHARE * item.scale if step is None else step for item in model.inputs}
+    for item, level in zip(model.inputs, levels, strict=True):
+        for name, value in ((item.name, level), (f"{item.name} + step", level + steps[item.name])):
+            if not item.lower <= value <= item.upper:
+                raise InputError(f"{name} must be in [{item.lower:g}, {item.upper:g}] {item.unit}, got {value:g}")
+    inputs = np.array(levels, dtype=float)
+    points = [_point(model, point, inputs, steps) for point in steady_states(model, inputs)]
     if as_json:
-        return msgspec.json.encode({"qc": qc, "steady_states": points}).decode()
-    return f"{len(points)} steady states at qc = {qc:g} l/min\n" + "".join(_text(point, step) for point in points)
+        return msgspec.json.encode(
+            {**dict(zip(model.input_names, levels, strict=True)), "steady_states": points}
+        ).decode()
+    given = ", ".join(f"{item.name} = {level:g} {item.unit}" for item, level in zip(model.inputs, levels, strict=True))
+    plural = "" if len(points) == 1 else "s"
+    return f"{len(points)} steady state{plural} at {given}\n" + "".join(_text(model, point, steps) for point in points)
 
 
-def _point(model: ProcessModel, point: SteadyState, qc: float, step: float) -> dict[str, Any]:
-    linear = linearise(model, point.state, np.array([qc]))
-    error = compare_step(model, point, np.array([qc]), np.array([step])).error.tolist() if point.stable else None
+def _point(model: ProcessModel, point: SteadyState, inputs: Array, steps: dict[str, float]) -> dict[str, Any]:
+    linear = linearise(model, point.state, inputs)
     return {
         "state": dict(zip(model.state_names, point.state.tolist(), strict=True)),
         "kind": point.kind,
@@ -49,23 +63,33 @@ def _point(model: ProcessModel, point: SteadyState, qc: float, step: float) -> d
         "B": linear.B.tolist(),
         "C": linear.C.tolist(),
         "D": linear.D.tolist(),
-        "step_error": None if error is None else dict(zip(model.output_names, error, strict=True)),
+        "step_error": _step_errors(model, point, inputs, steps) if point.stable else None,
     }
 
 
-def _text(point: dict[str, Any], step: float) -> str:
-    state = point["state"]
+def _step_errors(model: ProcessModel, point: SteadyState, inputs: Array, steps: dict[str, float]) -> dict[str, Any]:
+    """Errors by output; of a process with several inputs by input and output."""
+    found = {}
+    for index, name in enumerate(model.input_names):
+        step = np.zeros(inputs.size)
+        step[index] = steps[name]
+        error = compare_step(model, point, inputs, step).error.tolist()
+        found[name] = dict(zip(model.output_names, error, strict=True))
+    return found if len(found) > 1 else next(iter(found.values()))
+
+
+def _text(model: ProcessModel, point: dict[str, Any], steps: dict[str, float]) -> str:
+    states = ", ".join(f"{item.name} = {point['state'][item.name]:#.7g} {item.unit}" for item in model.states)
     eigenvalues = ", ".join(f"{re:.3f}{f' {im:+.3f}i' if im else ''}" for re, im in point["eigenvalues_per_min"])
     rows = [f"  {name} = {_matrix(point[name])}" for name in "ABCD"]
-    lines = [
-        "",
-        f"C = {state['C']:.7f} mol/l, T = {state['T']:.4f} K: {point['kind']}",
-        f"  eigenvalues {eigenvalues} 1/min",
-        *rows,
-    ]
-    if point["step_error"] is not None:
-        parts = ", ".join(f"{name} {100 * value:.2g} %" for name, value in point["step_error"].items())
-        lines.append(f"  a step of {step:g} l/min: linear model off the plant by {parts} of the response, over 10 min")
+    lines = ["", f"{states}: {point['kind']}", f"  eigenvalues {eigenvalues} 1/min", *rows]
+    errors = point["step_error"]
+    several = len(model.inputs) > 1
+    for item in model.inputs if errors is not None else ():
+        by_output = errors[item.name] if several else errors
+        parts = ", ".join(f"{name} {100 * value:.2g} %" for name, value in by_output.items())
+        stepped = f"{steps[item.name]:g} {item.unit}{f' in {item.name}' if several else ''}"
+        lines.append(f"  a step of {stepped}: linear model off the plant by {parts} of the response, over 10 min")
     return "\n".join(lines) + "\n"
 
 

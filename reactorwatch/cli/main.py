@@ -15,8 +15,10 @@ import typer
 from reactorwatch import __version__
 from reactorwatch.cli import (
     alarm,
+    causes,
     charts,
     compilation,
+    examples,
     files,
     models,
     nodes,
@@ -46,7 +48,23 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (runs, nodes, view, site, playback, alarm, files, recordings, studies, models, charts, compilation):
+GROUPS = (
+    runs,
+    nodes,
+    examples,
+    view,
+    site,
+    playback,
+    alarm,
+    files,
+    recordings,
+    studies,
+    causes,
+    models,
+    charts,
+    compilation,
+)
+for group in GROUPS:
     group.register_commands(app)
 
 

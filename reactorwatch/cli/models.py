@@ -5,12 +5,14 @@ from typing import Annotated
 
 import typer
 
+from reactorwatch.cli.display import print_report
 from reactorwatch.cli.options import (
     Columns,
     Force,
     Inputs,
     Json,
     Plant,
+    Process,
     Processes,
     Scheduler,
     check_recording,
@@ -58,9 +60,9 @@ def identify(
         int, typer.Option(help="Held-out rows that may set the state of the free run, and are left out of fits.")
     ] = 0,
     recursive: Annotated[bool, typer.Option("--recursive", help="Learn row by row, as the monitor does.")] = False,
-    report_rows: Annotated[
-        bool, typer.Option("--report-rows", help="Fit every 6th row from the 100th on, as the original report did.")
-    ] = False,
+    scheme: Annotated[
+        str, typer.Option(help="least-squares, or report: as the original report fits (arx and oe).")
+    ] = "least-squares",
     compare: Annotated[
         bool, typer.Option("--compare", help="Compare ARX and OE of orders 1 to --order, and choose.")
     ] = False,
@@ -73,16 +75,15 @@ def identify(
     stated: FileFormat = GUESS,
 ) -> None:
     """Fit models of the outputs to one half, validate them on the other."""
+    from reactorwatch.api.files import record
     from reactorwatch.cli import identification
     from reactorwatch.cli.batch import write_remark
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.read_record import record
     from reactorwatch.cli.unit_remarks import unit_remark
     from reactorwatch.identification.identify import ModelForm
-    from reactorwatch.identification.structure import ALL_ROWS, REPORT_ROWS
 
     described, outputs = identification.choose_outputs(process, split_names(inputs), split_names(output))
-    form = ModelForm(model, order, delay, recursive=recursive, choice=REPORT_ROWS if report_rows else ALL_ROWS)
+    form = ModelForm(model, order, delay, recursive=recursive, scheme=scheme)
     if compare and (validate is not None or settle):
         raise InputError("--compare chooses by the second half of FILE: leave --validate and --settle out")
     measured, held_out = (
@@ -98,30 +99,38 @@ def identify(
         else:
             validation = identification.Validation(held_out, settle)
             text = identification.fit(measured, described.inputs, outputs, form, validation, as_json=as_json)
-    print_text(text)
+    print_report(text, as_json=as_json)
     write_remark(file, remark)
 
 
 def linearise(
-    qc: Annotated[float, typer.Argument(help="The coolant flow, l/min.", show_default=False)],
-    step: Annotated[float, typer.Option(help="Of qc, by which linear model and plant are compared, l/min.")] = 1.0,
+    levels: Annotated[
+        list[float], typer.Argument(help="Level of each input, in its order and unit (qc of cstr).", show_default=False)
+    ],
+    process: Process = None,
+    step: Annotated[
+        float | None,
+        typer.Option(
+            help="Of each input, by which linear model and plant are compared [a tenth of its scale; qc: 1 l/min].",
+            show_default=False,
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """The linear models at all steady states of a coolant flow."""
+    """The linear models at all steady states of constant inputs."""
     from reactorwatch.cli.linear_models import describe
+    from reactorwatch.description.choice import ProcessChoice
 
-    print_text(describe(qc, step, as_json=as_json))
+    print_text(describe(ProcessChoice(process).load_model(), levels, step, as_json=as_json))
 
 
 def reproduce(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for study.md and its pictures.", show_default=False)],
     seed: Annotated[int, typer.Option(help="Of every simulated record.", min=0)] = 1,
-    only: Annotated[str | None, typer.Option(help="Figures, such as 7,12 [4 to 20].", show_default=False)] = None,
+    only: Annotated[str | None, typer.Option(help="Figures by number, such as 7,12 [all].", show_default=False)] = None,
     file: Annotated[
         Path | None,
-        typer.Option(
-            "--record", help="A record that figures 14 to 17 learn from, not a simulated one.", show_default=False
-        ),
+        typer.Option("--record", help="A record that figures 5, 6, 11 to 16 learn from.", show_default=False),
     ] = None,
     plant: Plant = None,
     column: Columns = None,
@@ -130,7 +139,7 @@ def reproduce(
     force: Force = False,
 ) -> None:
     """Draw every figure of the original report (source tree, reactorwatch[pictures])."""
-    from reactorwatch.cli.read_record import record
+    from reactorwatch.api.files import record
 
     try:
         from benchmarks.study_figures.reproduce import check_out

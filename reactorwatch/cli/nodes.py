@@ -14,17 +14,19 @@ from reactorwatch.cli.options import (
     Endpoint,
     Inputs,
     Json,
-    Model,
     Outputs,
     Plant,
     Process,
+    Reference,
     Settings,
-    check_input,
+    TrainingMin,
+    TrainingRows,
     check_recording,
     choose_process,
     parse_columns,
     parse_pace,
     parse_span_ns,
+    training_flags,
 )
 from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.table_options import take_table_options
@@ -75,7 +77,7 @@ def plant(
     scenario: Annotated[
         str | None,
         typer.Option(
-            help="The input: random-steps, sines, square, constant or a .csv record [random-steps].",
+            help="The inputs: random-steps, sines, square, constant or a record [random-steps].",
             show_default=False,
         ),
     ] = None,
@@ -83,12 +85,11 @@ def plant(
         list[str] | None,
         typer.Option(help="A fault, as cause:profile:size@onset: coolant_flow:step:-0.05@30min. Repeatable."),
     ] = None,
-    model: Model = None,
+    process: Process = None,
 ) -> None:
-    """Simulate the reactor and publish its sensors' samples."""
+    """Simulate a process with equations and publish its sensors' samples."""
     from plant_node.__main__ import run
-    from plant_node.config import PlantConfig
-    from reactorwatch.runtime.config import section
+    from reactorwatch.cli.plant_settings import load_plant_settings
 
     tables, bus = _settings(config, endpoint)
     flags = {
@@ -99,19 +100,19 @@ def plant(
         "seed": seed,
         "scenario": scenario,
         "faults": fault or None,
-        "model": str(check_input(model)) if model is not None else None,
+        "process": process,
     }
-    run(section(PlantConfig, "plant", tables, flags), bus, _metrics(tables))
+    run(load_plant_settings(tables, flags), bus, _metrics(tables))
 
 
 def monitor(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    training: Annotated[
-        float | None, typer.Option("--training", help="Minutes of plant time to learn from [100].", show_default=False)
-    ] = None,
-    model: Model = None,
+    training: TrainingMin = None,
+    training_rows: TrainingRows = None,
+    process: Process = None,
+    reference: Reference = None,
     diagnose: Diagnose = None,
     state: Annotated[
         Path | None,
@@ -144,7 +145,8 @@ def monitor(
     from reactorwatch.runtime.config import LogConfig, section
 
     tables, bus = _settings(config, endpoint)
-    flags = {"plant": name, "training_min": training, "model": str(check_input(model)) if model is not None else None}
+    flags: dict[str, Any] = {"plant": name, "process": process, "reference": reference}
+    flags |= training_flags(tables, training, training_rows)
     of_fleet = {"plants": plants, "shard": shard, "state": str(state) if state is not None else None}
     fleet = section(FleetConfig, "fleet", tables, of_fleet)
     if state is not None and fleet.plants is None:

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -54,6 +54,22 @@ Outputs = Annotated[
         "--output", help="A column to watch, without a process (repeatable, or with commas).", show_default=False
     ),
 ]
+TrainingMin = Annotated[
+    float | None,
+    typer.Option("--training", help="Minutes to learn from [cstr: 100; else see --training-rows].", show_default=False),
+]
+TrainingRows = Annotated[
+    int | None,
+    typer.Option(
+        "--training-rows",
+        help="Rows to learn from, instead of minutes [1000, or a third of a record if that is fewer].",
+        show_default=False,
+    ),
+]
+Reference = Annotated[
+    str | None,
+    typer.Option(help="Model that judges: auto, equations, black-box or arx [auto].", show_default=False),
+]
 Force = Annotated[
     bool, typer.Option("--force", help="Replace a file that is there and is of another kind than its name says.")
 ]
@@ -84,14 +100,14 @@ Scheduler = Annotated[
 ]
 
 
-def check_encodable(text: str) -> str:
+def check_encodable(text: str | None) -> str | None:
     """Check that a text can be sent in a message; returns it.
 
     Raises:
         BadParameter: the terminal sent bytes that are no UTF-8.
     """
     try:
-        text.encode()
+        (text or "").encode()
     except UnicodeEncodeError as error:
         raise typer.BadParameter(f"must be UTF-8, got {text!r}") from error
     return text
@@ -107,6 +123,23 @@ def choose_process(process: str | None, inputs: list[str] | None, outputs: list[
 
     named = [tuple(name.strip() for text in texts or () for name in text.split(",")) for texts in (inputs, outputs)]
     return ProcessChoice(process, *named)
+
+
+def training_flags(
+    tables: dict[str, dict[str, Any]], minutes: float | None, rows: int | None
+) -> dict[str, float | int | None]:
+    """Flags of the length of a training; one that is given takes the place of a length in the settings file.
+
+    Args:
+        tables: tables of the settings file, from which a length is removed.
+        minutes: duration in minutes; None: not given.
+        rows: duration in rows; None: not given.
+    """
+    flags = {"training_min": minutes, "training_rows": rows}
+    if minutes is not None or rows is not None:
+        for name in flags:
+            tables.get("monitor", {}).pop(name, None)
+    return flags
 
 
 def parse_columns(pairs: list[str] | None) -> dict[str, str]:

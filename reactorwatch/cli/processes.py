@@ -20,6 +20,7 @@ log = structlog.get_logger()
 
 MODULES = {
     "plant": "plant_node",
+    "replay": "recorder.tools.replay",
     "monitor": "monitor_node",
     "diagnosis": "diagnosis_node",
     "recorder": "recorder",

@@ -70,6 +70,7 @@ def info(
     """Show the contents of a recording, and missing messages; or how a table is read, and what is in it."""
     import msgspec
 
+    from reactorwatch.cli.display import print_report
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.recording_reports import info_object, info_text
     from reactorwatch.cli.table_report import table_object, table_text
@@ -88,7 +89,7 @@ def info(
             if not choice.is_default:
                 seen = replace(seen, processes=dict.fromkeys(seen.overview.runs, choice.load()))
             text = msgspec.json.encode(info_object(seen, file)).decode() if as_json else info_text(seen, file)
-    print_text(text)
+    print_report(text, as_json=as_json)
 
 
 def cut(

@@ -5,7 +5,10 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Diagnose, Endpoint, Plant, Settings, parse_pace
+from reactorwatch.cli.options import Diagnose, Endpoint, Plant, Process, Settings, parse_pace
+from reactorwatch.cli.table_options import take_table_options
+from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import GUESS, FileFormat
 
 Site = Annotated[
     Path | None,
@@ -18,7 +21,7 @@ Site = Annotated[
 
 def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
-    app.command("up")(up)
+    app.command("up")(take_table_options(up))
     app.command("demo")(demo)
 
 
@@ -40,14 +43,33 @@ def up(
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Of the input and the noise.", show_default=False)] = None,
     fault: Annotated[list[str] | None, typer.Option(help="A fault, as cause:profile:size@onset. Repeatable.")] = None,
+    process: Process = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(help="Play this record (a recording or a table) in place of a simulated plant."),
+    ] = None,
     diagnose: Diagnose = None,
     site: Site = None,
+    stated: FileFormat = GUESS,
 ) -> None:
-    """Run router, plant, monitor and recorder until stopped."""
+    """Run router, plant, monitor and recorder until stopped.
+
+    With --record a record is played in place of the simulated plant; the run ends with it.
+    """
+    from reactorwatch.cli.plant_settings import PlayedRecord
     from reactorwatch.cli.supervise import run_until_stopped
 
-    flags = {"name": name, "speed": parse_pace(speed, "--speed"), "seed": seed, "faults": fault or None}
-    raise typer.Exit(run_until_stopped(config, endpoint, out, flags, diagnose, site))
+    flags = {
+        "name": name,
+        "speed": parse_pace(speed, "--speed"),
+        "seed": seed,
+        "faults": fault or None,
+        "process": process,
+    }
+    if record is None and stated != GUESS:
+        raise InputError("options about the form of a table are for the record of --record; name it, or leave them out")
+    played = None if record is None else PlayedRecord(record, stated)
+    raise typer.Exit(run_until_stopped(config, endpoint, out, flags, diagnose, site, played))
 
 
 def demo(
@@ -57,14 +79,19 @@ def demo(
     duration: Annotated[float, typer.Option(help="Minutes of plant time.", min=150)] = 240.0,
     speed: Annotated[str, typer.Option(help="Plant time over wall time.")] = "400",
     fault: Annotated[
-        str, typer.Option(help="The fault, as cause:profile:size@onset.")
-    ] = "coolant_flow:step:-0.15@150min",
+        str | None,
+        typer.Option(
+            help="The fault, as cause:profile:size@onset [of the process; coolant_flow:step:-0.15@150min].",
+            show_default=False,
+        ),
+    ] = None,
+    process: Process = None,
     seed: Annotated[int, typer.Option(help="Of the input and the noise.")] = 1,
     site: Site = None,
 ) -> None:
     """Run it all with a fault in it, draw it, say what happened."""
-    from reactorwatch.cli.demonstration import run
+    from reactorwatch.cli.demonstration import Demonstration, run
 
     speed_value = parse_pace(speed, "--speed")
     assert speed_value is not None
-    raise typer.Exit(run(out, duration, speed_value, fault, seed, site))
+    raise typer.Exit(run(Demonstration(process, duration, speed_value, fault, seed), out, site))

@@ -8,22 +8,23 @@ from math import isnan
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+import typer
 
-from reactorwatch.cli.printing import print_text
+from reactorwatch.cli.alarm_rows import ANNUNCIATED, Now, age_s, sort_alarms
+from reactorwatch.cli.display import has_colour, screen_width
+from reactorwatch.cli.status_view import format_plant
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import priority_word, state_word
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode_message
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Health, ListAlarms, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, ListAlarms, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import stop_on_signals
-from reactorwatch.terminal import printable_lines
+from reactorwatch.terminal import printable
 from recorder.columns.measurement import measured_value
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from reactorwatch.description.process import Process
 
 SECOND_NS = 1_000_000_000
@@ -103,14 +104,35 @@ class StatusBoard:
             counts = self._samples.get(name, Counter())
             samples = sum(count for item, count in counts.items() if second - span_s <= item < second)
             nodes = {node for plant, node in (*self._alive, *self._health) if plant == name}
-            alarms = [alarm for (plant, _), alarm in self._alarms.items() if plant == name]
+            now = self._now(name, now_ns)
             return {
                 "plant": name,
                 "samples_per_s": samples / span_s if span_s > 0 else None,
                 "signals": self._signals(name),
                 "nodes": [self._node(name, node, now_ns) for node in sorted(nodes)],
-                "alarms": [_alarm(alarm) for alarm in sorted(alarms, key=_rank) if _is_visible(alarm)],
+                "alarms": [_alarm(alarm, now) for alarm in self._visible_alarms(name)],
             }
+
+    def text(self, now_ns: int, width: int | None = None, *, colour: bool = False) -> str:
+        """State of all plants for people; see `format_plant`."""
+        parts = []
+        for name in self.plants:
+            plant = self.plant(name, now_ns)
+            with self._lock:
+                alarms, now = self._visible_alarms(name), self._now(name, now_ns)
+            parts.append(format_plant(plant, alarms, now, width=width, colour=colour))
+        return "\n\n".join(parts) or "no nodes"
+
+    def _visible_alarms(self, plant: str) -> list[Alarm]:
+        """Alarms of a plant that are in sight, the most urgent first."""
+        alarms = (alarm for (name, _), alarm in self._alarms.items() if name == plant)
+        return sort_alarms(alarm for alarm in alarms if alarm.state in ANNUNCIATED)
+
+    def _now(self, plant: str, clock_ns: int) -> Now:
+        """Present times of a plant; its own time is that of its newest sample or alarm."""
+        times = [sample.time_ns for sample in self._newest.get(plant, {}).values()]
+        times += [alarm.time_ns for (name, _), alarm in self._alarms.items() if name == plant]
+        return Now(max(times, default=0), clock_ns)
 
     def _signals(self, plant: str) -> dict[str, dict[str, Any]]:
         """Newest value of each signal; null where none was received or measured."""
@@ -138,6 +160,10 @@ class StatusBoard:
                 **{name: getattr(health, name) for name in ("received", "published", "lost", "late", "refused")},
                 "lag_ms": health.lag_ms,
             }
+            if health.reference:
+                state["reference"] = health.reference
+            if health.phase == "training":
+                state["training"] = health.training
         return state
 
 
@@ -175,7 +201,7 @@ def run(
             if once or as_json:
                 stopped.wait(listen_s)
                 _query_alarms(bus, board)
-                print_text(_text(board, as_json=as_json).removesuffix("\n"))
+                typer.echo(_text(board, as_json=as_json))
             else:
                 _show(bus, board, stopped)
         finally:
@@ -204,6 +230,7 @@ def _query_alarms(bus: ZenohBus, board: StatusBoard) -> None:
 
 def _show(bus: ZenohBus, board: StatusBoard, stopped: threading.Event) -> None:
     from rich.live import Live
+    from rich.text import Text
 
     asked: list[str] = []
     with Live(auto_refresh=False) as live:
@@ -211,73 +238,26 @@ def _show(bus: ZenohBus, board: StatusBoard, stopped: threading.Event) -> None:
             if board.plants != asked:
                 _query_alarms(bus, board)
                 asked = board.plants
-            live.update(_table(board, time.time_ns()), refresh=True)
+            live.update(Text.from_ansi(_text(board)), refresh=True)
 
 
-def _text(board: StatusBoard, *, as_json: bool) -> str:
+def _text(board: StatusBoard, *, as_json: bool = False) -> str:
     now_ns = time.time_ns()
     if as_json:
         plants = [board.plant(name, now_ns) for name in board.plants]
-        return msgspec.json.encode({"plants": plants}).decode() + "\n"
-    from io import StringIO
-
-    from rich.console import Console
-
-    console = Console(file=StringIO(), width=120)
-    console.print(_table(board, now_ns))
-    assert isinstance(console.file, StringIO)
-    return console.file.getvalue()
+        return printable(msgspec.json.encode({"plants": plants}).decode())
+    return board.text(now_ns, screen_width(), colour=has_colour())
 
 
-def _table(board: StatusBoard, now_ns: int) -> "Table":
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table("plant", "node", "phase", "samples/s", "lost", "refused", "lag", "said", "alarms")
-    for name in board.plants:
-        plant = board.plant(name, now_ns)
-        rate = plant["samples_per_s"]
-        alarms = printable_lines(f"{item['alarm']} ({item['priority']}): {item['state']}" for item in plant["alarms"])
-        rates = "" if rate is None else f"{rate:.3g}"
-        missing = [item for item, signal in plant["signals"].items() if signal["value"] is None]
-        rates += f"\nno {', '.join(missing)}" if missing else ""
-        for number, node in enumerate(plant["nodes"] or [{"node": "", "alive": True}]):
-            first = number == 0
-            cells = (
-                name if first else "",
-                node["node"],
-                node.get("phase", "") if node["alive"] else "not there",
-                rates if first else "",
-                str(node.get("lost", "")),
-                str(node.get("refused", "")),
-                f"{node['lag_ms']:.1f} ms" if "lag_ms" in node else "",
-                f"{node['said_s_ago']:.0f} s ago" if "said_s_ago" in node else "",
-                (alarms or "none") if first else "",
-            )
-            lines = (printable_lines(cell.split("\n")) for cell in cells)
-            table.add_row(*map(Text, lines))  # text from the bus is no markup
-    if not table.row_count:
-        table.add_row("no nodes", *[""] * 8)
-    return table
-
-
-def _alarm(alarm: Alarm) -> dict[str, Any]:
+def _alarm(alarm: Alarm, now: Now) -> dict[str, Any]:
     return {
         "alarm": alarm.alarm,
         "state": state_word(alarm.state),
         "priority": priority_word(alarm.priority),
+        "incident": alarm.incident or None,
+        "age_s": age_s(alarm, now),
         "text": alarm.text,
+        "suspect": [
+            {"cause": item.cause, "probability": item.probability, "text": item.text} for item in alarm.suspects
+        ],
     }
-
-
-def _is_visible(alarm: Alarm) -> bool:
-    return alarm.state in (
-        AlarmState.ALARM_STATE_UNACKNOWLEDGED,
-        AlarmState.ALARM_STATE_ACKNOWLEDGED,
-        AlarmState.ALARM_STATE_RETURNED_UNACKNOWLEDGED,
-    )
-
-
-def _rank(alarm: Alarm) -> tuple[int, int]:
-    """Sort key: the most urgent first, then the newest."""
-    return -alarm.priority, -alarm.raised_ns

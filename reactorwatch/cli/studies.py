@@ -1,30 +1,36 @@
 """Commands on records: `simulate`, `backtest` and `diagnose`."""
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from reactorwatch.cli.display import print_report
 from reactorwatch.cli.options import (
     Columns,
     Files,
     Force,
+    Inputs,
     Json,
-    Model,
+    Outputs,
     Plant,
     Process,
     Processes,
+    Reference,
     Scheduler,
     Settings,
-    check_input,
+    TrainingMin,
+    TrainingRows,
     check_output,
     check_recording,
+    choose_process,
     parse_columns,
     parse_limits,
     parse_tolerances,
     split_names,
+    training_flags,
 )
-from reactorwatch.cli.printing import print_text
 from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS, FileFormat
@@ -56,37 +62,51 @@ def simulate(
 
     They start from its first row and run freely, driven by its inputs.
     """
+    from reactorwatch.api.files import described_process, process_on_clock, record
+    from reactorwatch.api.simulation import report, simulate_along
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.read_record import record
-    from reactorwatch.cli.simulation import report, simulate_along
     from reactorwatch.description.choice import ProcessChoice
     from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
 
     choice = ProcessChoice(process)
     out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
-    measured = record(check_recording(file), plant, parse_columns(column), choice.load(), stated=stated)
-    model = choice.load_model(measured.zero_ns)
+    described = described_process(check_recording(file), plant, choice)
+    measured = record(file, plant, parse_columns(column), described, stated=stated)
+    model = process_on_clock(choice, described, measured.zero_ns).require_model()
     with task(f"simulating {file.name}"):
         simulated = simulate_along(measured, model, fault or [])
         try:
             write_table(out, simulated)
         except InputError:
-            print_text(report(measured, simulated, model, None, as_json=as_json))
+            print_report(report(measured, simulated, model, None, as_json=as_json), as_json=as_json)
             raise
-    print_text(report(measured, simulated, model, out, as_json=as_json))
+    print_report(report(measured, simulated, model, out, as_json=as_json), as_json=as_json)
 
 
 def backtest(
     files: Files,
     config: Settings = None,
+    process: Process = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
     plant: Plant = None,
-    training: Annotated[
-        float | None, typer.Option("--training", help="Minutes to learn from [100].", show_default=False)
+    train: Annotated[
+        Path | None,
+        typer.Option(help="A record to learn from, all of it; FILES are then judged from their first row."),
     ] = None,
-    model: Model = None,
+    training: TrainingMin = None,
+    training_rows: TrainingRows = None,
+    reference: Reference = None,
+    scheme: Annotated[
+        str, typer.Option(help="monitor, or report: watch as the original report does, mean +- 3 sigma of OE(3,3).")
+    ] = "monitor",
     column: Columns = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for a summary of several files.", show_default=False)
+    ] = None,
+    rows: Annotated[
+        Path | None,
+        typer.Option(help="A file (.csv) for each row of FILES, and whether an alarm is active.", show_default=False),
     ] = None,
     jobs: Processes = None,
     scheduler: Scheduler = None,
@@ -96,24 +116,54 @@ def backtest(
 ) -> None:
     """Run the monitor over recordings at full speed."""
     from monitor_node.config import MonitorConfig
-    from reactorwatch.cli.backtest_jobs import BACKTEST, make_jobs
+    from reactorwatch.api.files import DEFAULT_PLANT
+    from reactorwatch.cli.backtest_jobs import BACKTEST, BacktestOptions, make_jobs, train_on, write_rows
     from reactorwatch.cli.batch import SUMMARY, expand_files, run_jobs
-    from reactorwatch.cli.read_record import DEFAULT_PLANT
+    from reactorwatch.cli.progress import task
     from reactorwatch.records.output import check_output_folder
     from reactorwatch.runtime.config import read_settings, section
 
-    named = expand_files(files)
+    named, choice = expand_files(files), choose_process(process, inputs, outputs)
+    sources = (*named, config, train, choice.file)
     if out is not None:
-        check_output_folder(out, SUMMARY, (*named, config, model), force=force)
-    flags = {
-        "plant": plant or DEFAULT_PLANT,
-        "training_min": training,
-        "model": str(check_input(model)) if model is not None else None,
-    }
-    settings = section(MonitorConfig, "monitor", read_settings(config), flags)
-    columns, elsewhere = parse_columns(column), scheduler is not None
-    todo = make_jobs(named, settings, plant, columns, as_json=as_json, elsewhere=elsewhere, stated=stated)
-    run_jobs(BACKTEST, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)
+        check_output_folder(out, SUMMARY, sources, force=force)
+    if rows is not None:
+        rows = check_output(rows, ".csv", sources, force=force)
+    if train is not None and (training is not None or training_rows is not None):
+        raise InputError(f"--train {train}: all of it is the training; leave --training and --training-rows out")
+    if train is not None and scheme == "report":
+        raise InputError(f"--train {train}: the report's scheme learns from the first rows of each file; leave it out")
+    tables = read_settings(config)
+    flags: dict[str, Any] = {"plant": plant or DEFAULT_PLANT, "reference": reference}
+    if choice.outputs:
+        choice.load()  # reports a column of two roles
+        flags |= {"inputs": choice.inputs, "outputs": choice.outputs}
+    flags |= training_flags(tables, training, training_rows)
+    settings = section(MonitorConfig, "monitor", tables, flags)
+    asked = BacktestOptions(
+        settings,
+        plant,
+        parse_columns(column),
+        choice,
+        stated,
+        as_json=as_json,
+        log_rows=rows is not None,
+        scheme=scheme,
+    )
+    trained = None
+    if train is not None:
+        with task(f"learning from {train.name}"):
+            trained = train_on(train, asked)
+    run_jobs(
+        BACKTEST,
+        make_jobs(named, asked, trained, elsewhere=scheduler is not None),
+        named,
+        out,
+        processes=jobs,
+        scheduler=scheduler,
+        as_json=as_json,
+        on_end=None if rows is None else partial(write_rows, rows),
+    )
 
 
 def diagnose(

@@ -23,16 +23,16 @@ from reactorwatch.cli.bus_settings import (
     restrict_to_plant,
     write_node_settings,
 )
+from reactorwatch.cli.plant_settings import PlayedRecord, load_source
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
+from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.output import check_folder_name
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import stop_on_signals
 from reactorwatch.runtime.logs import configure
-from reactorwatch.runtime.model_file import read_extended_model
 from recorder.__main__ import first_file
 from recorder.config import RecorderConfig
 from recorder.policy.file_names import ENDING
@@ -51,6 +51,7 @@ def run_until_stopped(
     flags: dict[str, Any],
     diagnose: Path | None = None,
     site: Path | None = None,
+    played: PlayedRecord | None = None,
 ) -> int:
     """Run everything until SIGINT or SIGTERM, or until a node ends by itself.
 
@@ -62,6 +63,7 @@ def run_until_stopped(
         flags: flags of the plant; None: not given.
         diagnose: folder for diagnoses after alarms; None: that of the settings, or none.
         site: folder of a site, for its router and the nodes' certificates; None: without TLS.
+        played: a record that is played in place of a simulated plant; None: a plant is simulated.
 
     Returns:
         0 if it was stopped or the plant finished, 1 if a node failed.
@@ -72,34 +74,35 @@ def run_until_stopped(
     tables = read_settings(config)
     log_config = section(LogConfig, "log", tables, {})
     configure(as_json=log_config.format == "json")
-    name = flags.get("name")
-    waiting = {"wait_for": ["monitor", "recorder"]}
-    plant = section(PlantConfig, "plant", {"plant": {**waiting, **tables.get("plant", {})}}, flags)
-    monitor = section(MonitorConfig, "monitor", tables, {"plant": name or plant.name})
-    try:
-        check_promise(monitor, plant.period_min)
-    except InputError as error:
-        raise InputError(f"settings [monitor]: {error}") from error
-    of_recorder = {"recorder": {"out": DEFAULT_OUT, **tables.get("recorder", {})}}
-    recorder_flags = {"plant": name or plant.name, "out": str(out) if out is not None else None}
+    source = load_source(tables, flags, played)
+    monitor = section(MonitorConfig, "monitor", tables, source.monitor_flags(tables))
+    if isinstance(source.settings, PlantConfig):
+        try:
+            check_promise(monitor, source.settings.period_min)
+        except InputError as error:
+            raise InputError(f"settings [monitor]: {error}") from error
+    of_recorder = tables.get("recorder", {})
+    processes = {source.plant: source.process, **of_recorder.get("processes", {})}
+    of_recorder = {"recorder": {"out": DEFAULT_OUT, **of_recorder, "processes": processes}}
+    recorder_flags = {"plant": source.plant, "out": str(out) if out is not None else None}
     recorder = restrict_to_plant(section(RecorderConfig, "recorder", of_recorder, recorder_flags), site)
-    join = load_bus_settings(site, plant.name, tables, endpoint)
+    join = load_bus_settings(site, source.plant, tables, endpoint)
     diagnosis = diagnosis_settings(tables, monitor, diagnose)
     metrics = section(MetricsConfig, "metrics", tables, {})
     if Path(recorder.out).suffix != ENDING:
         check_folder_name(Path(recorder.out), "--out")
     with open_router(site, join):  # before anything is written, in case the address is taken
-        tables_written = {"plant": plant, "monitor": monitor, "diagnosis": diagnosis, "metrics": metrics}
-        nodes = ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", "plant")
-        settings = _write_settings(recorder, plant.seed, {**tables_written, "log": log_config}, join, nodes)
-        with stop_on_signals() as stop, Processes(settings) as processes:
+        tables_written = {source.node: source.settings, "monitor": monitor, "diagnosis": diagnosis, "metrics": metrics}
+        nodes = ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", source.node)
+        settings = _write_settings(recorder, source.about, {**tables_written, "log": log_config}, join, nodes)
+        with stop_on_signals() as stop, Processes(settings) as processes_running:
             woken = threading.Event()
             stop.call_on_set(woken.set)
             for node in nodes:
-                processes.start(node)
-            log.info("running", plant=plant.name, router=join[VIEWER].endpoint, out=recorder.out, stop="Ctrl-C")
+                processes_running.start(node)
+            log.info("running", plant=source.plant, router=join[VIEWER].endpoint, out=recorder.out, stop="Ctrl-C")
             while not woken.wait(POLL_S):
-                ended = processes.exit_codes()
+                ended = processes_running.exit_codes()
                 if ended:
                     for node, code in ended.items():
                         log.info("ended by itself", node=node, code=code)
@@ -118,7 +121,7 @@ def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig
     Raises:
         InputError: invalid settings, or a folder that is a file.
     """
-    of_monitor = {"plant": monitor.plant, **({"model": monitor.model} if monitor.model else {})}
+    of_monitor = {"plant": monitor.plant, **({"model": monitor.process} if monitor.process else {})}
     tables = {"diagnosis": {**of_monitor, **tables.get("diagnosis", {})}}
     settings = section(DiagnosisConfig, "diagnosis", tables, {"out": str(out) if out is not None else None})
     if settings.out is not None:
@@ -134,7 +137,7 @@ def check_against_model(config: DiagnosisConfig) -> None:
     Raises:
         InputError: there is no such model, or a tolerance is for none of its outputs.
     """
-    model = cstr() if config.model is None else read_extended_model(Path(config.model)).build()
+    model = find_process(config.model or DEFAULT_PROCESS).require_model()
     try:
         check_tolerance(model, config.tolerance)
     except InputError as error:
@@ -154,7 +157,7 @@ def run_diagnosis_node(config: DiagnosisConfig, bus_config: BusConfig, log_confi
 
 def _write_settings(
     recorder: RecorderConfig,
-    seed: int,
+    about: dict[str, str],
     others: dict[str, msgspec.Struct],
     join: BusSettings,
     nodes: Sequence[str],
@@ -166,6 +169,6 @@ def _write_settings(
     if recording.exists():
         raise InputError(f"--out {out}: a recording of that name exists; choose another name, or a folder")
     settings = recording.with_suffix(".toml")
-    about = {"seed": str(seed), "settings": settings_text({"bus": join[VIEWER], **others}), **recorder.about}
+    about = {**about, "settings": settings_text({"bus": join[VIEWER], **others}), **recorder.about}
     recorder = msgspec.structs.replace(recorder, about=about)
     return write_node_settings(settings, {**others, "recorder": recorder}, join, nodes)

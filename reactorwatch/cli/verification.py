@@ -14,13 +14,15 @@ from reactorwatch.cli.printing import print_text
 from reactorwatch.cli.progress import task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
+from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import parse_tables, read_settings, section
 from reactorwatch.terminal import printable_lines
 from recorder.tools.inspect import gaps_in, zero_ns_of
-from recorder.tools.mcap_file import has_clock, one_plant_in, read_messages, read_metadata
+from recorder.tools.mcap_file import has_clock, one_plant_in, read_messages, read_metadata, recorded_process
 
 SETTINGS = "settings"
 """Name of the nodes' settings in the metadata of a recording."""
@@ -53,7 +55,7 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
 
     with task(f"verifying {file.name}"):
         try:
-            verification = verify(read, monitor)
+            verification = verify(read, monitor, _described_process(file, monitor) if config is None else None)
         except InputError as error:
             raise error if str(error).startswith(str(file)) else InputError(f"{file}: {error}") from error
     version = metadata.get("version", __version__)
@@ -71,6 +73,18 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
     }
     print_text(msgspec.json.encode(report).decode() if as_json else _text(report))
     return 0 if verification.exact else 1
+
+
+def _described_process(file: Path, monitor: MonitorConfig) -> Process | None:
+    """Process that the recording describes, where the settings in it name a file; None: that of the settings.
+
+    A file of equations that a recording cannot hold is read, if it is still there.
+    """
+    named = ProcessChoice(monitor.process).file
+    described = None if named is None else recorded_process(file, monitor.plant)
+    if described is None or (described.model is None and named is not None and named.exists()):
+        return None
+    return described
 
 
 def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: str) -> MonitorConfig:

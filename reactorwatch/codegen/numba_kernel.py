@@ -7,6 +7,7 @@ thousand, with the same bits.
 `fastmath` stays off: the compiler could then reorder sums, and two machines differ.
 """
 
+import logging
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -14,6 +15,8 @@ import numba
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
+
+_log = logging.getLogger(__name__)
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
@@ -25,9 +28,25 @@ def jit(kernel: Kernel) -> Kernel:
         kernel: a function of numbers and NumPy arrays, in the subset of Python that Numba compiles.
     """
     try:
-        return cast(Kernel, numba.njit(cache=True, fastmath=False, error_model="numpy")(kernel))
+        compiled = numba.njit(cache=True, fastmath=False, error_model="numpy")(kernel)
     except RuntimeError:  # Numba: no locator available
         return cast(Kernel, numba.njit(cache=False, fastmath=False, error_model="numpy")(kernel))
+    _tolerate_full_disk(compiled)
+    return cast(Kernel, compiled)
+
+
+def _tolerate_full_disk(compiled: Any) -> None:
+    """Let a kernel work where its machine code cannot be cached: what was asked for is its result, not the cache."""
+    cache = compiled._cache
+    save = cache.save_overload
+
+    def save_overload(signature: Any, code: Any) -> None:
+        try:
+            save(signature, code)
+        except OSError as error:
+            _log.debug("the machine code of %s is not cached: %s", compiled.__name__, error)
+
+    cache.save_overload = save_overload
 
 
 def python_function(kernel: Kernel) -> Kernel:

@@ -11,8 +11,22 @@ MIN_PROBABILITY = 0.05
 _MINUTE_NS = 60_000_000_000
 
 
+def describe_suspects(suspects: Iterable[Suspect]) -> str:
+    """Likeliest causes of an alarm in words, with their probabilities; empty if there are none.
+
+    >>> lost = Suspect(cause="coolant_flow", probability=0.93, text="15 % of the coolant lost")
+    >>> describe_suspects([lost, Suspect(cause="feed_flow", probability=0.06)])
+    '15 % of the coolant lost (93 %), feed flow (6 %)'
+    """
+    return ", ".join(
+        f"{item.text or item.cause.replace('_', ' ')} ({100 * item.probability:.0f} %)"
+        for item in suspects
+        if item.probability >= MIN_PROBABILITY
+    )
+
+
 def suspects_text(suspects: Iterable[Suspect], zero_ns: int | None = None) -> str:
-    """Format the likeliest causes; empty if there are none.
+    """Likeliest causes by their names, with profile, size and onset; empty if there are none.
 
     >>> suspects_text([Suspect(cause="coolant_flow", probability=0.93, profile="step", size=-0.1502, unit="1")])
     'coolant_flow (93 %; step of -0.15)'

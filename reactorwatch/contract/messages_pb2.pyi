@@ -231,7 +231,7 @@ class Contribution(_message.Message):
     def __init__(self, signal: _Optional[str] = ..., share: _Optional[float] = ...) -> None: ...
 
 class Suspect(_message.Message):
-    __slots__ = ("cause", "probability", "profile", "size", "size_sd", "unit", "onset_ns", "onset_sd_min", "kind")
+    __slots__ = ("cause", "probability", "profile", "size", "size_sd", "unit", "onset_ns", "onset_sd_min", "kind", "text")
     CAUSE_FIELD_NUMBER: _ClassVar[int]
     PROBABILITY_FIELD_NUMBER: _ClassVar[int]
     PROFILE_FIELD_NUMBER: _ClassVar[int]
@@ -241,6 +241,7 @@ class Suspect(_message.Message):
     ONSET_NS_FIELD_NUMBER: _ClassVar[int]
     ONSET_SD_MIN_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
     cause: str
     probability: float
     profile: str
@@ -250,7 +251,8 @@ class Suspect(_message.Message):
     onset_ns: int
     onset_sd_min: float
     kind: str
-    def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ..., profile: _Optional[str] = ..., size: _Optional[float] = ..., size_sd: _Optional[float] = ..., unit: _Optional[str] = ..., onset_ns: _Optional[int] = ..., onset_sd_min: _Optional[float] = ..., kind: _Optional[str] = ...) -> None: ...
+    text: str
+    def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ..., profile: _Optional[str] = ..., size: _Optional[float] = ..., size_sd: _Optional[float] = ..., unit: _Optional[str] = ..., onset_ns: _Optional[int] = ..., onset_sd_min: _Optional[float] = ..., kind: _Optional[str] = ..., text: _Optional[str] = ...) -> None: ...
 
 class Reconstruction(_message.Message):
     __slots__ = ("time_ns", "value", "sd", "unit", "measured", "cause")
@@ -410,14 +412,16 @@ class ClearFault(_message.Message):
     def __init__(self, cause: _Optional[str] = ..., by: _Optional[str] = ...) -> None: ...
 
 class AlarmCommand(_message.Message):
-    __slots__ = ("alarm", "by", "comment")
+    __slots__ = ("alarm", "by", "comment", "incident")
     ALARM_FIELD_NUMBER: _ClassVar[int]
     BY_FIELD_NUMBER: _ClassVar[int]
     COMMENT_FIELD_NUMBER: _ClassVar[int]
+    INCIDENT_FIELD_NUMBER: _ClassVar[int]
     alarm: str
     by: str
     comment: str
-    def __init__(self, alarm: _Optional[str] = ..., by: _Optional[str] = ..., comment: _Optional[str] = ...) -> None: ...
+    incident: int
+    def __init__(self, alarm: _Optional[str] = ..., by: _Optional[str] = ..., comment: _Optional[str] = ..., incident: _Optional[int] = ...) -> None: ...
 
 class ShelveAlarm(_message.Message):
     __slots__ = ("alarm", "by", "comment", "minutes")

@@ -6,7 +6,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 from reactorwatch.description.process import Process, describe_model
 from reactorwatch.errors import InputError
-from reactorwatch.process import EFFECTS_OF, MODELS
+from reactorwatch.process import MODELS
 from reactorwatch.process.model import ProcessModel
 
 GROUP = "reactorwatch.processes"
@@ -41,8 +41,7 @@ class Catalogue(Mapping[str, Callable[[], Process]]):
 
 
 def _build_process(make: Callable[[], ProcessModel]) -> Process:
-    model = make()
-    return describe_model(model, EFFECTS_OF.get(model.name, ()))
+    return describe_model(make())
 
 
 def _load(entry: EntryPoint) -> Process:

@@ -53,11 +53,12 @@ class ProcessChoice:
         """Copy with the absolute path of the file."""
         return self if self.file is None else replace(self, process=str(self.file.absolute()))
 
-    def load(self, zero_ns: int = 0) -> Process:
+    def load(self, zero_ns: int = 0, *, on_bus: bool = False) -> Process:
         """Load the process.
 
         Args:
             zero_ns: time from which the minutes of an extended model count; 0: the one that its file states.
+            on_bus: see `find_process`.
 
         Raises:
             InputError: as `find_process`.
@@ -66,7 +67,7 @@ class ProcessChoice:
             roles = {"input": self.inputs, "output": self.outputs}
             signals = (Signal(name, role=role) for role, names in roles.items() for name in names)
             return Process(UNDESCRIBED, tuple(signals))
-        return find_process(self.process or DEFAULT_PROCESS, zero_ns)
+        return find_process(self.process or DEFAULT_PROCESS, zero_ns, on_bus=on_bus)
 
     def load_model(self, zero_ns: int = 0) -> ProcessModel:
         """Load the equations of the process.

@@ -1,13 +1,13 @@
 """Find a process: by name in the catalogue, or in a file that describes it (`.toml`, `.py`, `extended.json`)."""
 
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
 from reactorwatch.description.catalogue import Catalogue, check_process
 from reactorwatch.description.process import Process, describe_model
 from reactorwatch.description.toml_file import parse_process
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.process import EFFECTS_OF
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.input_file import wrap_read_errors
@@ -21,7 +21,9 @@ FILE_KINDS = (".toml", ".py", ".json")
 """Suffixes of files that describe a process."""
 
 
-def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS, zero_ns: int = 0) -> Process:
+def find_process(
+    process: str | Path | Process | ProcessModel = DEFAULT_PROCESS, zero_ns: int = 0, *, on_bus: bool = False
+) -> Process:
     """Find a process.
 
     Args:
@@ -29,6 +31,8 @@ def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS,
             extended model (`.json`); or the process itself.
         zero_ns: time from which the minutes of an extended model's effects are to count, in nanoseconds since
             1970-01-01 UTC; 0: the zero that its file states.
+        on_bus: True if the minutes are to count from 1970-01-01 UTC, as those of samples on the bus; `zero_ns` is then
+            the zero of a file that states none.
 
     Raises:
         InputError: there is no such name or file, or the file does not describe a process; the text starts with its
@@ -37,7 +41,7 @@ def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS,
     if isinstance(process, Process):
         return process
     if isinstance(process, ProcessModel):
-        return describe_model(process, EFFECTS_OF.get(process.name, ()))
+        return describe_model(process)
     path = Path(process)
     kind = path.suffix.lower()
     if kind not in FILE_KINDS:
@@ -50,24 +54,28 @@ def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS,
         content = path.read_bytes()
     try:
         if kind == ".toml":
-            return parse_process(content, lambda name: _find_equations(name, path.parent, zero_ns))
+            return parse_process(content, lambda name: _find_equations(name, path.parent, zero_ns, on_bus=on_bus))
         if kind == ".py":
             return check_process(_call_function(path), f"{FUNCTION}()")
         extended = parse_extended_model(content)
-        model = (extended.rebase(zero_ns) if zero_ns else extended).build()
-        return describe_model(model, EFFECTS_OF.get(model.name, ()))
+        if on_bus:
+            extended = replace(extended, zero_ns=extended.zero_ns or zero_ns).rebase(0)
+        elif zero_ns:
+            extended = extended.rebase(zero_ns)
+        model = extended.build()
+        return describe_model(model)
     except InputError as error:
         raise InputError(f"process file {path}: {error}") from error
 
 
-def _find_equations(name: str, folder: Path, zero_ns: int) -> Process:
+def _find_equations(name: str, folder: Path, zero_ns: int, *, on_bus: bool) -> Process:
     """Process of the catalogue, or the extended model in a file; a relative path counts from a folder.
 
     Raises:
         InputError: there is none.
     """
     if Path(name).suffix.lower() == ".json":
-        return find_process(folder / name, zero_ns)
+        return find_process(folder / name, zero_ns, on_bus=on_bus)
     catalogue = Catalogue()
     if name not in catalogue:
         raise InputError(describe_unknown("equations", name, catalogue) + ", or the path of an extended.json")

@@ -6,10 +6,12 @@ from functools import cached_property
 from typing import Literal, get_args
 
 from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.process import CONTROLLERS_OF, EFFECTS_OF, OPERATIONS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.effect_twins import add_generic
 from reactorwatch.process.generic_effects import generic_effects
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.operation import Operation
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.units import conversion
 
@@ -83,9 +85,10 @@ class Process:
         signals: the signals, each name once; at least one of them an output.
         equations: the model, in the units of the equations; None: it is learned from data.
         effects: what can be named as a cause and injected as a fault.
-        controllers: controllers of its inputs, for a simulation.
+        controllers: controllers of its inputs, for a simulation (see `reactorwatch.process.controller`).
         parameters: constants of the equations that are given, by name: value, standard deviation and unit.
         file_format: statements on how to read its files; the rest is guessed for each file.
+        operation: levels of its inputs, noise of its sensors and named runs, for a simulation.
         generic: whether effects made from its equations are possible causes beside its own (`causes`).
 
     Raises:
@@ -99,6 +102,7 @@ class Process:
     controllers: tuple[object, ...] = ()
     parameters: Mapping[str, KnownParameter | tuple[float, float, str]] = field(default_factory=dict)
     file_format: FileFormat = field(default_factory=FileFormat)
+    operation: Operation = field(default_factory=Operation)
     generic: bool = False
 
     def __post_init__(self) -> None:
@@ -151,6 +155,14 @@ class Process:
         if not self.effects:
             return generic_effects(self.model)
         return add_generic(self.model, tuple(self.effects)) if self.generic else self.effects
+
+    @cached_property
+    def faults(self) -> tuple[Effect, ...]:
+        """Effects that can be injected: its own, and those made from its equations under other names."""
+        if self.model is None:
+            return ()
+        names = {effect.name for effect in self.effects}
+        return (*self.effects, *(effect for effect in generic_effects(self.model) if effect.name not in names))
 
     def select_causes(self, without: Sequence[str] = ()) -> tuple[Effect, ...]:
         """Causes but for some, by name; none is replaced by a generic one that does the same.
@@ -245,13 +257,20 @@ class Process:
             raise InputError(f"process {self.name!r}: {error}") from error
 
 
-def describe_model(model: ProcessModel, effects: tuple[Effect, ...] = (), name: str | None = None) -> Process:
-    """Describe a model: each input and output is a signal of its name, with its unit."""
+def describe_model(model: ProcessModel) -> Process:
+    """Describe a model: each input and output is a signal of its name, with its unit; the rest is of the catalogue."""
     signals = (
         *(Signal(item.name, item.unit, "input") for item in model.inputs),
         *(Signal(item.name, item.unit, "output") for item in model.outputs),
     )
-    return Process(name or model.name, signals, model, effects)
+    return Process(
+        model.name,
+        signals,
+        model,
+        EFFECTS_OF.get(model.name, ()),
+        CONTROLLERS_OF.get(model.name, ()),
+        operation=OPERATIONS.get(model.name, Operation()),
+    )
 
 
 def _find_parameter(process: Process, name: str) -> str:

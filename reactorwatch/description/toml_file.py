@@ -95,7 +95,7 @@ def parse_process(content: bytes, find_equations: Callable[[str], Process]) -> P
     described: dict[str, Any] = {}
     if document.equations is not None:
         named = find_equations(document.equations)
-        described = {"equations": named.equations, "effects": named.effects, "controllers": named.controllers}
+        described = {name: getattr(named, name) for name in ("equations", "effects", "controllers", "operation")}
     return Process(
         document.name,
         tuple(Signal(**msgspec.structs.asdict(item)) for item in document.signals),

@@ -39,8 +39,8 @@ def curves_of(
         hypothesis.filter.effects, hypothesis.profiles, best.fit.parameters, signals, covariances, strict=True
     ):
         slope = profile.derivatives(parameters, profile.difference_steps).sample_value
-        deviation[effect.name] = signal.sample_value
-        deviation_sd[effect.name] = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, part, slope), 0.0))
+        deviation[effect.name], n = signal.sample_value, profile.n_shape
+        deviation_sd[effect.name] = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, part[:n, :n], slope), 0.0))
     before = simulate_outputs(run, nominal.hypothesis.filter, (), offsets)
     after = before if best is nominal else simulate_outputs(run, hypothesis.filter, signals, offsets)
     return Curves(

@@ -41,7 +41,7 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.cause_prior import FROM_BEGINNING
 from reactorwatch.diagnosis.search.noise_masking import search_single_cause
 from reactorwatch.diagnosis.search.pairs import search_pairs
-from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult
+from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult, smallest_noise
 from reactorwatch.diagnosis.sensor_noise import estimate_sensor_noise
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, minus_log10_p
 from reactorwatch.process import effects_of
@@ -64,9 +64,6 @@ NEARLY = 1.15
 """Ratio to the noise: a simulation with a smaller error explains what matters, even if its residual is not white."""
 
 KEPT_BYTES = 31_000_000
-
-SMALLEST_NOISE = 1e-3
-"""Lower bound of a sensor's noise as a fraction of the state's scale; files have so many digits."""
 
 
 def diagnose(
@@ -102,7 +99,7 @@ def diagnose(
     whole = make_run(record, model)
     bands = tolerances_of(whole, model, tolerance or {})
     plant = add_priors(model, uncertain or {})
-    search = Search(plant, effects, whole, _smallest_sd(model))
+    search = Search(plant, effects, whole, smallest_noise(model))
     run = search.run
     result = search_single_cause(search)
     if search.adopt_colored_noise(result.best):
@@ -123,7 +120,7 @@ def diagnose(
         unknown = unknowns.localise()
         if verdict == UNKNOWN or _is_unknown(unknown, result, best, run, float(np.max(adequacy))):
             verdict, best, location = UNKNOWN, result.nominal, unknown.location
-        elif unknown.gain_over(best, run) > -SURE and len(best.label) > 1:
+        elif unknown.gain_over(best) > -SURE and len(best.label) > 1:
             verdict = AMBIGUOUS
             remarks.append(f"one unknown deviation in {unknown.location} explains the record as well")
         else:
@@ -138,6 +135,10 @@ def diagnose(
         best, covariances = refine_parameters(search, best)
     else:
         best = law_hypothesis(law, run)
+        if unknown is not None and unknown.approximation > LISTED:
+            remarks.append(
+                f"the law is an approximation: a smooth correction there is better by {unknown.approximation:.0f} BIC"
+            )
         covariances, adequacy = covariances_of(run, best), minus_log10_p(best.fit.w, run.inputs)
     before, after = evaluate_holdout(run, result.nominal, best)
     curves = curves_of(whole, run, model, result.nominal, best, covariances)
@@ -200,7 +201,7 @@ def _is_unknown(unknown: Localised, result: SearchResult, best: FittedHypothesis
         run: the record.
         log_p: minus the decimal logarithm of the p-value that its innovations are white.
     """
-    better = unknown.is_better(best, run)
+    better = unknown.is_better(best)
     if log_p < WHITE:
         return better and bool(best.label)
     if not best.label or log_p >= (MUCH_RESIDUAL if len(best.label) == 1 else MUCH_RESIDUAL_OF_TWO):
@@ -324,8 +325,3 @@ def _describe_outliers(whole: Run, run: Run) -> list[str]:
         return []
     values = "1 value was" if count == 1 else f"{count} values were"
     return [f"{values} excluded as outliers"]
-
-
-def _smallest_sd(model: ProcessModel) -> list[float]:
-    scales = {state.name: state.scale for state in model.states}
-    return [SMALLEST_NOISE * scales.get(output.name, 1.0) for output in model.outputs]

@@ -109,6 +109,9 @@ def causes_of(best: FittedHypothesis, covariances: Sequence[Array]) -> list[Caus
             )
             for name, number in value.items()
         }
+        for index, item in enumerate(profile.constants, start=profile.n_shape):
+            sd = sqrt(max(float(part[index, index]), 0.0))
+            parameters[item.name] = Estimate(float(fitted[index]), sd, item.unit)
         causes.append(
             Cause(effect.name, profile.name, effect.labels.get(profile.name, effect.label), effect.location, parameters)
         )

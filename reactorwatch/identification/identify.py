@@ -1,7 +1,7 @@
 """Identify models of one output from a record, and validate them on rows that they have not seen."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.identification import report_scheme
 from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, model_of
 from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.excitation import check_record
@@ -23,7 +24,7 @@ from reactorwatch.identification.recursive_output_error import RecursiveOutputEr
 from reactorwatch.identification.regressor import consecutive_rows, rows_of
 from reactorwatch.identification.residual_tests import DEFAULT_LAGS, independence, whiteness
 from reactorwatch.identification.rls import RecursiveLeastSquares
-from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure
+from reactorwatch.identification.structure import Scaling, Structure
 
 Array = NDArray[np.float64]
 
@@ -37,6 +38,12 @@ MODELS: dict[str, Callable[..., FittedModel]] = {
     "narx": fit_narx,
 }
 """Fits by the kind of model."""
+
+SCHEMES: Mapping[str, Mapping[str, Callable[..., FittedModel]]] = {
+    "least-squares": MODELS,
+    "report": report_scheme.MODELS,
+}
+"""Fits by scheme and kind of model."""
 
 RECURSIVE_MODELS = ("arx", "oe")
 WORST_MINUS_LOG10_P = 6.0
@@ -55,7 +62,7 @@ class ModelForm:
         delay: samples from a move of an input to its first effect, at least 1.
         recursive: whether it is learned row by row instead of from all rows at once.
         forgetting: forgetting factor of the recursive methods, in (0, 1].
-        choice: rows that are fitted; `REPORT_ROWS` is the report's choice.
+        scheme: `least-squares`, or `report` for the scheme of the original report (see `report_scheme`).
 
     Raises:
         InputError: an unknown kind of model, or a choice that it does not have.
@@ -66,15 +73,20 @@ class ModelForm:
     delay: int = 1
     recursive: bool = False
     forgetting: float = 1.0
-    choice: RowChoice = ALL_ROWS
+    scheme: str = "least-squares"
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise InputError(describe_unknown("model", self.model, MODELS))
         if self.recursive and self.model not in RECURSIVE_MODELS:
             raise InputError(f"only {' and '.join(RECURSIVE_MODELS)} can be recursive, got {self.model}")
-        if self.recursive and self.model == "oe" and self.choice != ALL_ROWS:
-            raise InputError("a recursive output-error model runs through every row: it cannot choose rows")
+        if self.scheme not in SCHEMES:
+            raise InputError(describe_unknown("scheme", self.scheme, SCHEMES))
+        if self.model not in SCHEMES[self.scheme] or (self.recursive and self.scheme == "report"):
+            raise InputError(
+                f"scheme {self.scheme} fits {' and '.join(SCHEMES[self.scheme])}, and no recursive model, got "
+                f"{'recursive ' if self.recursive else ''}{self.model}"
+            )
 
 
 class Deviations(msgspec.Struct, frozen=True):
@@ -182,10 +194,34 @@ class Identification(msgspec.Struct, frozen=True):
         return self.fit_percent
 
 
+@dataclass(frozen=True, eq=False)
+class HeldOutRun:
+    """A model on the held-out rows.
+
+    Attributes:
+        time: times of the rows, shape (rows,).
+        measured: the output, NaN where nothing was measured.
+        one_step: one-step-ahead prediction, NaN where there is none.
+        free: simulation, NaN where there is none, inf after it has diverged.
+    """
+
+    time: Array
+    measured: Array
+    one_step: Array
+    free: Array
+
+
 def identify(
     data: Dataset, form: ModelForm | None = None, validation: Dataset | None = None, settle: int = 0
 ) -> Identification:
-    """Fit a model to the first half of a data set and validate it on the second.
+    """Fit a model and validate it; see `identify_and_run`."""
+    return identify_and_run(data, form, validation, settle)[0]
+
+
+def identify_and_run(
+    data: Dataset, form: ModelForm | None = None, validation: Dataset | None = None, settle: int = 0
+) -> tuple[Identification, HeldOutRun]:
+    """Fit a model to the first half of a data set and validate it on the second; returns it with its run there.
 
     Args:
         data: the rows.
@@ -209,6 +245,11 @@ def identify(
         # Where the input is to blame, that is the cause to name.
         excitation = checks.get("excitation", "ok")
         raise refusal if excitation == "ok" else InputError(excitation) from refusal
+    if form.scheme == "report" and isinstance(model, LinearModel) and model.condition > SINGULAR_CONDITION:
+        checks["rows"] = (
+            f"the report's rows do not determine {form.order * (1 + structure.inputs)} parameters, condition number "
+            f"{model.condition:.0e}: these are the parameters of least norm"
+        )
     residuals = model.residuals(*fitted.arrays)[:, 0]
     of_own_past = {"arx": form.order, "narx": form.order, "oe": 0}.get(form.model, 2 * form.order)
     lags, white = max(DEFAULT_LAGS, of_own_past + 10), math.nan
@@ -222,7 +263,7 @@ def identify(
     predicted[:settle] = np.nan
     y = held_out.output[:, 0]
     values, deviations = _coefficients(model, form, data)
-    return Identification(
+    found = Identification(
         model=form.model,
         order=form.order,
         delay=form.delay,
@@ -236,6 +277,7 @@ def identify(
         rmse=Rmse(_rmse(y, predicted), _rmse(y, run)) if validation is not None or settle else UNSET,
         **values,
     )
+    return found, HeldOutRun(held_out.time, y, predicted, run)
 
 
 def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out: Dataset, settle: int) -> None:
@@ -256,7 +298,7 @@ def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out
 def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
     u, y, t = data.arrays
     if not form.recursive:
-        return MODELS[form.model](structure, u, y, t, form.choice)
+        return SCHEMES[form.scheme][form.model](structure, u, y, t)
     scaling = Scaling.of(u, y)
     if form.model == "oe":
         running = RecursiveOutputError(structure, scaling, form.forgetting)
@@ -266,7 +308,7 @@ def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
             if unbroken_rows:
                 running.update(u[k], float(y[k, 0]))
         return running.model
-    rows = rows_of(structure, scaling.inputs(u), scaling.outputs(y), t, form.choice)
+    rows = rows_of(structure, scaling.inputs(u), scaling.outputs(y), t)
     estimator = RecursiveLeastSquares(structure.parameters, form.forgetting)
     for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
         estimator.update(regressor, value)

@@ -93,12 +93,13 @@ class RegressorBuffer:
     @property
     def state(self) -> BufferState:
         """A copy of the full state."""
+        rows = len(self._outputs) // self._structure.outputs
         return BufferState(
             self._structure,
             self._period_ns,
             self._choice,
-            _rows(self._outputs, self._structure.outputs),
-            _rows(self._inputs, self._structure.inputs),
+            _rows(self._outputs, self._structure.outputs, rows),
+            _rows(self._inputs, self._structure.inputs, rows),
             self._last_time_ns,
             self._row,
         )
@@ -159,9 +160,9 @@ class RegressorBuffer:
         return regressor
 
 
-def _rows(values: list[float], signals: int) -> tuple[tuple[float, ...], ...]:
+def _rows(values: list[float], signals: int, rows: int) -> tuple[tuple[float, ...], ...]:
     """Split a flat list into rows."""
-    return tuple(tuple(values[first : first + signals]) for first in range(0, len(values), signals))
+    return tuple(tuple(values[row * signals : (row + 1) * signals]) for row in range(rows))
 
 
 @dataclass(frozen=True)

@@ -17,18 +17,6 @@ from reactorwatch.process.profiles import CONSTANT, Profile
 TIMING = "timing"
 """Location of a deviation in the timestamps of a record, not in the plant."""
 
-LOCATIONS = (
-    "mass_balance",
-    "energy_balance",
-    "reaction",
-    "feed",
-    "coolant",
-    "temperature_sensor",
-    "concentration_sensor",
-    TIMING,
-)
-"""Locations of effects on the reactor."""
-
 
 @dataclass(frozen=True)
 class EffectConstant:
@@ -42,6 +30,7 @@ class EffectConstant:
         lower: smallest value that makes physical sense.
         upper: largest value that makes physical sense.
         meaning: a short description.
+        start_values: other values from which fits start.
     """
 
     name: str
@@ -51,6 +40,7 @@ class EffectConstant:
     lower: float
     upper: float
     meaning: str
+    start_values: tuple[float, ...] = ()
 
 
 class Effect(ABC):
@@ -59,7 +49,7 @@ class Effect(ABC):
     Attributes:
         name: name in the catalogue of causes.
         label: usual name of the effect in text.
-        location: part of the plant in which it acts; one of `LOCATIONS` for the reactor.
+        location: part of the plant in which it acts.
         unit: unit of its size.
         larger: meaning of a positive size, with `{}` for its amount: in the size's unit, or in % for a share.
         smaller: meaning of a negative size, like `larger`; empty: there is none.
@@ -148,15 +138,28 @@ class Effect(ABC):
         )
         return replace(model, parameters=(*model.parameters, *added)), tuple(item.symbol for item in added)
 
+    def describe(self, size: float) -> str:
+        """Meaning of a size, rounded to two digits, for people.
+
+        Args:
+            size: the size, in the effect's unit.
+        """
+        text, amount = self.larger or f"{self.label}: {{}} {self.unit}".removesuffix(" 1"), size
+        if size < 0.0 and self.smaller:
+            text, amount = self.smaller, -size
+        if "{} %" in text:
+            amount *= 100.0
+        return text.format(f"{float(f'{amount:.2g}'):g}")
+
     def size_signal(self, clock: Clock, profile: Profile, symbols: dict[str, ca.SX]) -> ca.SX:
         """m(t) with a profile, as an expression of the clock and of the symbols of the profile's parameters."""
         return profile.expression(clock, symbols)
 
     def prefix(self, model: ProcessModel) -> str:
         """Prefix of the names of the parameters and states that this effect adds to a model."""
-        taken = set(model.parameter_names)
+        taken = (*model.parameter_names, *model.state_names)
         prefix, number = self.name, 1
-        while f"{prefix}.size" in taken:
+        while any(name.startswith(f"{prefix}.") for name in taken):
             number += 1
             prefix = f"{self.name}_{number}"
         return prefix

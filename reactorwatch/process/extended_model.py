@@ -204,7 +204,8 @@ def _specification(effect: Effect, values: Mapping[str, float], prefix: str) -> 
     """Effect whose parameters have the prefix; profiles are distinguished by their parameters' names."""
     own = {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
     profile = _profile({name for name in own if name != "size"})
-    return FaultSpecification(effect, profile, {name: own[name] for name in ("size", *_names(profile))})
+    constants = [item.name for item in effect.constants if own[item.name] != item.value]
+    return FaultSpecification(effect, profile, {name: own[name] for name in ("size", *_names(profile), *constants)})
 
 
 def _profile(names: set[str]) -> Profile:

@@ -5,6 +5,7 @@
     reaction_rate:decay:-0.2@30min,time_constant=1h
     activation_energy:constant:0.002
     coolant_flow:free:-0.05,0min=0,50min=0.2,100min=1
+    side_reaction:constant:0.1,E2=12000K
 
 The text is cause, profile and size with colons between; where the profile has an onset, `@` and the onset; then
 `name=value` for the profile's other parameters, each after a comma. The size is in the effect's unit. A time carries
@@ -18,10 +19,10 @@ from math import inf, isfinite
 from typing import TypeVar
 
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.process.effect import Effect
+from reactorwatch.process.effect import Effect, EffectConstant
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, free_profile
+from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, ProfileParameter, free_profile
 
 EXAMPLE = "coolant_flow:step:-0.05@30min"
 
@@ -41,7 +42,8 @@ class FaultSpecification:
     Attributes:
         effect: effect of the catalogue.
         profile: profile of the catalogue.
-        values: `size` and the given parameters of the profile; times in minutes of the plant.
+        values: `size`, the given parameters of the profile, times in minutes of the plant, and the given constants of
+            the effect's own.
     """
 
     effect: Effect
@@ -68,6 +70,7 @@ class FaultSpecification:
                     f"like ,{item.name}=90min; or give the run a duration"
                 )
             values[item.name] = value
+        values |= {item.name: self.values[item.name] for item in self.effect.constants if item.name in self.values}
         _check_order(str(self), values)
         return FaultSpecification(self.effect, self.profile, values)
 
@@ -97,14 +100,20 @@ class FaultSpecification:
     def __str__(self) -> str:
         """The canonical text, which `parse_fault` reads."""
         text = f"{self.effect.name}:{self.profile.name}:{_format(self.values['size'])}"
+        given = [item for item in self.effect.constants if item.name in self.values]
+        constants = "".join(f",{item.name}={_format(self.values[item.name])}" for item in given)
         if self.profile.name == FREE_NAME:
-            return text + "".join(f",{_format(time)}min={_format(share)}" for time, share in _curve(self.values))
+            return (
+                text
+                + constants
+                + "".join(f",{_format(time)}min={_format(share)}" for time, share in _curve(self.values))
+            )
         if "onset" in self.values:
             text += f"@{_format(self.values['onset'])}min"
         for item in self.profile.parameters:
             if item.name in self.values and item.name != "onset":
                 text += f",{item.name}={_format(self.values[item.name])}{'min' if item.unit == 'min' else ''}"
-        return text
+        return text + constants
 
 
 def parse_fault(text: str, effects: Sequence[Effect] = EFFECTS) -> FaultSpecification:
@@ -127,12 +136,17 @@ def parse_fault(text: str, effects: Sequence[Effect] = EFFECTS) -> FaultSpecific
     profile = _look_up(text, "profile", parts[1], {item.name: item for item in PROFILES})
     first, *assignments = (part.strip() for part in parts[2].split(","))
     size, at, onset = (part.strip() for part in first.partition("@"))
-    known = {item.name: item for item in profile.parameters}
+    known: dict[str, ProfileParameter | EffectConstant] = {item.name: item for item in profile.parameters}
+    constants = {item.name: item for item in effect.constants}
     if at and "onset" not in known:
         raise InputError(f"fault {text!r}: the profile {profile.name} has no onset, got '@{onset}'; leave it out")
     values = {"size": _parse_number(text, "size", size, effect.unit, (effect.lower, effect.upper))}
     if profile.name == FREE_NAME:
-        return _parse_curve(text, effect, values["size"], assignments)
+        named = [item for item in assignments if item.partition("=")[0].strip() in constants]
+        assignments = [item for item in assignments if item not in named]
+        shape, values = _parse_curve(text, effect, values["size"], assignments)
+        assignments, profile, known = named, shape, {}
+    known |= constants
     given = [("onset", onset)] if at else []
     for assignment in assignments:
         name, equals, value = (part.strip() for part in assignment.partition("="))
@@ -140,7 +154,7 @@ def parse_fault(text: str, effects: Sequence[Effect] = EFFECTS) -> FaultSpecific
             raise InputError(f"fault {text!r}: after the size must come name=value, got {assignment!r}")
         given.append((name, value))
     for name, value in given:
-        item = _look_up(text, f"parameter of the profile {profile.name}", name, known)
+        item = _look_up(text, f"parameter of the profile {profile.name}{_of_effect(effect)}", name, known)
         if name in values:
             raise InputError(f"fault {text!r}: {name} must be given once, got it again as {value!r}")
         values[name] = _parse_number(text, name, value, item.unit, (item.lower, item.upper))
@@ -148,7 +162,7 @@ def parse_fault(text: str, effects: Sequence[Effect] = EFFECTS) -> FaultSpecific
     return FaultSpecification(effect, profile, values)
 
 
-def _parse_curve(text: str, effect: Effect, size: float, assignments: list[str]) -> FaultSpecification:
+def _parse_curve(text: str, effect: Effect, size: float, assignments: list[str]) -> tuple[Profile, dict[str, float]]:
     """Read the knots of a free profile."""
     knots: list[tuple[float, float]] = []
     for assignment in assignments:
@@ -173,13 +187,17 @@ def _parse_curve(text: str, effect: Effect, size: float, assignments: list[str])
     values = {"size": size}
     values |= {f"time_{number}": time for number, (time, _) in enumerate(knots, 1)}
     values |= {f"value_{number}": share for number, (_, share) in enumerate(knots, 1)}
-    return FaultSpecification(effect, free_profile(len(knots)), values)
+    return free_profile(len(knots)), values
 
 
 def _curve(values: Mapping[str, float]) -> list[tuple[float, float]]:
     """Knots of a free profile: times in minutes and shares of the size."""
     count = sum(name.startswith("time_") for name in values)
     return [(values[f"time_{number}"], values[f"value_{number}"]) for number in range(1, count + 1)]
+
+
+def _of_effect(effect: Effect) -> str:
+    return f" or constant of {effect.name}" if effect.constants else ""
 
 
 def _look_up(text: str, what: str, name: str, valid: Mapping[str, _Item]) -> _Item:

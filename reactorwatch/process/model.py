@@ -40,7 +40,8 @@ class Variable:
         scale: a typical magnitude of its changes; tolerances are relative to it.
         meaning: a short description.
         symbol: symbol of the variable in the expressions.
-        balance: location of the balance that a state's equation is (one of `process.effect.LOCATIONS`); empty: none.
+        balance: location of the balance that a state's equation is; empty: none.
+        usual: usual value of an input; None: unknown.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Variable:
     meaning: str
     symbol: ca.SX
     balance: str = ""
+    usual: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +86,16 @@ class Clock:
 
 
 def variable(
-    name: str, unit: str, bounds: tuple[float, float], scale: float, meaning: str, balance: str = ""
+    name: str,
+    unit: str,
+    bounds: tuple[float, float],
+    scale: float,
+    meaning: str,
+    balance: str = "",
+    usual: float | None = None,
 ) -> Variable:
     """Make a variable with a new symbol."""
-    return Variable(name, unit, *bounds, scale, meaning, ca.SX.sym(name), balance)
+    return Variable(name, unit, *bounds, scale, meaning, ca.SX.sym(name), balance, usual)
 
 
 def parameter(name: str, value: float, unit: str, bounds: tuple[float, float], meaning: str) -> Parameter:

@@ -125,7 +125,11 @@ class TextTable:
         try:
             return pyarrow.csv.read_csv(
                 pa.BufferReader(self._body),
-                read_options=pyarrow.csv.ReadOptions(column_names=names, block_size=BLOCK_BYTES),
+                read_options=pyarrow.csv.ReadOptions(
+                    column_names=names,
+                    block_size=BLOCK_BYTES,
+                    use_threads=len(self._body) > BLOCK_BYTES,  # a thread that has just started can abort the exit
+                ),
                 parse_options=pyarrow.csv.ParseOptions(
                     delimiter=layout.separator,
                     newlines_in_values=b'"' in layout.text,

@@ -160,7 +160,7 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
 
     Args:
         kind: class of the settings, with their defaults. If it has `presets`, settings by name, the key `preset` names
-            one.
+            one. If it has `older_keys`, by older name the present one and a conversion of the value, both are valid.
         name: name of the table in the file.
         tables: the tables from `read_settings`.
         flags: values of the command line, by key; None: not given.
@@ -168,7 +168,8 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
     Raises:
         InputError: an unknown key or preset, or a value that breaks a rule.
     """
-    values = {**tables.get(name, {}), **{key: value for key, value in flags.items() if value is not None}}
+    given = {key: value for key, value in flags.items() if value is not None}
+    values = {**_rename_older(kind, name, tables.get(name, {})), **_rename_older(kind, name, given)}
     fields = tuple(field.name for field in msgspec.structs.fields(kind))
     presets: dict[str, dict[str, Any]] | None = getattr(kind, "presets", None)
     if presets is not None:
@@ -195,3 +196,19 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
     except (ValueError, OverflowError) as error:
         raise InputError(f"settings [{name}]: {error}") from error
     return settings
+
+
+def _rename_older(kind: type[Section], name: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Values with the present names of their keys.
+
+    Raises:
+        InputError: a key is there by both names.
+    """
+    renamed = dict(values)
+    for older, (key, convert) in getattr(kind, "older_keys", {}).items():
+        if older not in values:
+            continue
+        if key in values:
+            raise InputError(f"settings [{name}]: {older!r} is an older name of {key!r}, got both; leave {older!r} out")
+        renamed[key] = convert(renamed.pop(older))
+    return renamed

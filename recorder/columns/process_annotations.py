@@ -18,15 +18,20 @@ FARTHEST = 2.0
 
 
 def signal_title(name: str, unit: str, process: Process | None = None) -> str:
-    """Name of a signal, with its meaning if its process has a variable of that name and unit.
+    """Name of a signal, with its meaning if its process has a variable of that name.
 
     Args:
         name: name of the signal.
         unit: unit of the signal.
-        process: process of the signal; None: any of the catalogue.
+        process: process of the signal; None: any of the catalogue whose variable has this unit, too.
     """
-    variables = (item for model in _models_of(process) for item in (*model.inputs, *model.states))
-    meaning = next((item.meaning for item in variables if (item.name, item.unit) == (name, unit)), "")
+    variables = [
+        item
+        for model in _models_of(process)
+        for item in (*model.inputs, *model.states)
+        if item.name == name and (item.unit == unit or process is not None)
+    ]
+    meaning = variables[0].meaning if variables else ""
     return f"{name}: {meaning}" if meaning else name
 
 

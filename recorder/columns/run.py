@@ -36,6 +36,12 @@ class EstimateColumns:
     lower_limit: Values
     upper_limit: Values
 
+    def convert(self, scale: float, offset: float) -> "EstimateColumns":
+        """Columns in another unit, in which a value is `scale * value + offset`."""
+        levels = (scale * item + offset for item in (self.prediction, self.lower_limit, self.upper_limit))
+        prediction, lower, upper = levels
+        return EstimateColumns(self.time_ns, prediction, scale * self.residual, lower, upper)
+
     @property
     def residual_lower_limit(self) -> Values:
         """Lower limit of the residual."""
@@ -66,6 +72,10 @@ class ReconstructionColumns:
     time_ns: Times
     value: Values
     sd: Values
+
+    def convert(self, scale: float, offset: float) -> "ReconstructionColumns":
+        """Columns in another unit, in which a value is `scale * value + offset`."""
+        return ReconstructionColumns(self.time_ns, scale * self.value + offset, scale * self.sd)
 
 
 class AlarmChange(NamedTuple):

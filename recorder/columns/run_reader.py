@@ -20,6 +20,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
+from reactorwatch.units import conversion
 from recorder.columns.measurement import measured_value
 from recorder.columns.run import (
     ADAPTIVE,
@@ -178,15 +179,29 @@ class RunReader:
         self._statistics |= {
             name: _update_statistics(self._statistics.get(name), item) for name, item in samples.items()
         }
+        # a signal is drawn in the unit of its samples; the monitor may publish in that of the equations
+        published = {(item.topic.kind, item.topic.name): item.unit for item in found if item.unit}
+        sampled = {name: unit for (kind, name), unit in published.items() if kind == keys.SAMPLE}
+
+        def in_unit(columns: _Convertible, kind: str, name: str) -> _Convertible:
+            unit = published.get((kind, name), "")
+            return _convert(columns, unit, sampled.get(name.partition("/")[0]) or unit)
+
         run = RunColumns(
             plant=self._plant,
-            units={item.topic.name: item.unit for item in found if item.unit},
+            units={**{name: unit for (_, name), unit in published.items()}, **sampled},
             samples=samples,
-            estimates={name: EstimateColumns(*columns) for name, columns in of_kind(keys.ESTIMATE)},
+            estimates={
+                name: in_unit(EstimateColumns(*columns), keys.ESTIMATE, name)
+                for name, columns in of_kind(keys.ESTIMATE)
+            },
             charts={name: ChartColumns(*columns) for name, columns in of_kind(keys.CHART)},
             alarms=tuple(sorted(self._alarms, key=lambda change: change.time_ns)),
             faults=tuple(sorted(self._faults, key=lambda change: change.time_ns)),
-            reconstructions={name: ReconstructionColumns(*columns) for name, columns in of_kind(keys.RECONSTRUCTION)},
+            reconstructions={
+                name: in_unit(ReconstructionColumns(*columns), keys.RECONSTRUCTION, name)
+                for name, columns in of_kind(keys.RECONSTRUCTION)
+            },
             models={name: _last_of_each_time(items) for name, items in self._models.items()},
             health={node: _last_of_each_time(items) for node, items in self._health.items()},
             statistics=dict(self._statistics),
@@ -199,6 +214,19 @@ class RunReader:
             item.clear()
         self._alarms, self._faults, self._models, self._health = [], [], {}, {}
         return run
+
+
+_Convertible = TypeVar("_Convertible", EstimateColumns, ReconstructionColumns)
+
+
+def _convert(columns: _Convertible, unit: str, wanted: str) -> _Convertible:
+    """Columns in another unit; unchanged where the units are equal or measure different quantities."""
+    if unit == wanted:
+        return columns
+    try:
+        return columns.convert(*conversion(unit, wanted, "signal"))
+    except InputError:
+        return columns
 
 
 def _next_context(run: RunColumns) -> SegmentContext:

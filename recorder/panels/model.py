@@ -4,6 +4,7 @@ Excitation is the ratio of the smallest to the largest singular value of the sca
 estimated parameters are noise.
 """
 
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,6 +13,8 @@ from recorder.columns.run import ADAPTIVE, EQUATIONS, FROZEN, REFERENCE, RunColu
 from recorder.panels.base import LIMIT, MEASURED, PREDICTED, SEVERAL, Colour, Panel, Series, TimePlot
 
 _KINDS = {"a": "of the output", "b": "of the input", "c": "offset"}
+_NAME = re.compile(r"(\D+)\d*(?:_(\d+))?")
+"""Letter, lag and, of several inputs, number of the input in the name of a parameter."""
 _FIXED = {REFERENCE: "reference model", FROZEN: "model frozen since the training"}
 """Labels of models that do not adapt."""
 
@@ -21,7 +24,7 @@ def draw(run: RunColumns) -> tuple[TimePlot, ...]:
     identified = {name: items for name, items in run.models.items() if name[1] != EQUATIONS}
     signals = sorted({signal for signal, _ in identified})
     names = sorted({name for items in identified.values() for item in items for name in item.parameters})
-    kinds = sorted({name.rstrip("0123456789") for name in names})
+    kinds = sorted(set(map(_kind, names)))
     plots = [_parameters(run, signal, kind, names) for kind in kinds for signal in signals]
     by_equations = sorted(signal for signal, purpose in run.models if purpose == EQUATIONS)
     return (
@@ -31,16 +34,26 @@ def draw(run: RunColumns) -> tuple[TimePlot, ...]:
     )
 
 
-def _parameters(run: RunColumns, signal: str, kind: str, names: list[str]) -> TimePlot:
+def _kind(name: str) -> tuple[str, int]:
+    """Letter of a parameter and the number of its signal, from 1; 0: there is only one."""
+    match = _NAME.fullmatch(name)
+    return (match[1], int(match[2] or 0)) if match is not None else (name, 0)
+
+
+def _parameters(run: RunColumns, signal: str, kind: tuple[str, int], names: list[str]) -> TimePlot:
     series: list[Series] = []
-    for index, name in enumerate(name for name in names if name.rstrip("0123456789") == kind):
+    letter, number = kind
+    for index, name in enumerate(name for name in names if _kind(name) == kind):
         colour = SEVERAL[index % len(SEVERAL)]
         for purpose in (REFERENCE, FROZEN, ADAPTIVE):
             items = [item for item in run.models.get((signal, purpose), ()) if name in item.parameters]
             if items:
                 series += _parameter(name, items, colour, purpose)
-    meaning = f" {_KINDS[kind]}" if kind in _KINDS else ""
-    return TimePlot(f"Parameters {kind} of the model of {signal}:{meaning}", "", tuple(series))
+    meaning = f": {_KINDS[letter]}" if letter in _KINDS else ""
+    inputs = () if run.process is None else run.process.inputs
+    if number:
+        meaning += f" {inputs[number - 1] if number <= len(inputs) else number}"
+    return TimePlot(f"Parameters {letter} of the model of {signal}{meaning}", "", tuple(series))
 
 
 def _parameter(name: str, items: list[Snapshot], colour: Colour, purpose: str) -> Iterator[Series]:

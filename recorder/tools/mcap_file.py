@@ -8,7 +8,8 @@ The metadata record "reactorwatch" holds the version that wrote the file and det
 time that minutes count from, where that is not the first sample. If its `clock` is `none`, the record had no clock
 time, and its times were shifted so that none is before 1970.
 
-A metadata record "reactorwatch.process" names the process of a plant, and its signals with their units and roles.
+A metadata record "reactorwatch.process" names the process of a plant, its signals with their units and roles, and its
+equations.
 
 A folder is read as one recording, file by file in the order of time, or interleaved where times overlap. Latched
 messages are skipped in all files but the first.

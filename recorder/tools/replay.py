@@ -1,5 +1,6 @@
-"""Replay a recording or a record on the bus."""
+"""Replay a recording or a record on the bus; as a process: `python -m recorder.tools.replay [settings.toml]`."""
 
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from math import inf, isinf
 from pathlib import Path
@@ -17,6 +18,7 @@ from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.liveliness import wait_alive
+from reactorwatch.runtime.node_main import main
 from recorder.config import ReplayConfig
 from recorder.tools.convert import plant_name
 from recorder.tools.inspect import zero_ns_of
@@ -145,4 +147,10 @@ def _span_ns(config: ReplayConfig, zero_ns: int) -> tuple[int, int]:
     return (
         -NEVER_NS if isinf(begin) else to_time_ns(begin, zero_ns),
         NEVER_NS if isinf(end) else to_time_ns(end, zero_ns),
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(
+        main("recorder.tools.replay", "replay", ReplayConfig, lambda config, bus, _metrics: run_replay(config, bus))
     )

@@ -9,6 +9,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from plant_node.config import PlantConfig
+from plant_node.examples import make_example
 from plant_node.record import simulate_record
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
@@ -25,8 +26,8 @@ NARROW = {"kind": "random-steps", "low": 102.41, "high": 104.41}
 
 
 def _record(path: Path) -> None:
-    """A simulated plant whose coolant leaks."""
-    write_table(path, simulate_record(PlantConfig(seed=3, faults=(LEAK,)), 1500))
+    """The sample record `leak`."""
+    write_table(path, make_example("leak", 3)[0])
 
 
 def _renamed_record(path: Path) -> None:
@@ -85,6 +86,34 @@ def _three_tanks_record(path: Path) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def _temperature_lab(path: Path, seed: int = 1, lost: float = 0.0) -> None:
+    """Two heaters and two temperatures a second for 15 min, as an Arduino's logger writes them.
+
+    Written independently of the page's equations, in Euler steps of 0.1 s. From the tenth minute on heater 1 loses a
+    share of its power.
+    """
+    random, rows = np.random.default_rng(seed), 900
+    heaters = np.repeat(random.uniform(10.0, 70.0, (rows // 60, 2)), 60, axis=0).round(1)
+    room, kelvin, measured = 296.15, np.array([296.15, 296.15]), np.empty((rows, 2))
+    for row in range(rows):
+        measured[row] = kelvin - 273.15
+        power = heaters[row] * [0.01, 0.0075] * np.array([1.0 - lost * (row >= 600), 1.0])
+        for _ in range(10):
+            radiated = 0.9 * 5.67e-8 * kelvin**4
+            exchanged = 0.002 * (kelvin[1] - kelvin[0]) + 0.0002 * (radiated[1] - radiated[0])
+            lost_to_room = 0.01 * (kelvin - room) + 0.001 * (radiated - 0.9 * 5.67e-8 * room**4)
+            kelvin = kelvin + 0.1 * (power - lost_to_room + exchanged * np.array([1.0, -1.0])) / 2.0
+    measured += random.normal(0.0, 0.05, measured.shape)
+    table = np.column_stack([np.arange(rows), heaters, measured])
+    header = "Time (sec), Heater 1 (%), Heater 2 (%), Temperature 1 (degC), Temperature 2 (degC)"
+    np.savetxt(path, table, fmt="%.3f", delimiter=",", header=header, comments="")
+
+
+def _later_temperature_lab(path: Path) -> None:
+    """The same lab on another day: heater 1 loses a fifth of its power."""
+    _temperature_lab(path, 2, 0.2)
+
+
 def _recording(path: Path) -> None:
     """An hour of a plant, recorded with all that its monitor published."""
     record_hour(path, black_box_min=0.0).stop()
@@ -105,6 +134,8 @@ GIVEN: dict[str, Callable[[Path], None]] = {
     "narrow.csv": _narrow_record,
     "rig.csv": _tank_record,
     "tanks.txt": _three_tanks_record,
+    "tclab.csv": _temperature_lab,
+    "tclab_later.csv": _later_temperature_lab,
     "run.mcap": _recording,
     "records": _records,
 }

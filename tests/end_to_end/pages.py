@@ -14,7 +14,7 @@ Above a table, its commands are run; those within sentences and within tables wi
 | `others end` | what runs beside it is ended before |
 | `ends with N or M` | its exit code, where that is not 0 alone |
 | `not here: REASON` | it is not run |
-| `file NAME` | of settings or JSON: it is written there |
+| `file NAME` | of settings, JSON or a process in Python: it is written there |
 """
 
 import re

@@ -116,7 +116,7 @@ def record_csv(tmp_path: Path) -> Path:
         (["diagnose", "RECORD", "-o", "BAD.txt"], "is a file, the name of a folder was expected"),
         (["simulate", "RECORD", "-o", "OUT", "--model", "nowhere.json"], "nowhere.json: there is no such file"),
         (["plant", "--model", "nowhere.json"], "nowhere.json: there is no such file"),
-        (["monitor", "--model", "BAD.txt"], "model file BAD.txt: is not JSON"),
+        (["monitor", "--model", "BAD.json"], "process file BAD.json: is not JSON"),
     ],
 )
 def test_what_is_wrong_is_told_in_one_line_and_nothing_is_written(
@@ -145,6 +145,7 @@ def check_told_in_one_line(
     (tmp_path / "BAD.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,x,440\n")
     (tmp_path / "BAD.mcap").write_bytes(b"this is no recording")
     (tmp_path / "BAD.txt").write_text("?")
+    (tmp_path / "BAD.json").write_text("?")
     (tmp_path / "BAD.doc").write_text("?")
     (tmp_path / "EMPTY").mkdir()
     before = sorted(tmp_path.rglob("*"))

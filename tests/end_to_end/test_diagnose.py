@@ -120,7 +120,7 @@ def test_a_plant_of_the_extended_model_has_the_fault_in_it(
     (text,) = json.loads((folder / "report" / "extended.json").read_text())["effects"]
     fault = "feed_temperature:step:2@10min"
     for faults in ((), (fault,)):
-        of_model = simulate_record(PlantConfig(seed=7, model=model, faults=faults), 1000)
+        of_model = simulate_record(PlantConfig(seed=7, process=model, faults=faults), 1000)
         of_faults = simulate_record(PlantConfig(seed=7, faults=(text, *faults)), 1000)
         for name, values in of_model.columns.items():
             assert np.array_equal(values, of_faults.columns[name])

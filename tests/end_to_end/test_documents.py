@@ -121,6 +121,9 @@ def test_the_page_works_as_it_is_written(
             case "json":
                 assert parse_extended_model(block.text)
                 written.write_text(block.text, encoding="utf-8")
+            case "python" if "file" in block.clauses:
+                written.write_text(block.text, encoding="utf-8")
+                assert find_process(written).outputs
             case "python":
                 with contextlib.chdir(tmp_path):
                     exec(compile(block.text, f"{name_of(page)}:{block.line}", "exec"), {"__name__": "example"})

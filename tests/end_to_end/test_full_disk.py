@@ -51,21 +51,21 @@ def test_a_full_disk_is_listed_with_the_other_alarms_and_can_be_acknowledged(
     start("monitor", "--endpoint", endpoint)
     with recording(tmp_path, endpoint):
         wait_alive("cstr", "monitor", "recorder")
-        early = called("alarm", "acknowledge", DISK, "--by", "Ada", "--endpoint", endpoint)
+        # the recorder answers behind what was published before
+        at = ("--endpoint", endpoint, "--timeout", f"{PATIENCE_S:g}")
+        early = called("alarm", "acknowledge", DISK, "--by", "Ada", *at)
         assert (early.returncode, early.stderr) == (2, f"reactorwatch: alarm {DISK} has not come up\n")
         fill(bus)
-        listed = [
-            json.loads(line) for line in called("alarm", "list", "--json", "--endpoint", endpoint).stdout.splitlines()
-        ]
+        listed = [json.loads(line) for line in called("alarm", "list", "--json", *at).stdout.splitlines()]
         (disk,) = [alarm for alarm in listed if alarm["alarm"] == DISK]
         assert (disk["state"], disk["priority"]) == ("unacknowledged", "critical")
         assert "shewhart/T" in {alarm["alarm"] for alarm in listed}
-        done = called("alarm", "acknowledge", DISK, "--by", "Ada", "--comment", "I make room", "--endpoint", endpoint)
+        done = called("alarm", "acknowledge", DISK, "--by", "Ada", "--comment", "I make room", *at)
         assert (done.returncode, done.stderr) == (0, "")
         assert done.stdout.startswith(f"{DISK} (critical): acknowledged; ")
         assert done.stdout.rstrip().endswith("Ada: I make room")
-        shelved = called("alarm", "shelve", DISK, "--by", "Ada", "--minutes", "5", "--endpoint", endpoint)
+        shelved = called("alarm", "shelve", DISK, "--by", "Ada", "--minutes", "5", *at)
         assert (shelved.returncode, shelved.stdout) == (2, "")
         assert "can be acknowledged and nothing else" in shelved.stderr
-    gone = called("alarm", "acknowledge", DISK, "--by", "Ada", "--endpoint", endpoint)
+    gone = called("alarm", "acknowledge", DISK, "--by", "Ada", *at)
     assert (gone.returncode, gone.stderr.count("no recorder of plant 'cstr' answered")) == (2, 1)

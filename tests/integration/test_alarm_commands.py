@@ -127,6 +127,22 @@ def test_the_operator_s_word_is_done_published_and_survives_a_kill(control: Cont
         again = control.alarm("acknowledge", "shewhart/T", "--by", "Ben")
         assert again.returncode == 2
         assert again.stderr == "reactorwatch: alarm shewhart/T is acknowledged already\n"
+        rest = control.alarm("ack", "--all", "--by", "Cem", "--json")
+        assert rest.returncode == 0, rest.stderr
+        others = {item["alarm"]: item for item in map(json.loads, rest.stdout.splitlines())}
+        assert {"ewma/T", "mewma/all"} <= others.keys()
+        assert {(item["state"], item["by"]) for item in others.values()} == {("acknowledged", "Cem")}
+        header, *rows = control.alarm("list").stdout.splitlines()
+        assert header.split()[:3] == ["priority", "incident", "alarm"]
+        assert {row.split()[2] for row in rows} == {"shewhart/T", *others}
+        assert [row.split()[0] for row in rows] == sorted(
+            (row.split()[0] for row in rows), key=["high", "medium"].index
+        )
+        assert all("10 % of the coolant lost (" in row for row in rows)
+        none = control.alarm("ack", "--all", "--by", "Cem")
+        assert (none.returncode, none.stderr) == (2, "reactorwatch: there is no alarm to acknowledge\n")
+        both = control.alarm("acknowledge", "ewma/T", "--incident", "1", "--by", "Cem")
+        assert (both.returncode, both.stderr.count("name one of")) == (2, 1)
         assert control.alarm("shelve", "shewhart/C", "--by", "Ben", "--minutes", "30").returncode == 0
         control.wait_for(lambda item: isinstance(item, AlarmKpis) and item.shelved == 1)
     finally:

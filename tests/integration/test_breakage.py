@@ -15,6 +15,7 @@ from benchmarks.link_cuts import connect_client
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode, encoding_of
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
+from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.config import BusConfig
 
 from .live_run import PLANT, SILENCE, LiveRun, is_of_plant
@@ -115,11 +116,15 @@ def test_a_second_plant_of_the_same_name_is_refused(run: LiveRun) -> None:
     eight samples (`sequence_check`).
     """
     second, numbers = connect_client(run.config), defaultdict[str, Iterator[int]](itertools.count)
+    first_ns: list[int] = []
 
     def publish_as_second(message: Encoded) -> None:
         sample = decode(message.payload, message.encoding)
         assert isinstance(sample, Sample)
-        if is_of_plant(sample) and 10.0 < run.now_min < 30.0:
+        if not is_of_plant(sample):
+            return
+        first_ns.append(sample.time_ns)
+        if 10.0 < (sample.time_ns - first_ns[0]) / MINUTE_NS < 30.0:
             sample.sequence = next(numbers[message.key])
             sample.time_ns = sample.sequence * 6 * SECOND_NS
             sample.value *= 1.01

@@ -4,10 +4,12 @@ What is refused is refused in silence. So each test also shows the like that is 
 sent before has come through: a session that leaves has a question answered by the router first.
 """
 
+import itertools
 import json
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -171,9 +173,9 @@ def test_a_recorder_that_forges_the_monitor_s_source_suppresses_none_of_its_alar
 ) -> None:
     """Zenoh's subscriber drops them; publishers are asked for the last they have published, past it."""
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.LAST_QUERY_PERIOD_S", 0.5)
-    key, changed = "reactor/cstr/alarm/ewma/T", threading.Condition()
+    key, changed, numbers = "reactor/cstr/alarm/ewma/T", threading.Condition(), itertools.count()
     heard: list[bytes] = []
-    sources: list[zenoh.SourceInfo] = []
+    sources: dict[bytes, zenoh.SourceInfo] = {}
 
     def hear(message: Encoded) -> None:
         with changed:
@@ -183,28 +185,33 @@ def test_a_recorder_that_forges_the_monitor_s_source_suppresses_none_of_its_alar
     def note(sample: zenoh.Sample) -> None:
         with changed:
             if sample.source_info is not None:
-                sources.append(sample.source_info)
+                sources[sample.payload.to_bytes()] = sample.source_info
             changed.notify_all()
 
     def wait_for(is_so: Callable[[], bool]) -> None:
         with changed:
             assert changed.wait_for(is_so, WITHIN_S), (heard, sources)
 
+    def publish() -> bytes:
+        payload = b"%d" % next(numbers)
+        monitor.publish(Encoded(key, payload, ""))
+        return payload
+
     viewer, monitor, recorder = (site.join(f"cstr/{who}") for who in ("viewer", "monitor", "recorder"))
     viewer.subscribe("reactor/cstr/alarm/**", hear)
     spy = recorder._session.declare_subscriber("reactor/cstr/alarm/**", note)
-    monitor.publish(Encoded(key, b"0", ""))
-    wait_for(lambda: bool(sources) and bool(heard))
-    source = sources[0]
+    while not sources:  # a subscriber misses what is published before its publisher knows of it
+        wait_for(partial(heard.__contains__, publish()))
+    newest = publish()
+    wait_for(lambda: newest in heard and newest in sources)
     for ahead in range(1, 51):
-        forged = zenoh.SourceInfo(source.source_id, source.source_sn + ahead)
+        forged = zenoh.SourceInfo(sources[newest].source_id, sources[newest].source_sn + ahead)
         recorder._session.put("reactor/cstr/alarm/recording/zz", b"forged", source_info=forged)
     wait_for(lambda: heard.count(b"forged") == 50)
-    for number in range(1, 6):
-        monitor.publish(Encoded(key, b"%d" % number, ""))
-    wait_for(lambda: len(heard) == 56)
+    last = [publish() for _ in range(5)][-1]
+    wait_for(lambda: last in heard)
     spy.undeclare()
-    assert [payload for payload in heard if payload != b"forged"] == [b"%d" % number for number in range(6)]
+    assert [payload for payload in heard if payload != b"forged"] == [b"%d" % number for number in range(int(last) + 1)]
 
 
 @pytest.mark.parametrize("who", ["cstr/engineer", "cstr/monitor", "other/plant"])

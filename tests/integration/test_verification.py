@@ -76,6 +76,7 @@ def test_what_people_did_and_what_the_clock_told_is_said_again_too(hour: Path) -
     assert {
         ("ewma/T", "raised"),
         ("ewma/T", "acknowledge"),
+        ("mewma/all", "acknowledge"),
         ("shewhart/T", "shelve"),
         ("shewhart/T", "shelf time over"),
         ("silence/T", "raised"),

@@ -89,7 +89,7 @@ def record_hour(out: Path, *, restart_at: int | None = None, **recorder_settings
             if not (400 <= number < 420 and publication.key.endswith("/T")):
                 hour.publish(publication)
         if number == 340 and restart_at is None:
-            hour.ask("acknowledge", AlarmCommand(alarm="ewma/T", by="Ada", comment="seen"))
+            hour.ask("acknowledge", AlarmCommand(incident=1, by="Ada", comment="seen"))
             hour.ask("shelve", ShelveAlarm(alarm="shewhart/T", by="Ada", minutes=7.5))
     hour.record(hour.monitor.on_stop(hour.fed.now_ns))
     return hour.fed

@@ -1,4 +1,4 @@
-"""The public names: a dozen, documented, lazy, with the results that the commands print."""
+"""The public names: few, documented, lazy, with the results that the commands print."""
 
 import inspect
 import json
@@ -14,19 +14,20 @@ import pytest
 import reactorwatch as rw
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.records.record import Record
 
 LEAK_MIN = 40.0
 
 
 @pytest.fixture(scope="module")
-def leaking() -> rw.Record:
+def leaking() -> Record:
     fault = f"coolant_flow:step:-0.05@{LEAK_MIN:g}min"
     scenario = {"kind": "random-steps"}
     return simulate_record(PlantConfig(duration_min=90.0, seed=7, faults=(fault,), scenario=scenario))
 
 
-def test_a_dozen_names_are_public_each_documented_and_no_more() -> None:
-    assert len(rw.__all__) == 12
+def test_fourteen_names_are_public_each_documented_and_no_more() -> None:
+    assert len(rw.__all__) == 14
     assert set(dir(rw)) == {*rw.__all__, "__version__"}
     for name in rw.__all__:
         assert inspect.getdoc(getattr(rw, name)) or name == "processes"
@@ -43,7 +44,7 @@ def test_another_name_is_no_attribute() -> None:
         rw.pipeline  # noqa: B018 # the access is what is tested
 
 
-def test_a_diagnosis_names_the_leak_and_its_extended_model_simulates_it(leaking: rw.Record, tmp_path: Path) -> None:
+def test_a_diagnosis_names_the_leak_and_its_extended_model_simulates_it(leaking: Record, tmp_path: Path) -> None:
     found = rw.diagnose(leaking)
     assert (found.verdict, found.causes[0].cause) == ("named", "coolant_flow")
     before = np.sqrt(np.mean((rw.simulate(leaking).columns["T"] - leaking.columns["T"]) ** 2))
@@ -54,7 +55,7 @@ def test_a_diagnosis_names_the_leak_and_its_extended_model_simulates_it(leaking:
     assert "coolant" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_backtest_and_a_monitor_that_is_fed_row_by_row_raise_the_same_alarms(leaking: rw.Record) -> None:
+def test_a_backtest_and_a_monitor_that_is_fed_row_by_row_raise_the_same_alarms(leaking: Record) -> None:
     settings: dict[str, Any] = {"training_min": 20.0, "isolation": False}
     result = rw.backtest(leaking, **settings)
     assert result.alarms
@@ -70,12 +71,12 @@ def test_a_backtest_and_a_monitor_that_is_fed_row_by_row_raise_the_same_alarms(l
     assert raised == [(item.alarm, item.raised_min) for item in result.alarms]
 
 
-def test_the_model_that_a_diagnosis_extended_judges_without_alarm(leaking: rw.Record) -> None:
+def test_the_model_that_a_diagnosis_extended_judges_without_alarm(leaking: Record) -> None:
     extended = rw.diagnose(leaking).extended
     assert not rw.backtest(leaking, extended, training_min=20.0).alarms
 
 
-def test_identification_gives_its_fit_under_both_names(leaking: rw.Record) -> None:
+def test_identification_gives_its_fit_under_both_names(leaking: Record) -> None:
     found = rw.identify(leaking, output="T", model="arx", order=2)
     assert found.fit is found.fit_percent
     assert found.fit.one_step > 80.0
@@ -96,7 +97,7 @@ def test_identification_gives_its_fit_under_both_names(leaking: rw.Record) -> No
         (lambda _: rw.read_record("data.doc"), r"must be a \.csv or \.mcap file"),
     ],
 )
-def test_a_mistake_is_one_line_that_names_the_cure(call: object, message: str, leaking: rw.Record) -> None:
+def test_a_mistake_is_one_line_that_names_the_cure(call: object, message: str, leaking: Record) -> None:
     assert callable(call)
     with pytest.raises(rw.InputError, match=message) as caught:
         call(leaking)

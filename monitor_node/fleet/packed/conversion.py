@@ -105,7 +105,7 @@ class Conversion:
     def __init__(self, config: MonitorConfig, model: ProcessModel, step: RowStep) -> None:
         self.config, self._model, self.step = config, model, step
         self._alarms = [keys.chart_name(*pair) for pair in alarm_names(config)]
-        self._signals = (config.input, *config.outputs)
+        self._signals = config.signals
         self.record = record_type(len(config.outputs), len(model.states))
         self._looks = has_causes(config, model)
         self.remembered = REMEMBERED * config.reorder_rows
@@ -128,6 +128,8 @@ class Conversion:
         """
         step = RowStep.of(config, model)
         if model is None or step is None:
+            return None
+        if len(config.inputs) != 1 or config.carried:  # the ring keeps the levels of one input, and no others
             return None
         form = Conversion(config, model, step)
         return form if form.keeps >= form.remembered else None
@@ -247,17 +249,17 @@ class Conversion:
             looked = SuspicionState(known, rest.cause[0], None, None, rest.cause[1], rest.cause[2], None)
         outputs = range(len(self.config.outputs))
         whiteners = [Prewhitener(None, numbers["whiteners"][i : i + 1]).state for i in outputs]
-        last_ns, last_input = int(numbers["last_ns"]), float(numbers["input"])
+        last_ns, inputs = int(numbers["last_ns"]), numbers["inputs"].tolist()
         noise, states = p["noise"].tolist(), len(self._model.states)
         x, P = tuple(belief[:states].tolist()), tuple(belief[states:].tolist())
         reference = ProcessReferenceState(
             NoiseLevels(tuple(noise[: len(outputs)]), tuple(noise[len(outputs) :])),
-            FilterState(float(numbers["time_min"]), (last_input,), x, P),
-            last_input,
-            False,
+            FilterState(float(numbers["time_min"]), tuple(inputs), x, P),
+            inputs,
+            [False],
             p["typical_sd"].tolist(),
             0,
-            float(p["reach"]),
+            p["reach"].tolist(),
         )
         watched = TrainedState(
             reference,

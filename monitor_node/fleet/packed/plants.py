@@ -62,7 +62,7 @@ class PackedPlants:
     def __init__(self, form: Conversion, config: MonitorConfig, model: ProcessModel) -> None:
         self._form, self._config, self._model = form, config, model
         self._settings = learning_settings(config, model, points=False)
-        self._signals = (config.input, *config.outputs)
+        self._signals = config.signals
         self._slots = PlantArray(form, self._signals)
         self._scratch = np.zeros(1, form.record)
         self._shared: dict[Any, Any] = {}  # parts of `Rest`, which are equal for many plants, are kept once

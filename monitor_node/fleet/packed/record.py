@@ -62,7 +62,7 @@ def record_type(outputs: int, states: int) -> np.dtype[Any]:
         # constants of the plant
         ("arl0", f, ()),
         ("width", f, (outputs,)),
-        ("reach", f, ()),  # see `references.input_reach`
+        ("reach", f, (1,)),  # see `references.input_reach`
         ("noise", f, (noise,)),  # standard deviations, of sensors and process
         ("typical_sd", f, (outputs,)),
         # the newest rows, in a ring

@@ -111,12 +111,12 @@ class Prediction:
         for profile, parameters in zip(self._hypothesis.profiles, self._fit.parameters, strict=True):
             later, then = extrapolate(profile, parameters, time_min, self._pattern_min)
             profiles.append(later)
-            values.append(then)
+            values.append(np.append(then, parameters[profile.n_shape :]))
         return Hypothesis(self._hypothesis.filter, profiles), values
 
     def _run(self, time_min: Array, inputs: Array, start: Array) -> Trajectory | None:
         hypothesis, parameters = self._extrapolate(time_min)
-        signals = [profile.signal(values) for profile, values in zip(hypothesis.profiles, parameters, strict=True)]
+        signals = hypothesis.signals_at(parameters)
         try:
             return self._simulator.run(time_min, hypothesis.filter.full_model.inputs(time_min, inputs, signals), start)
         except SimulationError:

@@ -170,8 +170,13 @@ class FaultFilter:
         late = self.delay_index
         return index != late and self._augmented.shifts_time[index - (late is not None and late < index)]
 
+    def constant_index(self, index: int) -> int:
+        """Index of an effect's first constant among the inputs of the error equations."""
+        late = self.delay_index
+        return self._augmented.constant_index(index - (late is not None and late < index))
+
     def inputs(self, run: Run, signals: Sequence[Signal]) -> Array:
-        """Inputs of the filter, magnitudes included, shape (rows, n_u + 2 effects)."""
+        """Inputs of the filter, magnitudes and constants included, shape (rows, n_u + those)."""
         prompt = [item for index, item in enumerate(signals) if index != self.delay_index]
         return self._augmented.inputs(run.time_min, run.certain_inputs, prompt)
 
@@ -308,7 +313,8 @@ class FaultFilter:
 
     def _shift_measurements(self, run: Run, inputs: Array, signals: Sequence[Signal], late: int) -> ShiftedRun:
         held: NDArray[np.bool_] = np.ones(inputs.shape[1], dtype=bool)
-        held[run.inputs.shape[1] + 1 :: 2] = False  # sample inputs
+        first = run.inputs.shape[1]
+        held[first + 1 : first + 2 * len(self._augmented.sample_inputs) : 2] = False  # sample inputs
         return shift_measurements(run, inputs, held, self._output(late), signals[late].sample_value)
 
     def _output(self, late: int) -> int:

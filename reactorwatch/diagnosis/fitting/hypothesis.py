@@ -64,7 +64,10 @@ class Hypothesis:
     """
 
     def __init__(self, ekf: FaultFilter, profiles: Sequence[FittedProfile]) -> None:
-        self.filter, self.profiles = ekf, tuple(profiles)
+        self.filter = ekf
+        self.profiles = tuple(
+            profile.with_constants(effect.constants) for profile, effect in zip(profiles, ekf.effects, strict=True)
+        )
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -73,8 +76,17 @@ class Hypothesis:
 
     @property
     def n_parameters(self) -> int:
-        """Number of fitted parameters."""
+        """Number of fitted parameters, constants of the effects included."""
         return sum(profile.n_parameters for profile in self.profiles)
+
+    @property
+    def constant_indices(self) -> list[int]:
+        """Indices of the effects' own constants among all parameters."""
+        result, begin = list[int](), 0
+        for profile in self.profiles:
+            result += range(begin + profile.n_shape, begin + profile.n_parameters)
+            begin += profile.n_parameters
+        return result
 
     def evaluate(self, run: Run, parameters: Sequence[Array], like: Fit | None = None) -> Fit:
         """Clip the parameters to their bounds and run the filter.
@@ -89,19 +101,29 @@ class Hypothesis:
     def evaluate_all(self, run: Run, several: Sequence[Sequence[Array]], like: Fit | None = None) -> list[Fit]:
         """Evaluate several sets of parameters, which is faster than one by one."""
         possible = [self._clip(parameters) for parameters in several]
-        signals = [self._signals(parameters) for parameters in possible]
+        signals = [self.signals_at(parameters) for parameters in possible]
         shared = None
         if like is not None:
-            before = self._signals(like.parameters)
+            before = self.signals_at(self._complete(like.parameters))
             shared = [SharedPrefix(like.innovations, _count_equal_rows(item, before)) for item in signals]
         results = self.filter.evaluate_all(run, signals, shared)
-        return [Fit(parameters, *item) for parameters, item in zip(possible, results, strict=True)]
+        return [
+            Fit(
+                parameters, item.loss + 0.5 * float(np.sum(self._deviations(parameters) ** 2)), item.w, item.innovations
+            )
+            for parameters, item in zip(possible, results, strict=True)
+        ]
 
     def _clip(self, parameters: Sequence[Array]) -> tuple[Array, ...]:
         return tuple(
             profile.clip(values, effect.lower, effect.upper)
-            for profile, values, effect in zip(self.profiles, parameters, self.filter.effects, strict=True)
+            for profile, values, effect in zip(
+                self.profiles, self._complete(parameters), self.filter.effects, strict=True
+            )
         )
+
+    def _complete(self, parameters: Sequence[Array]) -> list[Array]:
+        return [profile.complete(values) for profile, values in zip(self.profiles, parameters, strict=True)]
 
     def fit(self, run: Run, start: Sequence[Array], steps: int = MOST_STEPS, like: Fit | None = None) -> Fit:
         """Fit the parameters by least squares; magnitudes of discontinuous effects stay.
@@ -124,6 +146,10 @@ class Hypothesis:
             weights = HUBER / np.maximum(np.abs(w), HUBER)
             weighted = g * np.sqrt(weights)[:, None]
             information, gradient = weighted.T @ weighted + self._prior_information(), g.T @ (weights * w)
+            for index, deviation, sd in zip(
+                self.constant_indices, self._deviations(best.parameters), self._constant_sds, strict=True
+            ):
+                gradient[index] -= deviation / sd
             scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
             information, gradient = information / np.outer(scale, scale), gradient / scale
             before = best
@@ -153,7 +179,7 @@ class Hypothesis:
         """
         dynamics = None
         if self.filter.delay_index is None:
-            dynamics = self.filter.error_dynamics(run, self._signals(fit.parameters), fit.innovations)
+            dynamics = self.filter.error_dynamics(run, self.signals_at(fit.parameters), fit.innovations)
         differences = [np.maximum(item, first_difference) for item in self._difference_steps()]
         for _ in range(_WIDENINGS):
             result = self._covariance(self._jacobian(run, fit, differences, dynamics))
@@ -174,7 +200,7 @@ class Hypothesis:
             return offsets(self.filter.model, np.sqrt(variances))
         covariance = self.covariance(run, fit)
         changes = np.maximum(np.sqrt(np.maximum(np.diag(covariance), 0.0)), 1e-300)
-        moved = [self._signals(self._shift(fit.parameters, change)) for change in np.diag(changes)]
+        moved = [self.signals_at(self._shift(fit.parameters, change)) for change in np.diag(changes)]
         there = np.array([item.innovations.x[row] for item in self.filter.evaluate_all(run, moved)])
         by = np.nan_to_num((there - fit.innovations.x[row]) / changes[:, None])
         return offsets(self.filter.model, np.sqrt(variances + np.einsum("ni,nm,mi->i", by, covariance, by)))
@@ -188,15 +214,47 @@ class Hypothesis:
         return np.asarray(inner / np.outer(scale, scale))
 
     def _prior_information(self) -> Array:
-        """Prior information: the width of each parameter's range. Some records carry no information about an onset."""
-        widths = [self._ranges(index) for index in range(len(self.profiles))]
-        return np.diag(np.concatenate(widths) ** -2.0)
+        """Prior information: the width of each parameter's range; of a constant, the standard deviation of its prior.
+
+        Some records carry no information about an onset.
+        """
+        widths = np.concatenate([self._ranges(index) for index in range(len(self.profiles))])
+        return np.diag(widths**-2.0)
+
+    @property
+    def _constant_sds(self) -> list[float]:
+        return [item.sd for profile in self.profiles for item in profile.constants]
+
+    def _deviations(self, parameters: Sequence[Array]) -> Array:
+        """Deviations of the effects' own constants from the means of their priors, in standard deviations."""
+        pairs = zip(self.profiles, parameters, strict=True)
+        return np.array(
+            [
+                (value - item.value) / item.sd
+                for profile, values in pairs
+                for item, value in zip(profile.constants, values[profile.n_shape :].tolist(), strict=True)
+            ]
+        )
+
+    def constants_evidence(self, run: Run, fit: Fit) -> float:
+        """Cost in BIC of the effects' own constants: twice the logarithm of the prior's volume over the posterior's.
+
+        It is the Occam factor of Laplace's approximation (Kass & Raftery 1995, J. American Statistical Association 90),
+        0 for constants on which the record has no information.
+        """
+        indices = self.constant_indices
+        if not indices:
+            return 0.0
+        posterior = self._covariance(self._jacobian(run, fit, self._difference_steps()))[np.ix_(indices, indices)]
+        scaled = posterior / np.outer(self._constant_sds, self._constant_sds)
+        return max(-float(np.linalg.slogdet(scaled)[1]), 0.0)
 
     def _ranges(self, index: int) -> Array:
         """Widths of the ranges of an effect's parameters."""
         effect, profile = self.filter.effects[index], self.profiles[index]
         of_numbers = [number.upper - number.lower for number in profile.nonlinear_parameters]
-        return np.array([effect.upper - effect.lower] * profile.n_linear + of_numbers)
+        constants = [item.sd for item in profile.constants]
+        return np.array([effect.upper - effect.lower] * profile.n_linear + of_numbers + constants)
 
     def _jacobian(
         self,
@@ -213,7 +271,7 @@ class Hypothesis:
         """
         late = self.filter.delay_index
         if dynamics is None and (late is None or (rough and len(self.profiles) > 1)):
-            dynamics = self.filter.error_dynamics(run, self._signals(fit.parameters), fit.innovations)
+            dynamics = self.filter.error_dynamics(run, self.signals_at(fit.parameters), fit.innovations)
         columns = []
         for index, (profile, values, moved) in enumerate(zip(self.profiles, fit.parameters, differences, strict=True)):
             if index == late or dynamics is None:
@@ -221,11 +279,17 @@ class Hypothesis:
                 continue
             apart = bool(profile.nonlinear_parameters) and self.filter.shifts_time(index)
             shape = values[profile.n_linear :]
-            interval_mean, sample_value = profile.basis_signals(shape) if apart else profile.derivatives(values, moved)
+            near = profile.basis_signals(shape) if apart else profile.derivatives(values, moved)
+            interval_mean, sample_value = near.interval_mean, near.sample_value
             g = signatures.forward_signatures(dynamics, self.input_index(index), interval_mean[1:-1], sample_value[2:])
             columns.append(g.reshape(-1, interval_mean.shape[1]))
             if apart:
                 columns.append(self._finite_differences(run, fit, index, moved, profile.n_linear))
+                continue
+            first, ones = self.filter.constant_index(index), np.ones((run.time_min.size - 2, 1))
+            for number in range(len(profile.constants)):
+                g = signatures.forward_signatures(dynamics, first + number, ones, ones)
+                columns.append(g.reshape(-1, 1))
         return np.concatenate(columns, axis=1)
 
     def _finite_differences(self, run: Run, fit: Fit, index: int, moved: Array, first: int = 0) -> Array:
@@ -239,8 +303,8 @@ class Hypothesis:
         for number in range(first, profile.n_parameters):
             parameters = [item.copy() for item in fit.parameters]
             parameters[index][number] += steps[number]
-            signals.append(self._signals(parameters))
-        unchanged = self._signals(fit.parameters)
+            signals.append(self.signals_at(parameters))
+        unchanged = self.signals_at(fit.parameters)
         shared = [SharedPrefix(fit.innovations, _count_equal_rows(item, unchanged)) for item in signals]
         before, results = huber_clip(fit.w[2:]), self.filter.evaluate_all(run, signals, shared)
         moves = zip(steps[first:], results, strict=True)
@@ -261,8 +325,8 @@ class Hypothesis:
         Returns:
             Shape (values from the third row on, n_linear).
         """
-        dynamics = self.filter.error_dynamics(run, self._signals(fit.parameters), fit.innovations)
-        interval_mean, sample_value = profile.basis_signals(np.empty(0))
+        dynamics = self.filter.error_dynamics(run, self.signals_at(fit.parameters), fit.innovations)
+        interval_mean, sample_value = profile.basis_signals(np.empty(0))[:2]
         g = signatures.forward_signatures(dynamics, self.input_index(index), interval_mean[1:-1], sample_value[2:])
         return g.reshape(-1, profile.n_linear)
 
@@ -279,8 +343,8 @@ class Hypothesis:
 
     def innovations_without(self, run: Run, fit: Fit, index: int) -> Array:
         """Normalised innovations of a filter without the deviation at this index, shape (rows, n_y)."""
-        signals = self._signals(fit.parameters)
-        signals[index] = Signal(*(np.zeros_like(item) for item in signals[index]))
+        signals = self.signals_at(fit.parameters)
+        signals[index] = Signal(np.zeros(run.time_min.size), np.zeros(run.time_min.size))
         return self.filter.evaluate(run, signals).w
 
     def _difference_steps(self) -> list[Array]:
@@ -297,9 +361,10 @@ class Hypothesis:
 
     def signals(self, fit: Fit) -> list[Signal]:
         """Deviations of the effects at a fit."""
-        return self._signals(fit.parameters)
+        return self.signals_at(fit.parameters)
 
-    def _signals(self, parameters: Sequence[Array]) -> list[Signal]:
+    def signals_at(self, parameters: Sequence[Array]) -> list[Signal]:
+        """Deviations of the effects at given parameters."""
         return [profile.signal(values) for profile, values in zip(self.profiles, parameters, strict=True)]
 
     def _shift(self, parameters: Sequence[Array], change: Array) -> list[Array]:
@@ -315,5 +380,7 @@ def _count_equal_rows(one: Sequence[Signal], other: Sequence[Signal]) -> int:
     rows = len(one[0].sample_value)
     differs = np.zeros(rows, dtype=np.bool_)
     for mine, theirs in zip(one, other, strict=True):
+        if mine.constants != theirs.constants:
+            return 0
         differs |= (mine.interval_mean != theirs.interval_mean) | (mine.sample_value != theirs.sample_value)
     return int(np.argmax(differs)) if differs.any() else rows

@@ -42,7 +42,7 @@ def select_knots(
     """
     curve = hypothesis.profiles[index]
     assert isinstance(curve, PiecewiseLinear)
-    values = np.interp(grid.knots_min, curve.knots_min, fit.parameters[index])
+    values = np.interp(grid.knots_min, curve.knots_min, fit.parameters[index][: curve.n_linear])
     g = hypothesis.signatures(run, fit, index, grid)
     information = g.T @ g
     gradient = g.T @ huber_clip(fit.w[2:]).ravel() + information @ values
@@ -54,7 +54,7 @@ def select_knots(
         parameters = _solve(on_grid.T @ information @ on_grid, a)
         promised.append((count * log(run.values) - float(a @ parameters), parameters))
     _, parameters = min(promised, key=lambda item: item[0])
-    return PiecewiseLinear(run.time_min, parameters.size), parameters
+    return PiecewiseLinear(run.time_min, parameters.size), np.append(parameters, fit.parameters[index][curve.n_shape :])
 
 
 def _solve(information: Array, a: Array) -> Array:

@@ -10,14 +10,19 @@ model or into the plant.
 """
 
 from abc import ABC, abstractmethod
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from math import atan2, hypot, pi
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from reactorwatch.arrays import Array
+from reactorwatch.process.effect import EffectConstant
+
+CONSTANT_SHARE = 0.01
+"""Smallest step for derivatives by a constant of an effect, in standard deviations of its prior."""
 
 
 class Signal(NamedTuple):
@@ -26,10 +31,12 @@ class Signal(NamedTuple):
     Attributes:
         interval_mean: mean from each row to the next; in the last row, the value there.
         sample_value: value at each row.
+        constants: values of the effect's own constants; empty: the nominal ones.
     """
 
     interval_mean: Array
     sample_value: Array
+    constants: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -60,10 +67,12 @@ class FittedProfile(ABC):
     Attributes:
         name: name of the profile.
         n_linear: number of basis functions.
+        constants: constants of the effect's own, which are fitted after the parameters of the profile.
     """
 
     name: ClassVar[str]
     n_linear: int = 1
+    constants: tuple[EffectConstant, ...] = ()
 
     def __init__(self, time_min: Array) -> None:
         self.time_min = time_min
@@ -77,9 +86,28 @@ class FittedProfile(ABC):
         return ()
 
     @property
-    def n_parameters(self) -> int:
-        """Number of fitted parameters."""
+    def n_shape(self) -> int:
+        """Number of parameters of the profile itself."""
         return self.n_linear + len(self.nonlinear_parameters)
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of fitted parameters, the effect's constants included."""
+        return self.n_shape + len(self.constants)
+
+    def with_constants(self, constants: tuple[EffectConstant, ...]) -> Self:
+        """Copy for an effect with these constants."""
+        if constants == self.constants:
+            return self
+        other = copy(self)
+        other.constants = constants
+        return other
+
+    def complete(self, parameters: Array) -> Array:
+        """Parameters, with the nominal constants of the effect where they have none."""
+        if parameters.size == self.n_parameters:
+            return parameters
+        return np.append(parameters[: self.n_shape], [item.value for item in self.constants])
 
     @abstractmethod
     def basis_functions(self, shape: Array) -> tuple[Array, Array]:
@@ -87,7 +115,7 @@ class FittedProfile(ABC):
 
     def profile_values(self, parameters: Array) -> dict[str, float]:
         """Parameter values of the profile by name, `size` first."""
-        shape = zip(self.nonlinear_parameters, parameters[self.n_linear :].tolist(), strict=True)
+        shape = zip(self.nonlinear_parameters, parameters[self.n_linear : self.n_shape].tolist(), strict=True)
         return {"size": float(parameters[0])} | {item.name: value for item, value in shape}
 
     def unit(self, name: str, unit_of_size: str) -> str:
@@ -112,35 +140,40 @@ class FittedProfile(ABC):
 
     def signal(self, parameters: Array) -> Signal:
         """Deviation at these parameters: linear ones first, then nonlinear ones."""
-        interval_mean, sample_value = self.basis_signals(parameters[self.n_linear :])
-        by = parameters[: self.n_linear]
-        return Signal(interval_mean @ by, sample_value @ by)
+        basis = self.basis_signals(parameters[self.n_linear :])
+        by, constants = parameters[: self.n_linear], tuple(parameters[self.n_shape :].tolist())
+        return Signal(basis.interval_mean @ by, basis.sample_value @ by, constants)
 
     def derivatives(self, parameters: Array, differences: Array) -> Signal:
-        """Derivatives of the deviation by the parameters, shape (rows, n_parameters).
+        """Derivatives of the deviation by the parameters of the profile, shape (rows, n_shape).
 
         Args:
             parameters: linear, then nonlinear parameters.
-            differences: steps for the nonlinear parameters, at least `difference_steps`.
+            differences: steps for the nonlinear parameters and the constants, at least `difference_steps`.
         """
         basis = self.basis_signals(parameters[self.n_linear :])
         if not self.nonlinear_parameters:
             return basis
         columns = [basis]
         for index, (number, difference) in enumerate(
-            zip(self.nonlinear_parameters, differences, strict=True), start=self.n_linear
+            zip(self.nonlinear_parameters, differences, strict=False), start=self.n_linear
         ):
             low, high = parameters.copy(), parameters.copy()
             low[index] = max(parameters[index] - difference, min(number.lower, parameters[index] - number.difference))
             high[index] = min(parameters[index] + difference, max(number.upper, parameters[index] + number.difference))
-            near = zip(self.signal(low), self.signal(high), strict=True)
-            columns.append(Signal(*((after - before)[:, None] / (high[index] - low[index]) for before, after in near)))
-        return Signal(*(np.concatenate(items, axis=1) for items in zip(*columns, strict=True)))
+            before, after, step = self.signal(low), self.signal(high), high[index] - low[index]
+            interval_mean = (after.interval_mean - before.interval_mean)[:, None] / step
+            columns.append(Signal(interval_mean, (after.sample_value - before.sample_value)[:, None] / step))
+        return Signal(
+            np.concatenate([item.interval_mean for item in columns], axis=1),
+            np.concatenate([item.sample_value for item in columns], axis=1),
+        )
 
     @property
     def difference_steps(self) -> Array:
-        """Smallest steps for derivatives by the nonlinear parameters, shape (nonlinear parameters,)."""
-        return np.array([number.difference for number in self.nonlinear_parameters])
+        """Smallest steps for derivatives by the nonlinear parameters, then by the constants."""
+        shape = [number.difference for number in self.nonlinear_parameters]
+        return np.array([*shape, *(CONSTANT_SHARE * item.sd for item in self.constants)])
 
     def clip(self, parameters: Array, lower: float, upper: float) -> Array:
         """Clip the parameters to their bounds."""
@@ -148,6 +181,8 @@ class FittedProfile(ABC):
         result[: self.n_linear] = self._clip_linear(parameters[: self.n_linear], lower, upper)
         for index, number in enumerate(self.nonlinear_parameters, start=self.n_linear):
             result[index] = min(max(result[index], number.lower), number.upper)
+        for index, item in enumerate(self.constants, start=self.n_shape):
+            result[index] = min(max(result[index], item.lower), item.upper)
         return result
 
     def _clip_linear(self, by: Array, lower: float, upper: float) -> Array:

@@ -1,10 +1,11 @@
 """A diagnosis as one self-contained page without scripts, readable in light and dark mode."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import PurePath
 from shlex import quote
+from types import MappingProxyType
 
 import jinja2
 
@@ -38,6 +39,9 @@ _PAGES = jinja2.Environment(
 )
 
 
+NO_ORIGIN: Mapping[str, str] = MappingProxyType({})
+
+
 @dataclass(frozen=True)
 class _CauseRow:
     name: str
@@ -68,6 +72,7 @@ def as_page(
     experiment_file: str = "experiment.csv",
     *,
     on_the_bus: bool = True,
+    origin: Mapping[str, str] = NO_ORIGIN,
 ) -> str:
     """Page as HTML.
 
@@ -79,6 +84,7 @@ def as_page(
         model_file: name of the extended model's file.
         experiment_file: name of the proposed input's file.
         on_the_bus: true if there are nodes that could use the model.
+        origin: when and from what the page was made, by name; empty: not stated.
 
     Raises:
         ValueError: the diagnosis has no curves.
@@ -116,6 +122,7 @@ def as_page(
         experiment_command=_experiment_command(diagnosis.experiment, experiment_file),
         model_file=model_file,
         commands=_commands(file, model_file, on_the_bus=on_the_bus),
+        origin=origin,
         error=lambda value: f"{value:.3g}" if isfinite(value) else "ran away",
     )
 

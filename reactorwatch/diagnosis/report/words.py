@@ -20,22 +20,11 @@ from reactorwatch.diagnosis.result import (
     HeldOut,
     Law,
 )
+from reactorwatch.process import LOCATION_PHRASES
 from reactorwatch.process.effect import Effect
 
 MOSTLY_NOISE, WORSE = 0.9, 1.2
 """Noise share above which no range is named; error of a range, relative to all rows, above which it is named."""
-
-PLACES = {
-    "mass_balance": "in the mass balance",
-    "energy_balance": "in the energy balance",
-    "reaction": "in the reaction",
-    "feed": "in the feed",
-    "coolant": "on the side of the coolant",
-    "temperature_sensor": "in the measurement of the temperature",
-    "concentration_sensor": "in the measurement of the concentration",
-    "timing": "in the times of the record",
-}
-"""Phrases of locations whose name is not enough."""
 
 
 def describe_verdict(diagnosis: Diagnosis) -> str:
@@ -96,7 +85,7 @@ def describe_place(location: str) -> str:
     >>> describe_place("upper_tank")
     'in the upper tank'
     """
-    return PLACES.get(location, f"in the {location.replace('_', ' ')}")
+    return LOCATION_PHRASES.get(location, f"in the {location.replace('_', ' ')}")
 
 
 def describe_timing(cause: Cause, curves: Curves | None = None) -> str:
@@ -117,14 +106,16 @@ def describe_timing(cause: Cause, curves: Curves | None = None) -> str:
 
 
 def describe_size(cause: Cause, effects: Sequence[Effect]) -> str:
-    """Size of a cause in its unit and meaning with its 95 % interval, and the part of the profile it belongs to.
+    """Size of a cause with its 95 % interval, the part of the profile it belongs to, and constants of the effect.
 
     Args:
         cause: cause of an explanation.
         effects: the catalogue, which has its meaning.
     """
     of_what = {"ramp": " at the end", "decay": " in the end", "sine": " to either side", "free": " at its largest"}
-    return _describe_size(cause, effects) + of_what.get(cause.profile, "")
+    own = (item for effect in effects if effect.name == cause.cause for item in effect.constants)
+    constants = [f", {item.name} {format_interval(cause.parameters[item.name])}" for item in own]
+    return _describe_size(cause, effects) + of_what.get(cause.profile, "") + "".join(constants)
 
 
 def describe_explanation(causes: Sequence[Cause], effects: Sequence[Effect]) -> str:

@@ -106,7 +106,7 @@ class PairScreen:
 
     def _static_blocks(self, dynamics: ErrorDynamics) -> Iterator[Block]:
         """Every static effect as a constant and as a curve."""
-        interval_mean, sample_value = self._free.basis_signals(np.empty(0))
+        interval_mean, sample_value = self._free.basis_signals(np.empty(0))[:2]
         for cause, effect in enumerate(self._screen.static_effects):
             g = signatures.forward_signatures(dynamics, cause, interval_mean[1:-1], sample_value[2:]).reshape(-1, KNOTS)
             yield from self._blocks_of(effect, None, g)
@@ -146,7 +146,7 @@ class PairScreen:
                 period = candidate.parameters[2:]
                 key = (candidate.effect.name, round(log(float(period[0])), 2))
                 if candidate.score(self._run.values) > least and key not in result:
-                    interval_mean, sample_value = self._sine.basis_signals(period)
+                    interval_mean, sample_value = self._sine.basis_signals(period)[:2]
                     cause = self._screen.static_effects.index(candidate.effect)
                     g = signatures.forward_signatures(about, cause, interval_mean[1:-1], sample_value[2:])
                     result[key] = Block(candidate.effect, self._sine, period, None, g.reshape(-1, 2))

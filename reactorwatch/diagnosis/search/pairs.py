@@ -346,7 +346,7 @@ def _replace_part(fitted: FittedHypothesis, index: int, candidate: Candidate, kn
 def _refine_knots(part: Part, knots: int) -> Part:
     """Interpolate the curve on more knots."""
     finer = PiecewiseLinear(part.profile.time_min, knots)
-    values = part.profile.basis_functions(np.empty(0))[0] @ part.parameters
+    values = part.profile.basis_functions(np.empty(0))[0] @ part.parameters[: part.profile.n_linear]
     return Part(part.effect, finer, np.interp(finer.knots_min, part.profile.time_min, values))
 
 

@@ -31,6 +31,7 @@ from reactorwatch.diagnosis.fitting.profiles import (
     Step,
 )
 from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.constant_variants import ConstantVariant, variants_of
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
@@ -92,6 +93,7 @@ class Screen:
         names = model.state_names
         self.static_effects = tuple(effect for effect in effects if effect.extend(model).state_names == names)
         self.dynamic_effects = tuple(effect for effect in effects if effect not in self.static_effects)
+        self._columns = (*self.static_effects, *variants_of(self.static_effects))
         self._period_min = float(np.median(np.diff(run.time_min)))
         self._beta = np.diff(run.time_min[1:])
         t = run.time_min
@@ -107,9 +109,11 @@ class Screen:
             hypothesis: hypothesis about whose run everything is linearised.
             fit: fit of the hypothesis.
             replaced: indices of its effects to find alternatives for; the others stay.
-            of: causes to screen among `static_effects`; None: all.
+            of: causes to screen among `static_effects`, at all start values of their constants; None: all.
         """
-        effects = self.static_effects if of is None else of
+        of = self.static_effects if of is None else of
+        variants = (item for item in self._columns if isinstance(item, ConstantVariant) and item.effect in of)
+        effects = (*of, *variants)
         with np.errstate(over="ignore", invalid="ignore"):  # the filter may have lost an unstable plant
             dynamics = self.dynamics_of_all(hypothesis, fit, replaced, effects)
             if not all_finite(dynamics):
@@ -119,9 +123,29 @@ class Screen:
             for index in replaced:
                 profile, parameters = hypothesis.profiles[index], fit.parameters[index]
                 if profile.name != self._free.name:
-                    result += self._profile_candidates(dynamics, effects, profile, parameters[profile.n_linear :])
+                    shape = parameters[profile.n_linear : profile.n_shape]
+                    result += self._profile_candidates(dynamics, effects, profile.with_constants(()), shape)
         result = [item for item in result if np.isfinite(item.gain) and np.all(np.isfinite(item.parameters))]
+        result = [_with_constants(item) for item in result] + self._free_constants(dynamics, effects, result)
         return sorted(result, key=lambda item: -item.score(self._run.values))
+
+    def _free_constants(
+        self, dynamics: ErrorDynamics, effects: Sequence[Effect], candidates: Sequence[Candidate]
+    ) -> list[Candidate]:
+        """Constant deviation of each effect that has constants, with what they can gain between their start values.
+
+        To first order a signature at constants between the start values is a sum of those at the start values.
+        """
+        ones, w, result = np.ones((self._run.time_min.size - 2, 1)), dynamics.w.ravel(), []
+        for base in dict.fromkeys(item.effect for item in effects if isinstance(item, ConstantVariant)):
+            own = [index for index, item in enumerate(effects) if _base(item) is base]
+            g = np.column_stack([signatures.forward_signatures(dynamics, index, ones, ones).ravel() for index in own])
+            of_base = [item for item in candidates if _base(item.effect) is base and item.profile is self._constant]
+            if of_base and np.all(np.isfinite(g)):
+                by = np.linalg.lstsq(g, w, rcond=1e-9)[0]
+                best = _with_constants(max(of_base, key=lambda item: item.gain))
+                result.append(replace(best, gain=max(float(by @ (2.0 * g.T @ w - g.T @ (g @ by))), best.gain)))
+        return result
 
     def dynamics_of_all(
         self, hypothesis: Hypothesis, fit: Fit, replaced: Sequence[int], of: Sequence[Effect] | None = None
@@ -148,7 +172,7 @@ class Screen:
             return huber_clip(hypothesis.innovations_without(self._run, fit, index)[2:]) - huber_clip(fit.w[2:])
         signals = hypothesis.signals(fit)
         dynamics = ekf.error_dynamics(self._run, signals, fit.innovations)
-        interval_mean, sample_value = signals[index]
+        interval_mean, sample_value = signals[index][:2]
         return signatures.forward_signatures(
             dynamics, hypothesis.input_index(index), interval_mean[1:-1, None], sample_value[2:, None]
         )[:, :, 0]
@@ -164,7 +188,7 @@ class Screen:
         errors = errors.with_noise(ekf.noise_levels)
         errors.changes = ekf.noise.parameter_changes
         dynamics = error_dynamics_between(errors, self._run, inputs, fit.innovations, ekf.used_values(self._run))
-        columns = [self.static_effects.index(effect) for effect in effects]
+        columns = [self._columns.index(effect) for effect in effects]
         return replace(dynamics, G=dynamics.G[:, :, columns], D=dynamics.D[:, :, columns])
 
     def _full_equations(self, ekf: FaultFilter, signals: Sequence[Signal]) -> tuple[ErrorLinearization, Array]:
@@ -172,10 +196,10 @@ class Screen:
 
         It is compiled once for all hypotheses.
         """
-        of_all = augment_model(self._model, self.static_effects)
+        of_all = augment_model(self._model, self._columns)
         nothing = np.zeros(self._run.time_min.size)
         by_effect = dict(zip(ekf.effects, signals, strict=True))
-        sizes = [by_effect.get(effect, Signal(nothing, nothing)) for effect in self.static_effects]
+        sizes = [by_effect.get(effect, Signal(nothing, nothing)) for effect in self._columns]
         return of_all.errors, of_all.inputs(self._run.time_min, self._run.certain_inputs, sizes)
 
     def _equations_beside(self, ekf: FaultFilter) -> ErrorLinearization:
@@ -183,7 +207,7 @@ class Screen:
         if ekf not in self._errors:
             extended = ekf.model
             interval_inputs, sample_inputs = [], []
-            for effect in self.static_effects:
+            for effect in self._columns:
                 own = ekf.size_symbols(effect)
                 if own is None:
                     extended = effect.extend(extended)
@@ -237,7 +261,10 @@ class Screen:
         candidates = []
         periods = np.geomspace(1.0 / frequency[inner][-1], 1.0 / frequency[inner][0], KNOWN_PERIODS)
         profiles = [self._sine.basis_signals(np.array([period])) for period in periods]
-        both = [np.concatenate([getattr(item, name) for item in profiles], axis=1) for name in Signal._fields]
+        both = [
+            np.concatenate([getattr(item, name) for item in profiles], axis=1)
+            for name in ("interval_mean", "sample_value")
+        ]
         for cause, effect in enumerate(effects):
             if 0.0 in (effect.lower, effect.upper):
                 continue  # a one-sided effect cannot be a sine about zero
@@ -262,7 +289,7 @@ class Screen:
         self, dynamics: ErrorDynamics, effects: Sequence[Effect], profile: FittedProfile, shape: Array
     ) -> list[Candidate]:
         """All causes with one profile at given nonlinear parameters."""
-        interval_mean, sample_value = profile.basis_signals(shape)
+        interval_mean, sample_value = profile.basis_signals(shape)[:2]
         candidates = []
         for cause, effect in enumerate(effects):
             a, b = signatures.gram(dynamics, cause, interval_mean[1:-1], sample_value[2:])
@@ -280,6 +307,18 @@ class Screen:
                 gain = float(gains[0])
             candidates.append(Candidate(effect, profile, np.append(by, shape), gain))
         return candidates
+
+
+def _base(effect: Effect) -> Effect:
+    return effect.effect if isinstance(effect, ConstantVariant) else effect
+
+
+def _with_constants(item: Candidate) -> Candidate:
+    """Candidate of the effect itself, with the constants of its variant."""
+    if not isinstance(item.effect, ConstantVariant):
+        return item
+    parameters = np.append(item.parameters, item.effect.values)
+    return replace(item, effect=item.effect.effect, parameters=parameters)
 
 
 def all_finite(dynamics: ErrorDynamics) -> bool:

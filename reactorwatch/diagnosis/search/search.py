@@ -48,6 +48,9 @@ other noise levels, too. A curve with twelve knots that needs only three costs n
 ROUGH = 1e-3
 """Minimum error of a predicted gain, as a fraction of it: the equations are not linear."""
 
+SMALLEST_NOISE = 1e-3
+"""Lower bound of a sensor's noise as a fraction of the state's scale; files have so many digits."""
+
 LEAST_SENSOR_GAIN = 10.0
 """Minimum gain in BIC of coloured sensor noise."""
 
@@ -343,8 +346,8 @@ class Search:
         """Return true if a candidate with the best's cause and profile starts far from its fit."""
         if not candidate.profile.nonlinear_parameters:
             return False
-        parameters = best.fit.parameters[0]
-        apart = np.abs(candidate.parameters - parameters)[candidate.profile.n_linear :]
+        shape = slice(candidate.profile.n_linear, candidate.profile.n_shape)
+        apart = np.abs(candidate.parameters[shape] - best.fit.parameters[0][shape])
         return bool(np.any(apart > _NEAR * candidate.profile.difference_steps))
 
     def refit(self, fitted: FittedHypothesis) -> FittedHypothesis:
@@ -369,7 +372,8 @@ class Search:
 
     def score_fit(self, hypothesis: Hypothesis, fit: Fit) -> FittedHypothesis:
         """BIC of an existing fit."""
-        bic = 2.0 * fit.loss + hypothesis.n_parameters * log(self.run.values)
+        charged = hypothesis.n_parameters - len(hypothesis.constant_indices)
+        bic = 2.0 * fit.loss + charged * log(self.run.values) + hypothesis.constants_evidence(self.run, fit)
         return FittedHypothesis(hypothesis, fit, bic + self.prior.cost(hypothesis))
 
 
@@ -397,3 +401,9 @@ def _least_score(candidate: Candidate) -> float:
 
 def _label(candidate: Candidate) -> Label:
     return ((candidate.effect.name, candidate.profile.name),)
+
+
+def smallest_noise(model: ProcessModel) -> list[float]:
+    """Lower bound of each sensor's noise."""
+    scales = {state.name: state.scale for state in model.states}
+    return [SMALLEST_NOISE * scales.get(output.name, 1.0) for output in model.outputs]

@@ -213,8 +213,9 @@ class LinearisedForcing:
         """Deviation of the most likely path from this one, and the magnitude of the forcing along it."""
         offset, seen = (item[:, :, 0] + item[:, :, 1:] @ fitted.terms for item in (self.offset, self.seen))
         d, red = smooth(self.linear, *self._red_noise(fitted.levels), offset, seen)
-        sizes = (np.clip(item @ fitted.terms + red, self.effect.lower, self.effect.upper) for item in self.terms)
-        return d, Signal(*sizes)
+        bounds = (self.effect.lower, self.effect.upper)
+        interval_mean, sample_value = (np.clip(item @ fitted.terms + red, *bounds) for item in self.terms[:2])
+        return d, Signal(interval_mean, sample_value)
 
     def _red_noise(self, levels: Levels) -> tuple[Array, Array, float]:
         sd = levels.red * self.effect.typical
@@ -242,5 +243,5 @@ def _dependencies(augmented: AugmentedModel) -> Sequence[int]:
         by = ca.jacobian(output.expression, seen)
         if by.nnz():  # a sensor's error may depend on what it measures
             terms += [by, output.expression]
-    symbols = [item.symbol for item in (*model.states, *model.inputs[:-2])]
+    symbols = [item.symbol for item in (*model.states, *model.inputs[: -augmented.n_effect_inputs])]
     return [index for index, symbol in enumerate(symbols) if any(ca.depends_on(term, symbol) for term in terms)]

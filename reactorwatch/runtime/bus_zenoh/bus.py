@@ -52,7 +52,7 @@ MAX_CHANNEL = 5 * MAX_BATCH
 MAX_BATCH_BYTES = 1 << 20
 
 HISTORY_WITHIN_S = 10.0
-MAX_TRANSIT_S = 5.0  # of a message; a missing one was published at most this long before its successor arrived
+MAX_TRANSIT_S = 5.0  # of a message; a missing one was published at most this long before its predecessor arrived
 LAST_QUERY_PERIOD_S = 20.0
 """Period of queries for the last number on each key, on a bus with certificates.
 
@@ -60,7 +60,7 @@ Zenoh's subscriber counts messages by their source, which it reads from the mess
 another role's publisher, on its own keys, makes the subscriber silently drop that publisher's next messages. The
 replies of publishers bypass the subscriber, and show which are missing.
 """
-MAX_QUERIES = 4  # for the history; messages published while the replies arrived may be missing
+MAX_QUERIES = 4  # of caches, while a publisher does not reply in time
 
 
 @dataclass(frozen=True)
@@ -339,11 +339,17 @@ class ZenohBus:
 
     def _query_stream(self, stream: str, since_s: float) -> list[SequencedMessage]:
         """Messages of a stream from publishers' caches."""
+        messages, started = list[SequencedMessage](), time.monotonic()
         try:
-            return self._query_cache(keys_of(stream), _history_selector(since_s + MAX_TRANSIT_S)).messages
+            for _ in range(MAX_QUERIES):
+                waited_s = time.monotonic() - started
+                answers = self._query_cache(keys_of(stream), _history_selector(since_s + waited_s + MAX_TRANSIT_S))
+                messages += answers.messages
+                if answers.is_complete:
+                    break
         except zenoh.ZError as error:  # the bus is being closed, for instance
-            log.info("cannot ask for what is missing", stream=stream, why=first_line(error))
-            return []
+            log.info("cannot query missing messages", stream=stream, why=first_line(error))
+        return messages
 
     def _query_cache(self, key_expression: str, which: str) -> "_CacheReply":
         """Query the publishers' caches."""

@@ -141,9 +141,9 @@ class Delivery:
                 if self._closed:
                     return
                 overdue = self._buffer.overdue_streams(now_ns)
-                if all(since_ns <= queried_ns for since_ns in overdue.values()):
+                if all(item.since_ns <= queried_ns for item in overdue.values()):
                     self._deliver(self._buffer.release_overdue(now_ns))
                     continue
                 queried_ns = now_ns
-            for stream, since_ns in islice(overdue.items(), MAX_STREAMS_QUERIED):
-                self.receive(list(self._query_stream(stream, (now_ns - since_ns) / 1e9)))
+            for stream, item in islice(overdue.items(), MAX_STREAMS_QUERIED):
+                self.receive(list(self._query_stream(stream, (now_ns - item.after_ns) / 1e9)))

@@ -60,6 +60,18 @@ class Gap(NamedTuple):
     noticed_ns: int
 
 
+class Overdue(NamedTuple):
+    """A missing message of a stream whose timeout is over.
+
+    Attributes:
+        since_ns: time when the first message arrived that is held because of it.
+        after_ns: time when a message arrived that was published before it.
+    """
+
+    since_ns: int
+    after_ns: int
+
+
 class ReorderBuffer(Generic[Item]):
     """Releases messages in the order of their numbers.
 
@@ -91,7 +103,7 @@ class ReorderBuffer(Generic[Item]):
             state = self._add_stream((publisher, stream), now_ns)
             if not number and not self._await_history:
                 state.expected = 0
-        state.last_arrival_ns = now_ns
+        last_arrival_ns, state.last_arrival_ns = state.last_arrival_ns, now_ns
         state.record_key(key, number)
         if state.expected is None and not self._await_history and number <= state.last_before:
             return
@@ -106,11 +118,15 @@ class ReorderBuffer(Generic[Item]):
             if state.fill(number):
                 yield item  # given up before, and arrived after all
             return
-        yield from self._hold(state, number, item, now_ns)
+        yield from self._hold(state, number, item, now_ns, last_arrival_ns)
 
-    def _hold(self, state: StreamState[Item], number: int, item: Item, now_ns: int) -> Iterator[Item | Gap]:
+    def _hold(
+        self, state: StreamState[Item], number: int, item: Item, now_ns: int, last_arrival_ns: int
+    ) -> Iterator[Item | Gap]:
         """Hold a message while others before it are missing; yields the messages released nevertheless."""
         hold = state.hold_state()
+        if not hold.held:
+            hold.after_ns = last_arrival_ns or now_ns
         if self._await_history and hold.is_full:
             return  # it will be reported as missing
         if number not in hold.held:
@@ -190,20 +206,19 @@ class ReorderBuffer(Generic[Item]):
         self._holding = {name: state for name, state in self._holding.items() if due.get(name) is not None}
         return min((due_ns for due_ns in due.values() if due_ns is not None), default=None)
 
-    def overdue_streams(self, now_ns: int) -> dict[str, int]:
-        """Streams with an overdue message, with the arrival time of the first message that is held because of it.
-
-        Streams with an unknown start are left out: nothing is missing there.
-        """
-        since: dict[str, int] = {}
+    def overdue_streams(self, now_ns: int) -> dict[str, Overdue]:
+        """Streams with an overdue message; those with an unknown start are left out, as nothing is missing there."""
+        overdue: dict[str, Overdue] = {}
         for (_, stream), state in self._holding.items():
             hold = state.hold
             if hold is None or state.expected is None or not hold.held:
                 continue
             if hold.due_ns is not None and hold.due_ns <= now_ns:
-                first_ns = min(arrival_ns for arrival_ns, _ in hold.held.values())
-                since[stream] = min(since.get(stream, first_ns), first_ns)
-        return since
+                since_ns = min(arrival_ns for arrival_ns, _ in hold.held.values())
+                other = overdue.get(stream, Overdue(since_ns, since_ns))
+                after_ns = min(other.after_ns, since_ns, hold.after_ns)
+                overdue[stream] = Overdue(min(other.since_ns, since_ns), after_ns)
+        return overdue
 
     def _stream(self, publisher: int, stream: str) -> StreamState[Item]:
         return self._streams.get((publisher, stream)) or self._add_stream((publisher, stream), 0)

@@ -30,6 +30,7 @@ class HoldState(Generic[Item]):
     held_bytes: int = 0
     newest: int = 0
     due_ns: int | None = None  # when to check whether to hold no longer; None: nothing is held
+    after_ns: int = 0  # when the last message before the first held one arrived
     recovered_ns: int = 0  # when a missing message arrived last, or the first one was found missing
     reached: dict[str, int] = field(default_factory=dict)  # newest number by key, unless it is below the expected one
 

@@ -15,9 +15,9 @@ MODEL = '{"format": "reactorwatch.model.v1", "model": "cstr"}'
 
 def test_plant_and_model_are_those_of_the_monitor(tmp_path: Path) -> None:
     (tmp_path / "known.json").write_text(MODEL)
-    monitor = MonitorConfig(plant="unit_2", model=str(tmp_path / "known.json"))
+    monitor = MonitorConfig(plant="unit_2", process=str(tmp_path / "known.json"))
     found = diagnosis_settings({}, monitor, tmp_path / "reports")
-    assert found == DiagnosisConfig(plant="unit_2", out=str(tmp_path / "reports"), model=monitor.model)
+    assert found == DiagnosisConfig(plant="unit_2", out=str(tmp_path / "reports"), model=monitor.process)
 
 
 def test_settings_say_otherwise_and_a_flag_says_more(tmp_path: Path) -> None:
@@ -30,7 +30,7 @@ def test_settings_say_otherwise_and_a_flag_says_more(tmp_path: Path) -> None:
     ("table", "said"),
     [
         ({"out": "FILE"}, "FILE: is a file, the name of a folder was expected"),
-        ({"out": "new", "model": "none.json"}, "model file none.json: cannot be read"),
+        ({"out": "new", "model": "none.json"}, "none.json: there is no such file"),
         ({"after": 3}, r"unknown key 'after'; did you mean 'after_min'\?"),
         ({"window_min": 10.0}, r"window_min must be in \[20, 1e\+06\], got 10"),
     ],

@@ -10,8 +10,10 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.cli import identification
 from reactorwatch.cli.linear_models import describe
+from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record
 from tests.tables import read_csv
 
@@ -95,11 +97,11 @@ def test_options_that_make_no_model_are_refused(measured: Record, options: dict[
 
 def test_linearise_tells_the_table_of_the_plant() -> None:
     """Eigenvalues as published for qc = 100 and 85 l/min."""
-    points = json.loads(describe(100.0, 1.0, as_json=True))["steady_states"]
+    points = json.loads(describe(cstr(), [100.0], 1.0, as_json=True))["steady_states"]
     assert [point["kind"] for point in points] == ["stable node", "saddle", "stable focus"]
     (re, im), _ = points[-1]["eigenvalues_per_min"]
     assert (round(re, 3), round(abs(im), 3)) == (-1.983, 3.059)
-    overdamped = json.loads(describe(85.0, 1.0, as_json=True))["steady_states"][-1]
+    overdamped = json.loads(describe(cstr(), [85.0], 1.0, as_json=True))["steady_states"][-1]
     assert [round(re, 3) for re, _ in overdamped["eigenvalues_per_min"]] == [-8.769, -2.987]
     assert points[1]["step_error"] is None
     assert 0 < points[2]["step_error"]["T"] < 0.02
@@ -108,4 +110,20 @@ def test_linearise_tells_the_table_of_the_plant() -> None:
 @pytest.mark.parametrize(("qc", "step", "text"), [(-1.0, 1.0, "qc must be in"), (100.0, 0.0, "--step must not be 0")])
 def test_a_flow_or_step_that_cannot_be_is_refused(qc: float, step: float, text: str) -> None:
     with pytest.raises(InputError, match=text):
-        describe(qc, step, as_json=False)
+        describe(cstr(), [qc], step, as_json=False)
+
+
+def test_linearise_takes_a_level_of_each_input_of_any_process() -> None:
+    """The tanks at the base flows of their controllers rest at the set points; one error for each input and output."""
+    model = find_process("three_tanks").require_model()
+    found = json.loads(describe(model, [31.8605, 27.5668], None, as_json=True))
+    assert (found["Q1"], found["Q2"]) == (31.8605, 27.5668)
+    (point,) = found["steady_states"]
+    assert (point["state"]["h1"], point["state"]["h2"]) == pytest.approx((40.0, 20.0), abs=1e-3)
+    assert {name: list(errors) for name, errors in point["step_error"].items()} == {
+        "Q1": ["h1", "h2", "h3"],
+        "Q2": ["h1", "h2", "h3"],
+    }
+    assert "a step of 0.5 cm3/s in Q2" in describe(model, [31.8605, 27.5668], None, as_json=False)
+    with pytest.raises(InputError, match=r"^three_tanks: one level for each input is needed \(Q1, Q2\), got 1$"):
+        describe(model, [30.0], None, as_json=False)

@@ -19,6 +19,7 @@ TABLES = (".csv", ".gz", ".xlsx", ".parquet")
 FILES = {
     "dashboard run.csv": (".rrd",),
     "import run.csv": (".mcap",),
+    "example leak": TABLES,
     "export run.mcap": TABLES,
     "simulate run.csv": TABLES,
     "recover run.mcap": (".mcap",),

@@ -66,6 +66,7 @@ CASES = {
             option="--png",
         ),
     ],
+    "example": [Case("example leak", {}, "new.csv")],
     "recover": [Case("recover run.mcap", {"file": "run.mcap"}, "new.mcap")],
     "cut": [
         Case("cut run.mcap", {"file": "run.mcap"}, "new.mcap"),

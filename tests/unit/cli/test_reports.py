@@ -7,7 +7,10 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.replay.backtest import Backtest, run
-from reactorwatch.cli.reports import backtest_object, backtest_text
+from reactorwatch.api.alarm_lines import Raised, alarm_headline, alarm_lines
+from reactorwatch.api.backtest_report import backtest_object, backtest_text
+from reactorwatch.contract.messages_pb2 import Alarm, Suspect
+from reactorwatch.records.record import to_time_ns
 from tests.unit.monitor_node.samples import leaking_run, samples
 
 
@@ -42,3 +45,28 @@ def test_a_record_that_was_not_judged_names_nothing() -> None:
     found = backtest_object(result, 0)
     assert (found["reference"], found["noise_levels"]) == (None, None)
     assert "judged by" not in backtest_text(result, 0, Path("run.csv"))
+
+
+def raised(alarm: str, minute: float, cleared_min: float | None, incident: int, text: str = "") -> Raised:
+    suspects = [Suspect(cause="coolant_flow", probability=0.94, text=text)] if text else []
+    message = Alarm(alarm=alarm, priority=3, raised_ns=to_time_ns(minute), incident=incident, suspects=suspects)  # type: ignore[arg-type]
+    return message, None if cleared_min is None else to_time_ns(cleared_min)
+
+
+def test_the_headline_names_the_first_alarm_the_incidents_and_the_cause() -> None:
+    alarms = [raised("ewma/T", 150.3, 160.0, 1), raised("mewma/all", 151.0, None, 1, "15 % of the coolant lost")]
+    assert alarm_headline(alarms, 0) == (
+        "Detected at 150.3 min by ewma/T: 2 alarms in 1 incident; likely cause: 15 % of the coolant lost (94 %)"
+    )
+    assert alarm_headline([], 0) == ""
+
+
+def test_an_alarm_that_comes_and_goes_within_an_incident_is_one_line() -> None:
+    alarms = [raised("ewma/T", minute, minute + 5, 1) for minute in (100.0, 110.0, 120.0)]
+    alarms.append(raised("ewma/T", 400.0, None, 2))
+    assert alarm_lines(alarms, 0) == [
+        "incident 1, from 100 min",
+        "        100 min  ewma/T (high), raised 3 times, cleared at 125 min: ",
+        "incident 2, from 400 min",
+        "        400 min  ewma/T (high), still standing at the end: ",
+    ]

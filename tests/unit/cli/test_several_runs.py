@@ -12,9 +12,9 @@ from monitor_node.replay.backtest import run as watch
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import HeldRecord
+from reactorwatch.api.backtest_report import backtest_object, backtest_text
+from reactorwatch.api.simulation import report, simulate_along
 from reactorwatch.cli import identification
-from reactorwatch.cli.reports import backtest_object, backtest_text
-from reactorwatch.cli.simulation import report, simulate_along
 from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
@@ -93,4 +93,4 @@ def test_a_back_test_raises_the_same_alarms_after_the_clock_was_set_back(whole: 
 
 def test_several_runs_drive_no_plant(whole: Record) -> None:
     with pytest.raises(InputError, match=r"must be one run to drive the plant, .* 2 runs"):
-        HeldRecord.of(cut(whole, 60.0))
+        HeldRecord.of(cut(whole, 60.0), cstr().inputs[0])

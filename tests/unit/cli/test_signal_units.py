@@ -12,9 +12,11 @@ from monitor_node.config import MonitorConfig
 from monitor_node.replay.backtest import Backtest, run
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.api.files import open_messages
 from reactorwatch.cli import identification
-from reactorwatch.cli.backtest_jobs import _units
-from reactorwatch.cli.read_record import open_messages
+from reactorwatch.cli.backtest_jobs import choose_settings
+from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process import MODELS
 from reactorwatch.records.record import Record
@@ -47,7 +49,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def watched(path: Path, **options: object) -> Backtest:
     config = MonitorConfig(training_min=20.0, isolation=False, **options)  # type: ignore[arg-type]
-    return run(open_messages(path, "cstr", COLUMNS, _units(config)).messages, config)
+    return run(open_messages(path, "cstr", COLUMNS, for_equations=True).messages, config)
 
 
 @pytest.mark.parametrize("reference", ["auto", "arx"])
@@ -62,13 +64,18 @@ def test_alarms_on_renamed_columns_have_the_columns_units(rig: Path, reference: 
 
 
 def test_where_the_process_is_named_columns_have_the_units_of_its_signals(rig: Path, tmp_path: Path) -> None:
-    assert _units(MonitorConfig(reference="process")) == UNITS
-    assert _units(MonitorConfig()) is None
     write_extended_model(tmp_path / "m.json", {"format": "reactorwatch.model.v1", "model": "cstr", "effects": []})
-    named = _units(MonitorConfig(model=str(tmp_path / "m.json")))
-    assert named == UNITS
-    recorded = read_run(open_messages(rig, "cstr", COLUMNS, named).messages)
-    assert recorded.units == UNITS
+    columns = {"time_min": "ts", "qc": "flow", "C": "TI-2", "T": "TI-1 [degC]"}
+    by_settings = choose_settings(MonitorConfig(reference="equations"), DEFAULT_CHOICE)
+    assert choose_settings(MonitorConfig(), DEFAULT_CHOICE).is_default
+    for choice in (by_settings, ProcessChoice(str(tmp_path / "m.json"))):
+        source = open_messages(rig, "cstr", columns, choice=choice, for_equations=True)
+        assert source.measured is not None
+        assert source.measured.units == UNITS
+        assert source.measured.columns["T"].min() > 400.0  # kelvin
+        assert read_run(source.messages).units == UNITS
+        with pytest.raises(InputError, match="degC"):
+            open_messages(rig, "cstr", COLUMNS, choice=choice, for_equations=True)
 
 
 @pytest.mark.parametrize("build", MODELS)

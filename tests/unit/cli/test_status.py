@@ -3,9 +3,9 @@
 from google.protobuf.message import Message
 
 from reactorwatch.cli.alarm import _line as alarm_line
-from reactorwatch.cli.status import StatusBoard, _text
+from reactorwatch.cli.status import StatusBoard
 from reactorwatch.contract.codec import Encoded, encode_message
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Priority, Quality, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Priority, Quality, Sample, Suspect
 from reactorwatch.description.find import find_process
 
 S = 10**9
@@ -59,7 +59,7 @@ def test_a_node_that_goes_is_not_there() -> None:
     board.on_token("reactor/a/alive/plant", False)
     (node,) = board.plant("a", START_NS + 3 * S)["nodes"]
     assert (node["alive"], node["said_s_ago"]) == (False, 3.0)
-    assert "not there" in _text(board, as_json=False)
+    assert "not there" in board.text(START_NS)
 
 
 def test_alarms_in_sight_are_shown_the_most_urgent_first() -> None:
@@ -88,7 +88,7 @@ def test_what_comes_from_the_bus_is_shown_as_it_is() -> None:
     board = StatusBoard(START_NS)
     board.on_message(said("a/health/plant", Health(time_ns=START_NS, phase="[/b]")))
     board.on_token("reactor/a/alive/plant", True)
-    assert "[/b]" in _text(board, as_json=False)
+    assert "[/b]" in board.text(START_NS)
 
 
 def test_bytes_that_are_no_message_are_passed_over() -> None:
@@ -122,4 +122,37 @@ def test_each_signal_has_its_newest_value_and_unit_and_a_missing_one_of_the_proc
         "h3": {"value": None, "unit": "cm", "role": "output"},
         "pH": {"value": 6.0, "unit": None},
     }
-    assert "no Q1, Q2, h2, h3" in " ".join(_text(board, as_json=False).split())
+    assert "no Q1, Q2, h2, h3" in " ".join(board.text(START_NS).split())
+
+
+def test_it_shows_values_training_the_age_of_alarms_their_cause_and_the_command_that_acknowledges_them() -> None:
+    board = StatusBoard(START_NS)
+    good = Quality.QUALITY_GOOD
+    board.on_token("reactor/a/alive/monitor", True)
+    board.on_message(said("a/health/monitor", Health(time_ns=START_NS, phase="training", training=0.431)))
+    board.on_message(said("a/sample/T", Sample(time_ns=START_NS + 900 * S, value=438.54, unit="K", quality=good)))
+    leak = alarm("ewma/T", AlarmState.ALARM_STATE_UNACKNOWLEDGED, Priority.PRIORITY_HIGH)
+    leak.raised_ns, leak.incident = START_NS + 180 * S, 7
+    leak.suspects.append(Suspect(cause="coolant_flow", probability=0.93, text="15 % of the coolant lost"))
+    board.on_message(said("a/alarm/ewma/T", leak))
+    values, node, header, row, advice = board.text(START_NS + 5 * S).splitlines()
+    assert "T 438.54 K" in values
+    assert " ".join(node.split()) == "monitor training 43 % lost 0 refused 0 lag 0.0 ms 5 s ago"
+    assert header.split()[:2] == ["priority", "incident"]
+    assert row.split("  ")[1] == "high"
+    assert row.endswith("12 min  15 % of the coolant lost (93 %)")
+    assert advice.endswith("reactorwatch ack --incident 7 --by NAME --plant a")
+    (shown,) = board.plant("a", START_NS)["alarms"]
+    assert (shown["incident"], shown["age_s"]) == (7, 720.0)
+
+
+def test_alarms_are_sorted_by_priority_and_incident_and_each_line_fits() -> None:
+    board = StatusBoard(START_NS)
+    for name, priority, incident in (("a/1", 2, 1), ("a/2", 3, 1), ("a/3", 3, 2)):
+        item = alarm(name, AlarmState.ALARM_STATE_UNACKNOWLEDGED, Priority.Name(priority))  # type: ignore[arg-type]
+        item.incident, item.text = incident, "a sentence that is much longer than a terminal is wide " * 3
+        board.on_message(said(f"p/alarm/{name}", item))
+    lines = board.text(START_NS, width=80).splitlines()
+    shown = [line for line in lines if "…" in line]
+    assert [line.split()[2] for line in shown] == ["a/3", "a/2", "a/1"]
+    assert max(map(len, lines)) <= 80

@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 import reactorwatch as rw
+from reactorwatch.api.files import open_messages
 from reactorwatch.cli.main import app
-from reactorwatch.cli.read_record import open_messages
 from reactorwatch.records.file_format import FileFormat
 from recorder.tools.convert import export_csv, import_csv
 from recorder.tools.mcap_file import read_record

@@ -11,11 +11,11 @@ import pytest
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.cli.backtest_jobs import make_jobs, run_job
+from reactorwatch.api.files import open_messages, record
+from reactorwatch.api.simulation import simulate_along
+from reactorwatch.cli.backtest_jobs import BacktestOptions, make_jobs, run_job
 from reactorwatch.cli.options import parse_span_ns
-from reactorwatch.cli.read_record import open_messages, record
 from reactorwatch.cli.recordings import cut
-from reactorwatch.cli.simulation import simulate_along
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
@@ -49,8 +49,8 @@ def written(folder: Path, leaking: Record, origin_min: float) -> tuple[Path, Pat
 
 
 def watched(path: Path, model: Path | None = None) -> dict[str, Any]:
-    settings = MonitorConfig(training_min=20.0, isolation=False, model=None if model is None else str(model))
-    (job,) = make_jobs([path], settings, None, {}, as_json=True, elsewhere=False)
+    settings = MonitorConfig(training_min=20.0, isolation=False, process=None if model is None else str(model))
+    (job,) = make_jobs([path], BacktestOptions(settings, as_json=True), None, elsewhere=False)
     said: dict[str, Any] = msgspec.json.decode(run_job(job).text)
     return said
 

@@ -17,7 +17,7 @@ from recorder.config import RecorderConfig
 
 @pytest.mark.parametrize("outputs", [("x2",), ("C",), ("C", "T"), ("T", "level")])
 def test_default_priorities_hold_for_any_outputs(outputs: tuple[str, ...]) -> None:
-    config = MonitorConfig(input="u", outputs=outputs)
+    config = MonitorConfig(inputs=("u",), outputs=outputs)
     assert config.priorities == ({"T": "high"} if "T" in outputs else {})
 
 

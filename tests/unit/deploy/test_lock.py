@@ -2,6 +2,9 @@
 
 import importlib.util
 import re
+import shutil
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from types import ModuleType
@@ -58,7 +61,7 @@ def test_the_image_installs_what_is_locked_and_nothing_else() -> None:
     assert all(
         "--require-hashes" in line or ("--no-deps" in line and "--no-build-isolation" in line) for line in installs
     )
-    assert len(installs) == 2
+    assert len(installs) == 3
     assert re.search(r"^ARG PYTHON_IMAGE=python:\d+\.\d+\.\d+-", text, re.MULTILINE)
     assert "USER reactorwatch" in text
 
@@ -68,3 +71,32 @@ def test_the_image_holds_every_package_of_the_wheel() -> None:
     text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
     copied = re.findall(r"^COPY (\w+) \./\1$", text, re.MULTILINE)
     assert sorted(copied) == sorted(wheel["wheel"]["packages"])
+
+
+@pytest.mark.skipif(shutil.which("sed") is None, reason="needs sed")
+def test_the_image_of_nodes_leaves_out_rerun_and_nothing_else() -> None:
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    (script,) = re.findall(r"^RUN sed '([^']+)' requirements.lock > nodes.lock$", text, re.MULTILINE)
+    left = subprocess.run(["sed", script], input=LOCK, capture_output=True, text=True, check=True).stdout
+    lines = re.sub(r"^#.*\n", "", left, flags=re.MULTILINE).replace(" \\\n", " ").splitlines()
+    assert lines == [line for line in LINES if not line.startswith("rerun-sdk==")]
+    assert len(lines) == len(LINES) - 1
+
+
+def test_nodes_run_without_rerun_and_a_dashboard_says_what_is_missing() -> None:
+    program = (
+        "import sys\n"
+        "from importlib import machinery\n"
+        "find = machinery.PathFinder.find_spec\n"
+        "machinery.PathFinder.find_spec = lambda name, *rest: None if name.startswith('rerun') else find(name, *rest)\n"
+        "import diagnosis_node.node, monitor_node.__main__, monitor_node.fleet.node\n"
+        "import plant_node.__main__, recorder.__main__\n"
+        "import reactorwatch.cli.diagnosis\n"
+        "try:\n"
+        "    import recorder.dashboard.file\n"
+        "except ValueError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "dashboards need rerun-sdk, which is not installed here: pip install rerun-sdk\n"

@@ -26,6 +26,8 @@ class Rig:
     clogging: float = 0.0
     bias: float = 0.0
     onset_min: float = 0.0
+    brim: float = BRIM_V
+    caught: float = 0.5
 
 
 def record_of(rig: Rig, seed: int, rows: int = 1500) -> Record:
@@ -46,17 +48,17 @@ def _next(rig: Rig, start_min: float, levels: Array, u: float) -> Array:
     on = start_min >= rig.onset_min - 1e-9
     pump, outlet = 3 * u * (1 + on * rig.pump), 3 * (1 - on * rig.clogging)
     leak, spill = on * rig.leak, on * rig.overflow_per_min
-    now, end, x, over = start_min, start_min + PERIOD_MIN, levels, bool(levels[0] > BRIM_V)
+    now, end, x, over = start_min, start_min + PERIOD_MIN, levels, bool(levels[0] > rig.brim)
     while now < end:
 
         def rates(_: float, x: Array, over: bool = over) -> list[float]:
-            upper, above = np.sqrt(x[0]), x[0] - BRIM_V if over else 0.0
+            upper, above = np.sqrt(x[0]), x[0] - rig.brim if over else 0.0
             return [
                 pump - (outlet + leak) * upper - spill * above,
-                outlet * upper - 3 * np.sqrt(x[1]) + 0.5 * spill * above,
+                outlet * upper - 3 * np.sqrt(x[1]) + rig.caught * spill * above,
             ]
 
-        brim = _Brim(-1.0 if over else 1.0)
+        brim = _Brim(-1.0 if over else 1.0, rig.brim)
         found = solve_ivp(rates, (now, end), x, events=brim, rtol=1e-9, atol=1e-11)
         now, x, over = float(found.t[-1]), found.y[:, -1], over != (found.status == 1)
     return x
@@ -67,9 +69,9 @@ class _Brim:
 
     terminal = True
 
-    def __init__(self, direction: float) -> None:
-        self.direction = direction
+    def __init__(self, direction: float, brim: float) -> None:
+        self.direction, self.brim = direction, brim
 
     def __call__(self, _: float, x: Array) -> float:
         """Level above the brim."""
-        return float(x[0] - BRIM_V)
+        return float(x[0] - self.brim)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plant_node.config import NoiseSd, PlantConfig
+from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.diagnosis.experiment.alternatives import Predictions
 from reactorwatch.diagnosis.experiment.constraints import check_limits, limits_of
@@ -75,7 +75,7 @@ def test_the_plant_does_under_each_rival_what_was_predicted_and_what_its_sensors
     curves = experiment.curves
     assert curves is not None
     driver = Record(curves.time_min, {"qc": curves.level}, "experiment")
-    config = PlantConfig(seed=21, faults=(fault,), noise_sd=NoiseSd(C=0.0, T=0.0))
+    config = PlantConfig(seed=21, faults=(fault,), noise_sd={"C": 0.0, "T": 0.0})
     quiet = simulate_record(config, curves.level.size, driver=driver)
     name = fault.split(":", maxsplit=1)[0]
     for output, close in (("C", 1e-5), ("T", 1e-3)):

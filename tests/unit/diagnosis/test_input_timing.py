@@ -23,7 +23,7 @@ def test_what_sets_in_at_once_grows_as_fast_as_the_clock_goes_until_it_is_all_th
     size: float, after_row_min: float
 ) -> None:
     onset = TIMES[40] + after_row_min
-    growth, ahead = effective_timing(Step(TIMES).signal(np.array([size, onset])), TIMES)
+    growth, ahead = effective_timing(Step(TIMES).signal(np.array([size, onset])), TIMES)[:2]
     np.testing.assert_allclose(ahead, np.clip(TIMES - onset, 0.0, size), rtol=0, atol=1e-12)
     np.testing.assert_allclose(growth[:-1] * np.diff(TIMES), np.diff(ahead), rtol=0, atol=1e-12)
 

@@ -51,7 +51,7 @@ def test_the_signature_is_what_a_small_deviation_does(
     name: str, kind: type[FittedProfile], parameters: list[float], run: Run
 ) -> None:
     profile, numbers = kind(run.time_min), np.array(parameters)
-    interval_mean, sample_value = profile.basis_signals(numbers[profile.n_linear :])
+    interval_mean, sample_value = profile.basis_signals(numbers[profile.n_linear :])[:2]
     g = (
         signatures.forward_signatures(ways_of(name, run), 0, interval_mean[1:-1], sample_value[2:])
         @ numbers[: profile.n_linear]
@@ -84,7 +84,7 @@ def test_backwards_sums_are_those_of_the_signatures(name: str, run: Run) -> None
             (Decay(run.time_min), [onset_min, constant], set_in.other_a[1], set_in.other_b[1]),
         ):
             size = end_min - onset_min if isinstance(profile, Ramp) else 1.0  # the sums are those of a slope of 1
-            felt, seen = profile.basis_signals(np.array(shape))
+            felt, seen = profile.basis_signals(np.array(shape))[:2]
             g = size * signatures.forward_signatures(ways, 0, felt[1:-1], seen[2:])[:, :, 0]
             assert a[row, 0] == pytest.approx(np.sum(ways.w * g), rel=1e-5, abs=1e-6 * abs(np.sum(np.abs(ways.w * g))))
             assert b[row, 0] == pytest.approx(np.sum(g * g), rel=1e-5)
@@ -109,7 +109,7 @@ def test_the_signal_over_a_row_is_the_mean_of_what_is_at_every_moment(kind: type
         else same.signal(parameters).sample_value
     )
     means = (0.5 * (evaluate_all[1:] + evaluate_all[:-1])).reshape(-1, 100).mean(axis=1)
-    interval_mean, sample_value = profile.signal(parameters)
+    interval_mean, sample_value = profile.signal(parameters)[:2]
     np.testing.assert_allclose(interval_mean[:-1], means, atol=6e-3)  # the step lies in one of a hundred pieces
     np.testing.assert_allclose(sample_value, evaluate_all[::100], atol=1e-9)
 

@@ -11,6 +11,7 @@ import pytest
 
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.report.page import as_page
+from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.report.words import describe_verdict
 from reactorwatch.diagnosis.result import NAMED, NOMINAL, Diagnosis
 from reactorwatch.process import effects_of
@@ -43,6 +44,20 @@ def test_the_overflow_that_the_simulation_lacks_is_named_and_gained(overflowing:
     assert extended.parameter("overflow.size").value == pytest.approx(size.value)
 
 
+def test_another_brim_and_another_share_that_is_caught_are_fitted() -> None:
+    rig = Rig(overflow_per_min=10.0, brim=7.5, caught=0.15)
+    found = diagnose(record_of(rig, seed=5), tanks())
+    (cause,) = found.causes
+    assert (found.verdict, cause.cause) == (NAMED, "overflow")
+    for name, truth in (("size", 10.0), ("brim", 7.5), ("caught", 0.15)):
+        said = cause.parameters[name]
+        assert abs(said.value - truth) < 4 * said.sd < 0.4 * truth, name
+    assert found.gain.held_out["x2"].rmse_after < 1.15 * NOISE_V
+    extended = parse_extended_model(json.dumps(found.extended_model)).build()
+    assert extended.parameter("overflow.brim").value == pytest.approx(cause.parameters["brim"].value)
+    assert "brim 7.5" in as_text(found, "tanks.csv", effects_of(tanks()))
+
+
 @pytest.mark.parametrize(
     ("rig", "name", "size"),
     [
@@ -70,7 +85,7 @@ def test_its_report_speaks_of_tanks(overflowing: Diagnosis) -> None:
     assert describe_verdict(found).startswith("The simulation is wrong: overflow of the upper tank, ")
     page = as_page(found, tanks(), catalogue, "tanks.csv", "extended.json", on_the_bus=False)
     assert "in the upper tank" in page
-    assert "half of it into the lower tank" in page
+    assert "a share of it into the lower tank" in page
     assert '<mrow class="added">' in page
     assert "reactorwatch plant" not in page
     for foreign in ("concentration", "temperature", "coolant", "reactor "):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import fit_arx
 from reactorwatch.identification.identify import Identification
 from reactorwatch.identification.linear_model import fit_percent
-from reactorwatch.identification.structure import RowChoice, Structure
+from reactorwatch.identification.report_scheme import fit_least_squares
+from reactorwatch.identification.structure import Structure
 from tests.unit.identification.truth import Daisy, NoisyPlant, identify
 
 
@@ -81,12 +81,15 @@ def test_gaps_and_missing_rows_are_left_out_where_that_is_asked_for(noisy_plant:
     np.testing.assert_allclose(told_parameters(running), noisy_plant.parameters, atol=1e-3)
 
 
-def test_chosen_rows_are_fitted(daisy: Daisy) -> None:
-    told = identify(daisy.time, daisy.qc, daisy.T, order=2, choice=RowChoice(99, 6))
-    model = fit_arx(Structure.of_order(2), daisy.qc[:3750], daisy.T[:3750], choice=RowChoice(99, 6))
+def test_the_report_s_scheme_is_chosen_by_name(daisy: Daisy) -> None:
+    told = identify(daisy.time, daisy.qc, daisy.T, order=2, scheme="report")
+    model = fit_least_squares(Structure.of_order(2), daisy.qc[:3750], daisy.T[:3750])
     np.testing.assert_allclose(told_parameters(told), model.parameters[0], rtol=1e-12)
-    with pytest.raises(InputError, match="it cannot choose rows"):
-        identify(daisy.time, daisy.qc, daisy.T, model="oe", recursive=True, choice=RowChoice(99, 6))
+    for form in ({"model": "armax"}, {"recursive": True}):
+        with pytest.raises(InputError, match="scheme report fits arx and oe, and no recursive model, got"):
+            identify(daisy.time, daisy.qc, daisy.T, scheme="report", **form)
+    with pytest.raises(InputError, match=r"unknown scheme 'best' \(valid: least-squares, report\)"):
+        identify(daisy.time, daisy.qc, daisy.T, scheme="best")
 
 
 def test_a_record_that_determines_nothing_is_refused_with_the_cause(noisy_plant: NoisyPlant) -> None:

@@ -17,7 +17,7 @@ from .samples import leaking_run, samples
 
 PLANTS = "reactor/*"
 SECOND_NS = 1_000_000_000
-QUICK = MonitorConfig(training_min=20.0, isolation=False)
+QUICK = MonitorConfig(training_min=20.0, isolation=False, diagnose_training=False)
 
 
 def of_plant(plant: str, messages: Iterable[Encoded]) -> list[Encoded]:

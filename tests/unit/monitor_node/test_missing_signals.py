@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -13,7 +14,7 @@ from reactorwatch.records.record import MINUTE_NS
 
 from .samples import Rows, leaking_run, sample
 
-CONFIG = MonitorConfig(training_min=40.0, isolation=False)
+CONFIG = MonitorConfig(training_min=40.0, isolation=False, diagnose_training=False)
 LEAK_MIN, END_MIN = 70.0, 80.0
 SIGNALS = ("qc", "C", "T")
 Run = tuple[Rows, dict[str, Rows]]
@@ -50,7 +51,7 @@ def raised_min(result: Backtest) -> dict[str, float]:
 def test_without_one_signal_its_silence_is_told_and_the_others_are_watched(
     signal: str, reference: str, leak: Run
 ) -> None:
-    config = MonitorConfig(training_min=40.0, isolation=False, reference=reference)  # type: ignore[arg-type]
+    config = replace(CONFIG, reference=reference)
     result = watch(leak, signal, config=config)
     assert result.left_out == {signal: "no value of it has come"}
     assert f"training: {signal} is left out: no value of it has come" in result.notes

@@ -8,13 +8,12 @@ from scipy.stats import chi2
 
 from monitor_node.isolation.reconstruction import Reconstruction
 from monitor_node.isolation.window import Row
-from plant_node.config import NoiseSd
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
 
-QUIET = NoiseSd(C=0.0, T=0.0)
+QUIET = {"C": 0.0, "T": 0.0}
 NOISY = {"C": 0.002, "T": 0.5}
 
 

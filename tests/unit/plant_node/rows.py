@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from plant_node.config import NoiseSd
 from plant_node.core import Plant, Row
 from reactorwatch.arrays import Array
 
-QUIET = NoiseSd(C=0.0, T=0.0, qc=0.0)
+QUIET = {"C": 0.0, "T": 0.0, "qc": 0.0}
 
 
 def rows(of: Plant, count: int) -> list[Row]:

@@ -9,14 +9,21 @@ import msgspec
 import pytest
 
 from plant_node.config import PlantConfig
-from plant_node.controllers import LevelControl, TemperatureControl
+from plant_node.process_settings import ProcessSettings, fit_settings
+from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.errors import InputError
+from reactorwatch.process.library.cstr.controllers import LevelControl, TemperatureControl
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.runtime.config import read_settings, section
 
 
 def read(table: dict[str, Any]) -> PlantConfig:
     return section(PlantConfig, "plant", {"plant": table}, {})
+
+
+def fit(table: dict[str, Any]) -> ProcessSettings:
+    config = read(table)
+    return fit_settings(config, find_process(config.process or DEFAULT_PROCESS))
 
 
 def test_all_settings_go_through_a_file() -> None:
@@ -40,7 +47,7 @@ def test_all_settings_go_through_a_file() -> None:
         "wait_for": ["monitor"],
     }
     config = read(table)
-    assert (config.noise_sd.C, config.noise_sd.T) == (0.002, 0.1)
+    assert fit(table).noise_sd == {"qc": 0.0, "C": 0.002, "T": 0.1}
     assert config.rows == 300
     assert read(msgspec.to_builtins(config)) == config
 
@@ -56,7 +63,7 @@ def test_all_settings_go_through_a_file() -> None:
         ({"duration_min": inf}, "duration_min must be above 0, or left out for an endless run, got inf"),
         ({"seed": -1}, "seed must be in [0, 9.22337e+18], got -1"),
         ({"health_period_s": 0.0}, "health_period_s must be in [0.1, 3600], got 0"),
-        ({"valve_limits_l_min": [100.0, 90.0]}, "valve_limits_l_min must be two rising flows of at least 0, got 100"),
+        ({"valve_limits_l_min": [100.0, 90.0]}, "limits of valve_limits_l_min must be two rising numbers, got 100"),
         ({"noise_sd": {"T": -0.1}}, "noise_sd of T must be at least 0, got -0.1"),
         ({"resolution": {"C": inf}}, "resolution of C must be at least 0, got inf"),
         ({"process_noise_sd": {"T": -0.1}}, "process_noise_sd of T must be at least 0, got -0.1"),
@@ -72,14 +79,14 @@ def test_all_settings_go_through_a_file() -> None:
 )
 def test_wrong_settings_are_named_in_one_line(table: dict[str, Any], why: str) -> None:
     with pytest.raises(InputError) as caught:
-        read(table)
+        fit(table)
     assert str(caught.value).startswith(f"settings [plant]: {why}")
     assert len(str(caught.value).splitlines()) == 1
 
 
 def test_a_ramp_may_end_with_the_run() -> None:
-    config = read({"duration_min": 90.0, "faults": ["coolant_flow:ramp:0.1@30min"]})
-    assert str(config.fault_specifications()[0]) == "coolant_flow:ramp:0.1@30min,end=90min"
+    found = fit({"duration_min": 90.0, "faults": ["coolant_flow:ramp:0.1@30min"]})
+    assert str(found.faults[0]) == "coolant_flow:ramp:0.1@30min,end=90min"
 
 
 PLANT_PAGE = (Path(__file__).parents[3] / "docs" / "plant.md").read_text(encoding="utf-8")

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from plant_node.config import NoiseSd, PlantConfig
-from plant_node.controllers import GAIN, TemperatureControl
+from plant_node.config import PlantConfig
 from plant_node.core import Plant
 from plant_node.record import plant_from, simulate_record
+from plant_node.scenario import FromFile, scenario_settings
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.controllers import GAIN, TemperatureControl
 from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr.operation import OPERATION
 from reactorwatch.runtime.config import section
 from tests.unit.plant_node.reactor import Reactor, coolant_for, resting
 from tests.unit.plant_node.rows import QUIET, column, rows
@@ -81,7 +83,7 @@ def test_it_steadies_the_reactor_where_it_is_unstable_by_itself() -> None:
     """At 113 l/min the operating point has lost its stability; noise and all, the controller stays there."""
     rest = resting(113.0)
     start = {"C": float(rest[0]), "T": float(rest[1])}
-    controlled = column(rows(plant(at(113.0), start=start, noise_sd=NoiseSd(), seed=1), 2000), "T")
+    controlled = column(rows(plant(at(113.0), start=start, noise_sd={}, seed=1), 2000), "T")
     assert np.max(np.abs(controlled - rest[1])) < 3.0
     alone = PlantConfig(scenario={"kind": "constant", "level_l_min": 113.0}, start={**start, "T": start["T"] - 1})
     assert simulate_record(alone, 2000).columns["T"][-1] < 400
@@ -101,13 +103,13 @@ def test_the_command_of_a_row_answers_the_temperature_measured_in_it() -> None:
     """Noise and the bias of a sensor included; what is published is the command, whatever leaks."""
     control = TemperatureControl(438.0, 4.0, 100.0)
     faults = ("temperature_bias:step:3@2min", "coolant_flow:step:-0.1@4min")
-    found = rows(plant(control, noise_sd=NoiseSd(), faults=faults), 100)
+    found = rows(plant(control, noise_sd={}, faults=faults), 100)
     np.testing.assert_allclose(column(found, "qc"), 100.0 + 4.0 * (column(found, "T") - 438.0), rtol=1e-12)
     assert np.std(column(found, "qc")) > 1.0
 
 
 def test_the_valve_limits_what_the_controller_asks_for() -> None:
-    running = plant(TemperatureControl(gain_l_min_K=10.0), noise_sd=NoiseSd(), valve_limits_l_min=(101.0, 105.0))
+    running = plant(TemperatureControl(gain_l_min_K=10.0), noise_sd={}, valve_limits_l_min=(101.0, 105.0))
     found = column(rows(running, 200), "qc")
     assert (found.min(), found.max()) == (101.0, 105.0)
 
@@ -157,7 +159,7 @@ SQUARE = {"kind": "square", "low": 95.0, "high": 109.0, "period_min": 4.0}
 def test_the_scenario_is_not_used_unless_as_dither() -> None:
     without = [rows(plant(TemperatureControl(), scenario=kind), 100) for kind in (SQUARE, "constant")]
     assert without[0] == without[1]
-    found = rows(plant(TemperatureControl(dither=True), scenario=SQUARE, noise_sd=NoiseSd()), 100)
+    found = rows(plant(TemperatureControl(dither=True), scenario=SQUARE, noise_sd={}), 100)
     added = column(found, "qc") - 103.41 - GAIN * (column(found, "T") - 438.54)
     assert added == pytest.approx(np.where(np.arange(100) // 20 % 2, 7.0, -7.0), abs=1e-9)
 
@@ -170,8 +172,8 @@ def test_with_dither_it_starts_at_rest_at_the_first_level() -> None:
 @pytest.mark.parametrize("scenario", ["random-steps", "sines", "square", "constant"])
 def test_dither_of_every_scenario_has_no_mean(scenario: str) -> None:
     """Over 2000 min; within four standard errors of the mean of its holds or periods."""
-    settings = PlantConfig(scenario=scenario).scenario_settings()
-    assert not hasattr(settings, "path")
+    settings = scenario_settings(scenario, OPERATION.inputs["qc"])
+    assert not isinstance(settings, FromFile)
     levels = np.array([settings.level(number / 10, 3) - settings.mean for number in range(20_000)])
     assert abs(levels.mean()) <= 4 * levels.std() / np.sqrt(2000)
 
@@ -263,7 +265,7 @@ def test_wrong_settings_are_named_in_one_line(table: dict[str, Any], why: str) -
     ("table", "why"),
     [
         ({"set_point_K": 45.0}, "set point of T must be in [250, 700] K, got 45"),
-        ({"base_flow_l_min": 250.0}, "temperature_control: base_flow_l_min must be in [0, 200] l/min, got 250"),
+        ({"base_flow_l_min": 250.0}, "controller of 'qc': base must be in [0, 200] l/min, got 250"),
     ],
 )
 def test_settings_that_do_not_go_with_the_plant_are_refused(table: dict[str, Any], why: str) -> None:
@@ -275,5 +277,5 @@ def test_settings_that_do_not_go_with_the_plant_are_refused(table: dict[str, Any
 def test_a_model_that_does_not_measure_the_temperature_cannot_be_controlled() -> None:
     model = cstr()
     blind = replace(model, outputs=model.outputs[:1])
-    with pytest.raises(InputError, match=r"^temperature_control needs a model with the output 'T', cstr has \('C',\)$"):
+    with pytest.raises(InputError, match=r"^controller of 'qc' needs a model with the output 'T', cstr has \('C',\)$"):
         plant_from(PlantConfig(temperature_control=TemperatureControl()), blind)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from plant_node.actuators import CoolantValve
+from plant_node.actuators import Actuator
 from plant_node.noise import BLOCK
 from plant_node.sensors import Sensor
 
@@ -53,6 +53,6 @@ def test_resolution_rounds_to_its_nearest_multiple() -> None:
 
 
 def test_valve_lets_through_no_more_and_no_less_than_it_can() -> None:
-    valve = CoolantValve(10.0, 200.0)
-    assert [valve.flow(command) for command in (-5.0, 10.0, 103.4, 1e9)] == [10.0, 10.0, 103.4, 200.0]
+    valve = Actuator(10.0, 200.0)
+    assert [valve.limit(command) for command in (-5.0, 10.0, 103.4, 1e9)] == [10.0, 10.0, 103.4, 200.0]
     assert [valve.reaches(command) for command in (9.9, 10.0, 200.0, 200.1)] == [False, True, True, False]

@@ -9,13 +9,12 @@ import pytest
 from scipy.linalg import expm, solve_discrete_lyapunov
 from scipy.stats import chi2, kstest
 
-from plant_node.config import NoiseSd, PlantConfig
-from plant_node.controllers import LevelControl
-from plant_node.core import Plant
+from plant_node.config import PlantConfig
 from plant_node.disturbances import ProcessNoise
 from plant_node.record import plant_from, simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
+from reactorwatch.process.library.cstr.controllers import LevelControl
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.linearise import linearise
 from reactorwatch.process.model import ProcessModel
@@ -57,9 +56,9 @@ def test_each_state_and_each_sensor_has_a_stream_of_its_own() -> None:
     both = {"C": 1e-4, "T": 0.2}
     of_T = states("T", process_noise_sd=both)
     np.testing.assert_array_equal(of_T, states("T", process_noise_sd={"T": 0.2}))
-    np.testing.assert_array_equal(of_T, states("T", process_noise_sd=both, noise_sd=NoiseSd()))
+    np.testing.assert_array_equal(of_T, states("T", process_noise_sd=both, noise_sd={}))
     assert np.all(np.diff(of_T) != np.diff(states("T", process_noise_sd=both, seed=1)))
-    config = PlantConfig(noise_sd=NoiseSd(T=1.0), scenario="constant", start={"C": 1.0, "T": 440.0})
+    config = PlantConfig(noise_sd={"T": 1.0}, scenario="constant", start={"C": 1.0, "T": 440.0})
     of_sensor = simulate_record(config, ROWS, still()).columns["T"] - 440.0
     for one, other in ((np.diff(of_T), of_sensor[1:]), (np.diff(of_T), np.diff(states("C", process_noise_sd=both)))):
         for lag in (0, 1):
@@ -128,5 +127,5 @@ def test_the_level_may_be_noisy_too_and_a_fault_leaves_the_streams_alone() -> No
 
 def test_a_state_that_there_is_not_is_refused() -> None:
     with pytest.raises(InputError) as caught:
-        Plant(PlantConfig(process_noise_sd={"V": 0.1}), cstr(), PlantConfig().scenario_settings())  # type: ignore[arg-type]
+        plant_from(PlantConfig(process_noise_sd={"V": 0.1}))
     assert str(caught.value) == "process_noise_sd: cstr has no state 'V' (valid: C, T)"

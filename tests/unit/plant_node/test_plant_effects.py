@@ -8,14 +8,11 @@ import pytest
 from msgspec.structs import replace as with_changes
 
 from plant_node.config import PlantConfig
-from plant_node.controllers import LevelControl, TemperatureControl
-from plant_node.core import Plant
-from plant_node.record import simulate_record
-from plant_node.scenario import Constant
+from plant_node.record import plant_from, simulate_record
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.controllers import LevelControl, TemperatureControl
 from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.plant_node.reactor import Reactor
 from tests.unit.plant_node.rows import QUIET
 
@@ -34,7 +31,7 @@ def test_a_flow_that_is_stamped_late_has_acted_when_its_row_is_measured() -> Non
 def test_a_controller_does_not_see_how_its_commands_are_stamped() -> None:
     control = TemperatureControl(set_point_K=((0.0, 438.54), (2.0, 441.0)))
     late, in_time = (
-        Plant(PlantConfig(noise_sd=QUIET, temperature_control=control, faults=faults), cstr(), Constant())
+        plant_from(PlantConfig(noise_sd=QUIET, temperature_control=control, faults=faults))
         for faults in (("sample_timing:constant:0.05", "temperature_bias:constant:1"), ("temperature_bias:constant:1",))
     )
     rows = [(late.next_row().readings, in_time.next_row().readings) for _ in range(60)]
@@ -66,7 +63,7 @@ def test_every_effect_sets_in_on_a_plant_at_rest_and_moves_what_is_measured(effe
 
 def test_a_valve_that_begins_to_stick_stands_where_it_was() -> None:
     """It is made to stick before the flow is stepped by less than it sticks, and let go after."""
-    plant, twin = (Plant(PlantConfig(noise_sd=QUIET, scenario="constant"), cstr(), Constant()) for _ in range(2))
+    plant, twin = (plant_from(PlantConfig(noise_sd=QUIET, scenario="constant")) for _ in range(2))
     shown, expected = [], []
     for number in range(60):
         if number == 10:
@@ -88,7 +85,7 @@ def test_an_extended_model_is_the_plant_that_has_its_effects_as_faults(text: str
     path = tmp_path / "extended.json"
     path.write_text(json.dumps({"format": "reactorwatch.model.v1", "model": "cstr", "effects": [text]}))
     leak = "coolant_flow:step:-0.02@10min"
-    of_model = simulate_record(PlantConfig(seed=3, model=str(path), faults=(leak,)), 300)
+    of_model = simulate_record(PlantConfig(seed=3, process=str(path), faults=(leak,)), 300)
     of_faults = simulate_record(PlantConfig(seed=3, faults=(text, leak)), 300)
     for signal, values in of_model.columns.items():
         assert np.array_equal(values, of_faults.columns[signal])

@@ -7,10 +7,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from plant_node.config import NoiseSd, PlantConfig
-from plant_node.core import Plant
+from plant_node.config import PlantConfig
 from plant_node.initial_state import complete_state, start_state
-from plant_node.scenario import Constant
+from plant_node.record import plant_from
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import FaultSpecification
@@ -63,8 +62,8 @@ def test_steady_states_are_told_apart_by_temperature_whatever_the_last_state_is(
 
 
 def test_a_fault_with_a_state_of_its_own_comes_and_goes_without_a_jump() -> None:
-    config = PlantConfig(noise_sd=NoiseSd(C=0, T=0), start={"C": 0.2, "T": 430.0})
-    running, undisturbed = (Plant(config, cstr(), Constant()) for _ in range(2))
+    config = PlantConfig(noise_sd={"C": 0, "T": 0}, start={"C": 0.2, "T": 430.0}, scenario="constant")
+    running, undisturbed = (plant_from(config) for _ in range(2))
     slow = FaultSpecification(Thermowell(), CONSTANT, {"size": 1.0})
     true, measured = [], []
     for number in range(60):

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from plant_node.config import PlantConfig
-from plant_node.controllers import LevelControl, TemperatureControl
 from plant_node.core import Plant, Row
 from plant_node.record import plant_from
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.controllers import LevelControl, TemperatureControl
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.plant_node.reactor import Reactor, resting
 from tests.unit.plant_node.rows import QUIET
@@ -112,5 +112,5 @@ def test_both_controllers_work_together() -> None:
 def test_a_model_without_a_volume_is_refused() -> None:
     model = cstr()
     without = replace(model, parameters=tuple(item for item in model.parameters if item.name != "V"))
-    with pytest.raises(InputError, match=r"^level_control: cstr has no parameter 'V'"):
+    with pytest.raises(InputError, match=r"^settings \[plant\]: level_control: cstr has no parameter 'V'"):
         plant_from(PlantConfig(level_control=LevelControl()), without)

@@ -7,8 +7,7 @@ import pytest
 from google.protobuf.message import Message
 
 from plant_node.__main__ import serve_plant
-from plant_node.config import NoiseSd, PlantConfig
-from plant_node.controllers import TemperatureControl
+from plant_node.config import PlantConfig
 from plant_node.node import BATCH, COMMANDS, PlantNode
 from plant_node.record import plant_from, simulate_record
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode, encode_message
@@ -22,6 +21,7 @@ from reactorwatch.contract.messages_pb2 import (
     Sample,
     SetInput,
 )
+from reactorwatch.process.library.cstr.controllers import TemperatureControl
 from reactorwatch.runtime.event_loop import StopSignal
 from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
@@ -162,7 +162,7 @@ def test_under_control_the_reply_says_whether_it_is_manual_or_automatic() -> Non
 
 
 def test_set_input_acts_from_the_next_row_on() -> None:
-    bench = Bench(scenario="constant", noise_sd=NoiseSd(C=0, T=0), speed=60.0)
+    bench = Bench(scenario="constant", noise_sd={"C": 0, "T": 0}, speed=60.0)
     bench.node.on_tick(START_NS)
     reply = bench.ask("set_input", SetInput(signal="qc", value=95.0))
     assert (reply.accepted, reply.text) == (True, "qc = 95 l/min from 0.1 min on")

@@ -8,16 +8,19 @@ from msgspec.structs import asdict
 from typer.main import get_command
 
 from plant_node.config import PlantConfig
-from plant_node.presets import ONSET_MIN, PRESETS
+from plant_node.process_settings import fit_settings
 from plant_node.record import simulate_record
 from reactorwatch.cli.main import app
+from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr.operation import ONSET_MIN, OPERATION
 from reactorwatch.process.steady_state import steady_states
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.config import BusConfig, section
 
+PRESETS = OPERATION.presets
 NAMES = [item.name for item in PRESETS]
 FAULTY = [name for name in NAMES if name != "fault-free"]
 ONSET = round(ONSET_MIN / 0.1)
@@ -34,7 +37,10 @@ def records() -> dict[str, Record]:
 
 def test_they_are_the_four_records_of_the_work_this_starts_from() -> None:
     assert NAMES == ["fault-free", "input-leakage", "heat-transfer", "reaction-rate"]
-    causes = [[str(item.effect.name) for item in read({"preset": name}).fault_specifications()] for name in NAMES]
+    causes = [
+        [str(item.effect.name) for item in fit_settings(read({"preset": name}), find_process()).faults]
+        for name in NAMES
+    ]
     assert causes == [[], ["coolant_flow"], ["heat_transfer"], ["reaction_rate"]]
     assert all(item.meaning for item in PRESETS)
 
@@ -79,7 +85,7 @@ def test_the_plant_stays_on_its_operating_branch(name: str, seed: int) -> None:
 def test_the_file_overrides_the_preset_and_a_flag_overrides_both() -> None:
     table = {"preset": "input-leakage", "duration_min": 60.0, "noise_sd": {"T": 0.1}}
     config = read(table, duration_min=30.0)
-    assert (config.duration_min, config.noise_sd.T) == (30.0, 0.1)
+    assert (config.duration_min, config.noise_sd["T"]) == (30.0, 0.1)
     assert config.faults == ("coolant_flow:step:-0.1@220min",)
     assert read(table).duration_min == 60.0
     assert read(table, preset="heat-transfer").faults == ("heat_transfer:step:-0.5@220min",)

@@ -8,11 +8,12 @@ import pytest
 
 import reactorwatch.process.library.cstr.effects as catalogue
 from reactorwatch.arrays import Array
-from reactorwatch.process.effect import LOCATIONS, Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.effect_states import reset_function
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.library.cstr.effects.heat_transfer import HeatTransfer
+from reactorwatch.process.library.cstr.locations import LOCATIONS
 from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, FREE, PROFILES, RAMP, STEP, Profile, free_profile

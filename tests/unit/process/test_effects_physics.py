@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.level_control import with_level_control
+from reactorwatch.process.library.cstr.level_control import with_level_control
 from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.profiles import RAMP
 from reactorwatch.process.simulate import Simulator

@@ -46,6 +46,16 @@ from reactorwatch.process.simulate import Simulator
             },
             "coolant_flow:free:-0.05,0min=0,30min=0.2,90min=1",
         ),
+        (
+            "side_reaction:step:0.1@30min,heat=-20,E2=9000K",
+            {"size": 0.1, "onset": 30.0, "E2": 9000.0, "heat": -20.0},
+            "side_reaction:step:0.1@30min,E2=9000,heat=-20",
+        ),
+        (
+            "wall_heat_capacity:free:0.1,exchange=4,0min=0,30min=1",
+            {"size": 0.1, "exchange": 4.0, "time_1": 0.0, "time_2": 30.0, "value_1": 0.0, "value_2": 1.0},
+            "wall_heat_capacity:free:0.1,exchange=4,0min=0,30min=1",
+        ),
         ("coolant_flow:ramp:0.1,onset=5min", {"size": 0.1, "onset": 5.0}, "coolant_flow:ramp:0.1@5min"),
     ],
 )

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.level_control import with_level_control
+from reactorwatch.process.library.cstr.level_control import with_level_control
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states

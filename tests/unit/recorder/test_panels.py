@@ -263,6 +263,24 @@ def test_parameters_of_both_models_are_drawn_with_their_intervals(run: RunColumn
     assert excitation == {name: [0.03], "adaptive model": [0.02, 0.04]}
 
 
+def test_parameters_of_several_inputs_are_drawn_for_each_input_by_its_name(run: RunColumns) -> None:
+    names = ("a1", "b1_1", "b1_2", "b2_1", "b2_2", "c")
+    snapshot = Snapshot(1, dict.fromkeys(names, (1.0, 0.1)), 0.5, 2.0)
+    described = replace(run, models={("h1", ADAPTIVE): (snapshot,)}, process=find_process("three_tanks"))
+    plots = {plot.title: plot for plot in model.draw(described)}
+    assert list(plots)[:4] == [
+        "Parameters a of the model of h1: of the output",
+        "Parameters b of the model of h1: of the input Q1",
+        "Parameters b of the model of h1: of the input Q2",
+        "Parameters c of the model of h1: offset",
+    ]
+    drawn = [line.name for line in plots["Parameters b of the model of h1: of the input Q2"].series]
+    assert [name for name in drawn if name in names] == ["b1_2", "b2_2"]
+    assert "Parameters b of the model of h1: of the input 2" in [
+        plot.title for plot in model.draw(replace(described, process=None))
+    ]
+
+
 def test_the_noise_levels_of_the_equations_that_judge_are_drawn(run: RunColumns) -> None:
     judged = tuple(Snapshot(at, {"sensor_sd": (0.3, 0.0), "C_sd": (1e-4, 0.0)}, 0.0, 0.0) for at in (1, 2))
     (plot,) = model.draw(replace(run, models={("T", EQUATIONS): judged}))

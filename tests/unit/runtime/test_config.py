@@ -86,3 +86,10 @@ def test_settings_that_are_written_are_read_as_they_were(tmp_path: Path) -> None
     tables = read_settings(path)
     for name, settings in written.items():
         assert section(type(settings), name, tables, {}) == settings
+
+
+def test_an_older_name_of_a_key_is_valid_and_both_together_are_not() -> None:
+    assert section(MonitorConfig, "monitor", {"monitor": {"input": "u"}}, {}).inputs == ("u",)
+    assert section(MonitorConfig, "monitor", {"monitor": {"input": "u"}}, {"inputs": ("a", "b")}).inputs == ("a", "b")
+    with pytest.raises(InputError, match=r"'input' is an older name of 'inputs', got both; leave 'input' out"):
+        section(MonitorConfig, "monitor", {"monitor": {"input": "u", "inputs": ["u"]}}, {})

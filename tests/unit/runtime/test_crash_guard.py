@@ -20,7 +20,11 @@ MODULES = sorted(
     for path in (ROOT / package).rglob("*.py")
     if 'if __name__ == "__main__":' in path.read_text(encoding="utf-8")
 )
-ARGUMENTS = {"reactorwatch": ["record"], "diagnosis_node": ["settings.toml"]}
+ARGUMENTS = {
+    "reactorwatch": ["record"],
+    "diagnosis_node": ["settings.toml"],
+    "recorder.tools.replay": ["settings.toml"],
+}
 ERRORS: dict[str, tuple[BaseException, int, str | None]] = {
     "a fault of ours": (
         RuntimeError("the wrong\nreactor\x1b[31m"),
@@ -34,7 +38,14 @@ ERRORS: dict[str, tuple[BaseException, int, str | None]] = {
 
 
 def test_the_modules_are_those_that_the_documents_name() -> None:
-    assert MODULES == ["diagnosis_node", "monitor_node", "plant_node", "reactorwatch", "recorder"]
+    assert MODULES == [
+        "diagnosis_node",
+        "monitor_node",
+        "plant_node",
+        "reactorwatch",
+        "recorder",
+        "recorder.tools.replay",
+    ]
 
 
 @pytest.mark.parametrize("error", ERRORS)
@@ -50,7 +61,8 @@ def test_an_error_within_a_process_of_ours_is_one_line(
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", fail)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    Path("settings.toml").write_text('[diagnosis]\nout = "reports"\n')
+    Path("settings.toml").write_text('[diagnosis]\nout = "reports"\n[replay]\nfile = "run.csv"\n')
+    Path("run.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n1,101,0.1,440\n")
     monkeypatch.setattr(sys, "argv", [module, *ARGUMENTS.get(module, [])])
     for name in (module, f"{module}.__main__"):  # as in a process of its own, in which nothing has imported it
         if not hasattr(sys.modules.get(name), "__path__"):

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from queue import SimpleQueue
+from types import SimpleNamespace
 
 import pytest
 
@@ -75,6 +76,32 @@ def test_what_is_missing_is_asked_for_before_it_is_given_up(monkeypatch: pytest.
     ((stream, since_s),) = asked
     assert stream == "reactor/x/sample"
     assert 0.0 < since_s < WITHIN_S
+
+
+@pytest.mark.parametrize("before", [1, 3])
+def test_the_query_reaches_back_to_the_message_before_the_gap(monkeypatch: pytest.MonkeyPatch, before: int) -> None:
+    """Between them the link was down for a minute, and all that is missing was published then."""
+    clock = SimpleNamespace(now_ns=SECOND)
+    times = SimpleNamespace(monotonic_ns=lambda: clock.now_ns, time_ns=time.time_ns)
+    monkeypatch.setattr("reactorwatch.runtime.delivery.delivery.time", times)
+    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    asked: SimpleQueue[float] = SimpleQueue()
+
+    def ask(stream: str, since_s: float) -> list[SequencedMessage]:
+        asked.put(since_s)
+        return [message(number) for number in range(before, before + 2)]
+
+    delivery = Delivery(each(heard), heard.put, ask)
+    delivery.start()
+    delivery.receive([message(number) for number in range(before)])
+    clock.now_ns += 60 * SECOND
+    delivery.receive([message(before + 2)])
+    clock.now_ns += reorder_buffer.TIMEOUT_NS
+    delivery.receive([message(before + 3)])
+    assert asked.get(timeout=WITHIN_S) == 60.0 + reorder_buffer.TIMEOUT_NS / 1e9
+    items = [heard.get(timeout=WITHIN_S) for _ in range(before + 4)]
+    delivery.close()
+    assert [item.payload.decode() for item in items if isinstance(item, Encoded)] == [*map(str, range(before + 4))]
 
 
 def test_what_waits_is_handed_on_when_the_bus_is_closed() -> None:

@@ -41,7 +41,7 @@ def tanks() -> ProcessModel:
     """The tanks with their nominal constants: one model, so that what is compiled from it is compiled once."""
     x1 = variable("x1", "V", (0.0, 50.0), 3.0, "level of the upper tank")
     x2 = variable("x2", "V", (0.0, 50.0), 3.0, "level of the lower tank")
-    u = variable("u", "V", (0.0, 10.0), 1.0, "command of the pump")
+    u = variable("u", "V", (0.0, 10.0), 1.0, "command of the pump", usual=2.5)
     k1 = parameter("k1", 3.0, "V^0.5/min", (0.0, 100.0), "outlet of the upper tank, over its cross-section")
     k2 = parameter("k2", 3.0, "V^0.5/min", (0.0, 100.0), "the same, over the cross-section of the lower tank")
     k3 = parameter("k3", 3.0, "V^0.5/min", (0.0, 100.0), "outlet of the lower tank, over its cross-section")

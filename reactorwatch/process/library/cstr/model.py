@@ -61,7 +61,7 @@ def cstr() -> ProcessModel:
     """The reactor with its nominal constants: one model, so that what is compiled from it is compiled once."""
     C = variable("C", "mol/l", (0.0, 2.0), 0.1, "concentration of A in the reactor", "mass_balance")
     T = variable("T", "K", (250.0, 700.0), 10.0, "temperature of the reactor", "energy_balance")
-    qc = variable("qc", "l/min", (0.0, 500.0), 10.0, "coolant flow")
+    qc = variable("qc", "l/min", (0.0, 500.0), 10.0, "coolant flow", usual=OPERATING_COOLANT_FLOW)
     q = parameter("q", 100.0, "l/min", (1.0, 1000.0), "process flow")
     V = parameter("V", 100.0, "l", (1.0, 1000.0), "volume of the contents")
     Cf = parameter("Cf", 1.0, "mol/l", (0.0, 10.0), "concentration of A in the feed")

@@ -47,7 +47,10 @@ def three_tanks() -> ProcessModel:
     h1, h2, h3 = (
         variable(f"h{i}", "cm", (0.0, 62.0), 5.0, f"level of tank {i}", balance=f"tank{i}") for i in (1, 2, 3)
     )
-    Q1, Q2 = (variable(f"Q{i}", "cm3/s", (0.0, 150.0), 5.0, f"flow of pump {i}") for i in (1, 2))
+    Q1, Q2 = (
+        variable(f"Q{i}", "cm3/s", (0.0, 150.0), 5.0, f"flow of pump {i}", usual=usual)
+        for i, usual in ((1, 21.4), (2, 53.8))
+    )
     A = parameter("A", 154.0, "cm2", (1.0, 1e5), "cross-section of a tank")
     s = parameter("s", 0.5, "cm2", (1e-3, 1e3), "cross-section of a pipe")
     g = parameter("g", 981.0, "cm/s2", (900.0, 1000.0), "acceleration of gravity")

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from google.protobuf.message import Message
+from msgspec.structs import replace
 
 from monitor_node.__main__ import MonitorNode
 from monitor_node.alarms.commands import COMMANDS
@@ -29,6 +30,8 @@ from tests.memory_bus import Exchange, MemoryBus
 from ..samples import PLANT, leaking_run, samples
 
 END_MIN = 140.0
+CONFIG = MonitorConfig(diagnose_training=False)
+"""Each room has a node, which would start a process for the diagnosis."""
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +75,7 @@ class Room:
 
 @pytest.fixture
 def room(leak: list[Encoded]) -> Room:
-    return Room(MonitorConfig(), leak)
+    return Room(CONFIG, leak)
 
 
 def listed(room: Room) -> dict[str, Alarm]:
@@ -129,10 +132,54 @@ def test_the_list_has_every_alarm_and_publishes_nothing(room: Room) -> None:
     assert room.said == []
 
 
+def test_one_command_acknowledges_every_alarm_of_an_incident(room: Room) -> None:
+    before = listed(room)
+    raised = [alarm.alarm for alarm in before.values() if alarm.incident == 1]
+    assert len(raised) >= 3
+    reply = room.ask("acknowledge", AlarmCommand(incident=1, by="Anna", comment="a leak"))
+    assert reply.text == f"incident 1: acknowledge by Anna, {len(raised)} alarms"
+    assert [alarm.alarm for alarm in reply.alarms] == raised
+    after = listed(room)
+    assert {after[name].state for name in raised} == {AlarmState.ALARM_STATE_ACKNOWLEDGED}
+    assert {(after[name].by, after[name].comment) for name in raised} == {("Anna", "a leak")}
+    assert all(after[name].state == before[name].state for name in after.keys() - set(raised))
+
+
+def test_an_incident_is_published_as_single_acknowledgements_of_its_alarms(room: Room, leak: list[Encoded]) -> None:
+    """So a recording of it is replayed from the alarms alone."""
+    room.ask("acknowledge", AlarmCommand(incident=1, by="Anna"))
+    names = [item.message.alarm for item in room.said if isinstance(item.message, Alarm)]
+    singly = Room(CONFIG, leak)
+    published = []
+    for name in names:
+        singly.ask("acknowledge", by_anna(name))
+        published += singly.said
+    assert room.said == published
+
+
+def test_an_alarm_that_is_acknowledged_is_left_out_of_its_incident(room: Room) -> None:
+    room.ask("acknowledge", by_anna("shewhart/T"))
+    reply = room.ask("acknowledge", AlarmCommand(incident=1, by="Ben"))
+    assert reply.accepted
+    assert "shewhart/T" not in {alarm.alarm for alarm in reply.alarms}
+    assert listed(room)["shewhart/T"].by == "Anna"
+    again = room.ask("acknowledge", AlarmCommand(incident=1, by="Ben"))
+    assert again.text == "incident 1 has no alarm to acknowledge (the latest incident is 1)"
+
+
+def test_a_suspect_is_named_in_words(room: Room) -> None:
+    (leak, *_) = listed(room)["shewhart/T"].suspects
+    assert leak.cause == "coolant_flow"
+    assert leak.text == "10 % of the coolant lost"
+
+
 REFUSED: list[tuple[str, Message, str]] = [
     ("acknowledge", by_anna("shewhart/pH"), "there is no alarm 'shewhart/pH' (there are: shewhart/C, shewhart/T, "),
     ("acknowledge", AlarmCommand(alarm="shewhart/T"), "by must name the person, in 1 to 64 characters, got ''"),
     ("acknowledge", AlarmCommand(alarm="shewhart/T", by="   "), "by must name the person, in 1 to 64"),
+    ("acknowledge", AlarmCommand(incident=2, by="Anna"), "incident 2 has no alarm to acknowledge (the latest incident"),
+    ("acknowledge", AlarmCommand(alarm="ewma/T", incident=1, by="Anna"), "name an alarm or an incident, not both; got"),
+    ("suppress", AlarmCommand(incident=1, by="Anna"), "an incident can be acknowledged and nothing else, got suppress"),
     ("unshelve", by_anna(), "alarm shewhart/T is not shelved"),
     ("return_to_service", by_anna(), "alarm shewhart/T is in service"),
     ("comment", by_anna(comment="  "), "comment must say something, got ''"),
@@ -165,7 +212,7 @@ def test_a_flood_of_commands_is_refused_counted_and_written_nowhere(
     tmp_path: Path, leak: list[Encoded], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three thousand at once: as many writes to the disk as commands that are obeyed, and the next second is served."""
-    room = Room(MonitorConfig(alarm_state_file=str(tmp_path / "alarms.state")), leak)
+    room = Room(replace(CONFIG, alarm_state_file=str(tmp_path / "alarms.state")), leak)
     stored: list[int] = []
     monkeypatch.setattr("os.fsync", stored.append)
     replies = [room.ask("comment", by_anna(comment=f"number {number}")) for number in range(3000)]
@@ -185,7 +232,7 @@ def test_another_monitor_of_the_plant_is_reported(room: Room, capsys: pytest.Cap
     """And its own token, which it sees as well, is not."""
     room.node.on_alive(room.node.token, True, 0)
     assert capsys.readouterr().out == ""
-    other = MonitorNode(MonitorConfig(), 7).token
+    other = MonitorNode(CONFIG, 7).token
     assert room.node.on_alive(other, True, 0) == []
     assert "another monitor watches this plant; stop one of them" in capsys.readouterr().out
     room.node.on_alive(other, False, 0)
@@ -193,7 +240,7 @@ def test_another_monitor_of_the_plant_is_reported(room: Room, capsys: pytest.Cap
 
 
 def test_before_the_first_sample_nothing_can_be_acknowledged() -> None:
-    reply = Room(MonitorConfig(), []).ask("acknowledge", by_anna())
+    reply = Room(CONFIG, []).ask("acknowledge", by_anna())
     assert not reply.accepted
     assert reply.text.startswith("no sample has come yet")
 
@@ -204,7 +251,7 @@ def test_the_plant_and_the_monitor_share_no_command() -> None:
 
 def test_what_was_said_survives_a_restart(tmp_path: Path, leak: list[Encoded]) -> None:
     """The first monitor is gone without a word: only what it had stored by then is left."""
-    config = MonitorConfig(alarm_state_file=str(tmp_path / "alarms.state"))
+    config = replace(CONFIG, alarm_state_file=str(tmp_path / "alarms.state"))
     first = Room(config, leak)
     first.ask("acknowledge", by_anna(comment="seen"))
     first.ask("shelve", ShelveAlarm(alarm="shewhart/C", by="Ben", minutes=5.0))
@@ -240,7 +287,7 @@ def test_a_file_that_can_no_longer_be_written_stops_no_watch(
 ) -> None:
     folder = tmp_path / "gone"
     folder.mkdir()
-    room = Room(MonitorConfig(alarm_state_file=str(folder / "alarms.state")), leak)
+    room = Room(replace(CONFIG, alarm_state_file=str(folder / "alarms.state")), leak)
     (folder / "alarms.state").unlink()
     folder.rmdir()
     assert room.ask("acknowledge", by_anna()).accepted

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor_node.baseline.references import ArxReference, ProcessReference
+from monitor_node.baseline.black_box_reference import BlackBoxReference
+from monitor_node.baseline.references import ProcessReference
 from monitor_node.baseline.signal_range import ANY, signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -114,7 +115,7 @@ def test_a_plant_that_is_not_the_process_is_watched_whatever_its_values(run: lis
     monitor = Monitor(CONFIG, 0, points=False)
     alarms = fed(monitor, celsius)
     assert monitor.phase == "watching"
-    assert isinstance(monitor.pipeline._reference, ArxReference)
+    assert isinstance(monitor.pipeline._reference, BlackBoxReference)
     assert not [item.alarm for item in alarms if item.alarm.startswith("range/")]
 
 

@@ -96,12 +96,12 @@ def test_irregular_rows_are_watched_by_the_process_model_and_refused_by_the_iden
     "setting",
     [
         {"outputs": ("pH",), "priorities": {}, "reference": "process"},
-        {"input": "steam", "reference": "process"},
+        {"inputs": ("steam",), "reference": "process"},
     ],
 )
 def test_the_process_model_of_another_plant_is_refused_in_one_line(setting: dict[str, object]) -> None:
     from monitor_node.core import Monitor
     from reactorwatch.errors import InputError
 
-    with pytest.raises(InputError, match="reference 'process' needs the signals of cstr"):
+    with pytest.raises(InputError, match="reference 'equations' needs the signals of cstr"):
         Monitor(MonitorConfig(**setting), 0)  # type: ignore[arg-type]

@@ -1,6 +1,7 @@
 """A monitor that was stopped and goes on from its stored state says what it would have said, value for value."""
 
 import random
+from collections.abc import Callable
 from itertools import chain
 from typing import Any, Literal
 
@@ -96,9 +97,22 @@ def test_a_state_that_was_gone_on_from_is_the_same_bytes(leak: list[Encoded]) ->
     assert again.to_bytes() == monitor.to_bytes()
 
 
-def to_version_2(stored: bytes) -> bytes:
-    """A state as software of layout 2 stored it."""
-    fields = msgspec.msgpack.decode(SEAL.open(stored))
+def to_version_3(fields: dict[str, Any]) -> None:
+    """Turn the fields of a state with one input into those of layout 3."""
+    (fields["settings"]["input"],) = fields["settings"].pop("inputs")
+    reference = fields["watch"]["watched"] and fields["watch"]["watched"]["reference"]
+    for name in ("low", "high", "guessed", "reach") if reference else ():
+        if name in reference:
+            (reference[name],) = reference[name]
+    if reference:
+        reference.pop("uses_inputs", None)
+    if reference and "last_inputs" in reference:
+        (reference["last_input"],) = reference.pop("last_inputs")
+
+
+def to_version_2(fields: dict[str, Any]) -> None:
+    """Turn the fields of a state with one input into those of layout 2."""
+    to_version_3(fields)
     fields["runs"] = [
         {
             "number": None if run["expected"] is None else run["expected"] - 1,
@@ -110,18 +124,29 @@ def to_version_2(stored: bytes) -> bytes:
         }
         for run in fields["runs"]
     ]
-    return SEAL._replace(version=2).close(msgspec.msgpack.encode(fields))
 
 
-@pytest.mark.parametrize("place", [0, 20, 1500, 2400])
-def test_a_state_of_the_layout_before_is_read_without_loss(place: int, leak: list[Encoded]) -> None:
+@pytest.mark.parametrize(
+    ("place", "reference"), [(0, "auto"), (20, "auto"), (1500, "auto"), (2400, "auto"), (2400, "arx")]
+)
+@pytest.mark.parametrize(("version", "convert"), [(2, to_version_2), (3, to_version_3)])
+def test_a_state_of_the_layout_before_is_read_without_loss(
+    version: int,
+    convert: Callable[[dict[str, Any]], None],
+    place: int,
+    reference: Literal["auto", "arx"],
+    leak: list[Encoded],
+) -> None:
     """Before the first sample, with runs that are not known yet, in training and while a sample is held."""
-    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
+    config = msgspec.structs.replace(CONFIG, reference=reference)
+    monitor, again = Monitor(config, 0), Monitor(config, 0)
     run(monitor, leak, 0, place)
     if place:
         monitor.on_message(sample("T", 10**6, 1e6, 440.0), 0)  # out of place, so that it is held
     stored = monitor.to_bytes()
-    again.from_bytes(to_version_2(stored))
+    fields = msgspec.msgpack.decode(SEAL.open(stored))
+    convert(fields)
+    again.from_bytes(SEAL._replace(version=version).close(msgspec.msgpack.encode(fields)))
     assert again.to_bytes() == stored
 
 

@@ -1,7 +1,8 @@
 """A state that an earlier version stored is resumed: an upgrade costs no training.
 
-`state_2.bin` was stored by the version before the compiled step, after 391 samples of the run below. A change of the
-layout raises the version of the seal; the state in the layout before has to be read all the same.
+`state_2.bin` was stored by the version before the compiled step, `state_3.bin` by the last one with a single input,
+both after 391 samples of the run below. A change of the layout raises the version of the seal; the state in the layout
+before has to be read all the same.
 """
 
 from collections.abc import Iterator
@@ -17,7 +18,6 @@ from reactorwatch.contract.messages_pb2 import Alarm
 
 from ..samples import leaking_run, samples
 
-STORED = Path(__file__).parent / "state_2.bin"
 CONFIG = MonitorConfig(training_min=6.0, isolation=False)
 PROCESSED = 391
 
@@ -30,10 +30,11 @@ def alarms(monitor: Monitor, messages: list[Encoded]) -> Iterator[tuple[str, str
                 yield item.message.alarm, item.message.event, item.message.time_ns, item.message.value
 
 
-def test_a_state_of_the_version_before_is_resumed_without_a_training() -> None:
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_state_of_a_version_before_is_resumed_without_a_training(version: int) -> None:
     """The alarms are those of a monitor that has processed the samples before as well; numbers to 1e-9."""
-    data = STORED.read_bytes()
-    assert data.startswith(MAGIC + (2).to_bytes(2, "big"))
+    data = (Path(__file__).parent / f"state_{version}.bin").read_bytes()
+    assert data.startswith(MAGIC + version.to_bytes(2, "big"))
     state = MonitorState.from_bytes(SEAL.open(data))
     resumed, whole = Monitor(CONFIG, 0, points=False), Monitor(CONFIG, 0, points=False)
     settings = learning_settings(CONFIG, whole.model, points=False)

@@ -185,7 +185,7 @@ def stored_alarms(node: MonitorNode) -> list[Alarm]:
     return alarms
 
 
-WITH_ALARMS = MonitorConfig(training_min=60.0)
+WITH_ALARMS = MonitorConfig(training_min=60.0, diagnose_training=False)
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,8 @@ def leak() -> list[Encoded]:
 
 @pytest.fixture
 def config(tmp_path: Path) -> MonitorConfig:
-    return MonitorConfig(training_min=60.0, state_file=str(tmp_path / "monitor.state"), state_every_s=2.0)
+    path = str(tmp_path / "monitor.state")
+    return MonitorConfig(training_min=60.0, diagnose_training=False, state_file=path, state_every_s=2.0)
 
 
 def health(node: MonitorNode, now_ns: int) -> Health:

@@ -1,11 +1,9 @@
 """Side reaction of A."""
 
-from dataclasses import replace
-
 import casadi as ca
 
-from reactorwatch.process.effect import Effect
-from reactorwatch.process.model import ProcessModel, parameter
+from reactorwatch.process.effect import Effect, EffectConstant
+from reactorwatch.process.model import ProcessModel
 
 REFERENCE_K = 438.54
 """Temperature at which the rate constant of the side reaction is m: that of the operating point."""
@@ -21,8 +19,7 @@ HEAT_K_L_MOL = 100.0
 class SideReaction(Effect):
     """A also goes to D, at the rate m exp(-E2 (1/T - 1/438.54)) C, and releases heat of its own.
 
-    E2 and the heat are parameters of the extended model, `side_reaction.E2` and `side_reaction.heat`: a record with
-    enough excitation identifies them too.
+    E2 and the heat are fitted, too. Near the main reaction's E/R it is that reaction with another heat.
     """
 
     name = "side_reaction"
@@ -34,6 +31,10 @@ class SideReaction(Effect):
     upper = 20.0
     typical = 0.1
     start_values = (0.02, 0.5)
+    constants = (
+        EffectConstant("E2", ACTIVATION_K, 4e3, "K", 0.0, 1e5, "activation energy over R, of A -> D", (9e3, 19e3)),
+        EffectConstant("heat", HEAT_K_L_MOL, 100.0, "K l/mol", -1e3, 1e3, "heat over rho cp, of A -> D", (0.0, 220.0)),
+    )
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.
@@ -41,10 +42,7 @@ class SideReaction(Effect):
         Raises:
             ValueError: the model has no state C or T.
         """
-        prefix = self.prefix(model)
         C, T = (model.states[model.state_index(name)].symbol for name in ("C", "T"))
-        E2 = parameter(f"{prefix}.E2", ACTIVATION_K, "K", (0.0, 1e5), "activation energy over R, of A -> D")
-        heat = parameter(f"{prefix}.heat", HEAT_K_L_MOL, "K l/mol", (-1e3, 1e3), "heat over rho cp, of A -> D")
-        rate = size * ca.exp(-E2.symbol * (1 / T - 1 / REFERENCE_K)) * C
-        extended = model.add_rate("C", -rate).add_rate("T", heat.symbol * rate)
-        return replace(extended, parameters=(*model.parameters, E2, heat))
+        extended, (E2, heat) = self.add_constants(model)
+        rate = size * ca.exp(-E2 * (1 / T - 1 / REFERENCE_K)) * C
+        return extended.add_rate("C", -rate).add_rate("T", heat * rate)

@@ -1,11 +1,9 @@
 """Heat capacity of the vessel's wall."""
 
-from dataclasses import replace
-
 import casadi as ca
 
-from reactorwatch.process.effect import Effect
-from reactorwatch.process.model import ProcessModel, parameter, variable
+from reactorwatch.process.effect import Effect, EffectConstant
+from reactorwatch.process.model import ProcessModel, variable
 
 EXCHANGE_PER_MIN = 2.0
 """Rate of the wall's temperature, a time constant of half a minute: 8 mm of steel (7800 kg/m3,
@@ -17,8 +15,7 @@ class WallHeatCapacity(Effect):
 
         dT/dt = ... + m r (Tw - T),    dTw/dt = r (T - Tw)
 
-    r is a parameter of the extended model, `wall_heat_capacity.exchange`: a record with enough excitation identifies it
-    too.
+    r, the exchange, is fitted, too.
     """
 
     name = "wall_heat_capacity"
@@ -29,6 +26,7 @@ class WallHeatCapacity(Effect):
     lower = 0.0
     upper = 10.0
     typical = 0.05
+    constants = (EffectConstant("exchange", EXCHANGE_PER_MIN, 1.0, "1/min", 0.01, 20.0, "how fast the wall follows"),)
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.
@@ -40,7 +38,6 @@ class WallHeatCapacity(Effect):
         inside = model.states[model.state_index("T")]
         bounds = (inside.lower, inside.upper)
         wall = variable(f"{prefix}.temperature", inside.unit, bounds, inside.scale, "temperature of the wall")
-        exchange = parameter(f"{prefix}.exchange", EXCHANGE_PER_MIN, "1/min", (0.01, 20.0), "how fast the wall follows")
-        rate = exchange.symbol * (inside.symbol - wall.symbol)
-        extended = model.add_rate("T", -size * rate).with_state(wall, rate, at_rest=inside.symbol)
-        return replace(extended, parameters=(*model.parameters, exchange))
+        extended, (exchange,) = self.add_constants(model)
+        rate = exchange * (inside.symbol - wall.symbol)
+        return extended.add_rate("T", -size * rate).with_state(wall, rate, at_rest=inside.symbol)

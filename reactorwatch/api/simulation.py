@@ -1,23 +1,106 @@
-"""`simulate`: simulate the plant along a record."""
+"""Simulate a process along a record."""
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from plant_node.initial_state import complete_state
+from reactorwatch.api.records import ProcessLike, Record, measured_fields, model_of, process_of
+from reactorwatch.api.views.record import plot_record, record_html
 from reactorwatch.diagnosis.impossible_values import check_values
 from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
+from reactorwatch.notebook import html
 from reactorwatch.process import named_effects
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.records.record import Record, join_runs
+from reactorwatch.records.record import Record as MeasuredRecord
+from reactorwatch.records.record import join_runs
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
-def simulate_along(measured: Record, model: ProcessModel, faults: list[str]) -> Record:
+class Rmse(NamedTuple):
+    """Root mean square difference between a simulated and a measured output.
+
+    Attributes:
+        value: the difference.
+        unit: unit of the output.
+    """
+
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True, init=False)
+class Simulation(Record):
+    """A simulation in the rows of a record.
+
+    Attributes:
+        rmse: difference from the record, by output.
+        measured: the record; None: unknown.
+    """
+
+    rmse: Mapping[str, Rmse] = field(default_factory=dict)
+    measured: MeasuredRecord | None = field(default=None, repr=False)
+
+    def __init__(self, rmse: Mapping[str, Rmse], measured: MeasuredRecord | None = None, **about: Any) -> None:
+        super().__init__(**about)
+        object.__setattr__(self, "rmse", rmse)
+        object.__setattr__(self, "measured", measured)
+
+    def _repr_html_(self) -> str:
+        rows = [(name, f"{item.value:.3g} {item.unit}") for name, item in self.rmse.items()]
+        return record_html(self) + html.table(("output", "root mean square difference from the record"), rows)
+
+    def plot(self) -> "Figure":
+        """Plot the measured and the simulated signals.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
+        if self.measured is None:
+            return super().plot()
+        return plot_record(self.measured, self.inputs, self)
+
+
+def simulate(record: MeasuredRecord, process: ProcessLike | None = None, faults: Sequence[str] = ()) -> Simulation:
+    """Simulate a process from the first row of a record (of each run), driven by the record's inputs.
+
+    Args:
+        record: with the inputs and outputs of the process.
+        process: name, path of a file that describes it, description or model; None: the process of the record.
+        faults: specifications such as `coolant_flow:step:-0.05@30min`, in the record's time.
+
+    Returns:
+        The inputs and the simulated outputs in the rows of the record.
+
+    Raises:
+        InputError: the record cannot drive the model, or a specification is malformed.
+    """
+    model = model_of(record, process)
+    simulated = simulate_along(record, model, list(faults))
+    rmse = root_mean_squares(record, simulated, model)
+    return Simulation(rmse, record, **measured_fields(simulated), process=process_of(record, process))
+
+
+def root_mean_squares(measured: MeasuredRecord, simulated: MeasuredRecord, model: ProcessModel) -> dict[str, Rmse]:
+    """Root mean square difference between simulation and record, by output."""
+    return {
+        name: Rmse(
+            float(np.sqrt(np.nanmean((simulated.columns[name] - measured.columns[name]) ** 2))), model.units[name]
+        )
+        for name in model.output_names
+    }
+
+
+def simulate_along(measured: MeasuredRecord, model: ProcessModel, faults: list[str]) -> MeasuredRecord:
     """Run the equations from the first row of each run of the record, driven by its input.
 
     Args:
@@ -33,7 +116,7 @@ def simulate_along(measured: Record, model: ProcessModel, faults: list[str]) -> 
     return replace(simulated, name=f"simulation of {measured.name}")
 
 
-def _simulate_run(measured: Record, model: ProcessModel, faults: list[str], *, alone: bool) -> Record:
+def _simulate_run(measured: MeasuredRecord, model: ProcessModel, faults: list[str], *, alone: bool) -> MeasuredRecord:
     """Simulate along one run of a record; a single row among other runs is returned unchanged."""
     for text in faults:
         model = parse_fault(text, named_effects(model)).extend(model, end_min=float(measured.time_min[-1]))
@@ -67,7 +150,9 @@ def _simulate_run(measured: Record, model: ProcessModel, faults: list[str], *, a
     return replace(measured, columns=columns)
 
 
-def report(measured: Record, simulated: Record, model: ProcessModel, out: Path | None, *, as_json: bool) -> str:
+def report(
+    measured: MeasuredRecord, simulated: MeasuredRecord, model: ProcessModel, out: Path | None, *, as_json: bool
+) -> str:
     """Format the root mean square difference between simulation and record, by signal.
 
     Args:
@@ -77,21 +162,18 @@ def report(measured: Record, simulated: Record, model: ProcessModel, out: Path |
         out: file of the simulation; None: it could not be written.
         as_json: format as a JSON object.
     """
-    rmse, units = {}, model.units
+    rmse = root_mean_squares(measured, simulated, model)
     remarks = [sentence for law in model.laws for sentence in law.outside(simulated.columns)]
-    for name in model.output_names:
-        difference = simulated.columns[name] - measured.columns[name]
-        rmse[name] = float(np.sqrt(np.nanmean(difference**2)))
     if as_json:
         result = {
             "file": None if out is None else str(out),
             "rows": measured.rows,
             "runs": len(measured.run_starts),
-            "rmse": {name: {"value": value, "unit": units[name]} for name, value in rmse.items()},
+            "rmse": {name: item._asdict() for name, item in rmse.items()},
             **({"remarks": remarks} if model.laws else {}),
         }
         return msgspec.json.encode(result).decode()
-    parts = ", ".join(f"{name} {value:.3g} {units[name]}" for name, value in rmse.items())
+    parts = ", ".join(f"{name} {item.value:.3g} {item.unit}" for name, item in rmse.items())
     written = "not written" if out is None else f"wrote {out}"
     line = f"{written}: {measured.rows} rows; root mean square difference from the record: {parts}"
     return "\n".join([line, *(f"note: {remark}" for remark in [*measured.remarks, *remarks])])

@@ -7,18 +7,25 @@ from typing import Any
 import msgspec
 
 from monitor_node.replay.backtest import Backtest
-from reactorwatch.contract.alarm_text import priority_word, suspects_text
+from reactorwatch.api.alarm_lines import alarm_headline, alarm_lines
+from reactorwatch.contract.alarm_text import priority_word
 from reactorwatch.records.record import to_minutes
 from reactorwatch.terminal import printable_lines
 
+REFERENCES = {"arx": "identified models (ARX)", "black-box": "a black box learned from the training"}
+"""References without equations, for people."""
 
-def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> dict[str, Any]:
+
+def backtest_object(
+    result: Backtest, zero_ns: int, zero: str | None = None, *, is_trained: bool = False
+) -> dict[str, Any]:
     """The object that `backtest --json` prints.
 
     Args:
         result: result of the back-test.
         zero_ns: time from which the file's minutes are counted.
         zero: the same time as ISO 8601; None: unknown.
+        is_trained: True if the training was on another file.
     """
 
     def minutes(time_ns: int | None) -> float | None:
@@ -29,10 +36,10 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
         "zero": zero,
         "span_min": to_minutes(result.span_ns),
         "runs": result.runs,
-        "trained_until_min": minutes(result.watching_since_ns),
+        "trained_until_min": 0.0 if is_trained else minutes(result.watching_since_ns),
         "expected_false_alarms": float(f"{result.expected_false_alarms:.3g}"),
         "signals": {
-            "inputs": [name for name in (result.input,) if name not in result.left_out],
+            "inputs": [name for name in result.inputs if name not in result.left_out],
             "outputs": [name for name in result.outputs if name not in result.left_out],
             "left_out": [{"signal": name, "why": why} for name, why in result.left_out.items()],
         },
@@ -46,7 +53,9 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
                 "raised_min": minutes(alarm.raised_ns),
                 "cleared_min": minutes(cleared_ns),
                 "signals": [item.signal for item in alarm.contributions],
-                "suspect": [{"cause": item.cause, "probability": item.probability} for item in alarm.suspects],
+                "suspect": [
+                    {"cause": item.cause, "probability": item.probability, "text": item.text} for item in alarm.suspects
+                ],
             }
             for alarm, cleared_ns in result.raised_alarms
         ],
@@ -62,10 +71,11 @@ def _baseline(result: Backtest, minutes: Callable[[int], float | None]) -> dict[
     return {"what": change.what, "from_min": minutes(change.time_ns), "why": change.why, "extended_model": model}
 
 
-def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
-    """Format the result of `backtest` for people."""
-    report = backtest_object(result, zero_ns)
+def backtest_text(result: Backtest, zero_ns: int, file: Path, *, is_trained: bool = False) -> str:
+    """Format the result of `backtest` for people; arguments as for `backtest_object`."""
+    report = backtest_object(result, zero_ns, is_trained=is_trained)
     lines = [f"{file}: {report['samples']} rows over {report['span_min']:g} min"]
+    lines += filter(None, [alarm_headline(result.raised_alarms, zero_ns)])
     lines += [f"  {name} is not watched: {why}" for name, why in result.left_out.items()]
     if result.runs > 1:
         lines.append(
@@ -76,21 +86,13 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     elif report["trained_until_min"] is None:
         lines.append("too short to watch: all of it went into the training (make it shorter with --training)")
     else:
+        where = "on another file" if is_trained else f"until {report['trained_until_min']:g} min"
         lines.append(
-            f"trained until {report['trained_until_min']:g} min; "
+            f"trained {where} ({result.training_rows} rows); "
             f"{report['expected_false_alarms']:.2g} false alarms are to be expected in the rest by chance"
         )
         lines.append(_reference_line(result))
-    for alarm, cleared_ns in result.raised_alarms:
-        end = (
-            "still standing at the end" if cleared_ns is None else f"cleared at {to_minutes(cleared_ns, zero_ns):g} min"
-        )
-        raised = f"{to_minutes(alarm.raised_ns, zero_ns):9g} min"
-        lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm.priority)}), {end}: {alarm.text}")
-    suspects = dict.fromkeys(
-        filter(None, (suspects_text(alarm.suspects, zero_ns) for alarm, _ in result.raised_alarms))
-    )
-    lines += [f"  suspect: {text}" for text in suspects]
+    lines += alarm_lines(result.raised_alarms, zero_ns)
     lines += [f"  note: {note}" for note in result.notes]
     if not result.raised_alarms and report["trained_until_min"] is not None:
         lines.append("no alarms")
@@ -102,6 +104,6 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
 def _reference_line(result: Backtest) -> str:
     """Line with the reference and its noise levels."""
     if result.noise_levels is None:
-        return "judged by identified models (ARX)"
+        return f"judged by {REFERENCES.get(result.reference or '', result.reference)}"
     levels = (f"{name} {sd:.3g}" for name, sd in result.noise_levels["sensors"].items())
     return f"judged by the equations, with noise of the sensors (standard deviation) {', '.join(levels)}"

@@ -3,7 +3,7 @@
 A folder is one recording of all the files in it; in a list of files it stands for each of them (`expand_folder`).
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -55,6 +55,35 @@ def record(
     return read_process_table(path, described, columns, stated)
 
 
+def described_process(path: Path, plant: str | None = None, choice: ProcessChoice = DEFAULT_CHOICE) -> "Process":
+    """Process of a file: the chosen one; else the one that a recording describes; else the reactor.
+
+    Args:
+        path: a table, an .mcap or a folder of recordings.
+        plant: plant in a recording.
+        choice: the choice.
+
+    Raises:
+        InputError: as `ProcessChoice.load`, or the recording is damaged.
+    """
+    if not choice.is_default or file_kind(path) == "table":
+        return choice.load()
+    from recorder.tools.mcap_file import recorded_process
+
+    return recorded_process(path, plant) or choice.load()
+
+
+def process_on_clock(choice: ProcessChoice, described: "Process", zero_ns: int) -> "Process":
+    """A described process on the clock of a record.
+
+    Args:
+        choice: the choice by which it was described.
+        described: see `described_process`.
+        zero_ns: zero of the record's minutes, from which those of a chosen extended model are counted.
+    """
+    return described if choice.is_default else choice.load(zero_ns)
+
+
 class MessageSource(NamedTuple):
     """Messages of a file.
 
@@ -64,6 +93,7 @@ class MessageSource(NamedTuple):
         has_clock: True if the times of the messages are clock times.
         read_as: guesses about the form of a table; empty: none.
         process: process of the messages' plant; None: unknown.
+        measured: the record, of a table.
     """
 
     messages: Iterator[Encoded]
@@ -71,6 +101,7 @@ class MessageSource(NamedTuple):
     has_clock: bool
     read_as: str = ""
     process: "Process | None" = None
+    measured: Record | None = None
 
     def zero(self, first_ns: int) -> str | None:
         """Time from which the minutes are counted, as ISO 8601; None: unknown.
@@ -85,9 +116,10 @@ def open_messages(
     path: Path,
     plant: str | None = None,
     columns: dict[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
     stated: FileFormat = GUESS,
     choice: ProcessChoice = DEFAULT_CHOICE,
+    *,
+    for_equations: bool = False,
 ) -> MessageSource:
     """Open a file as messages.
 
@@ -95,25 +127,29 @@ def open_messages(
         path: a table, an .mcap or a folder of recordings.
         plant: plant in a recording.
         columns: names of a table's columns, by signal.
-        units: units of the signals; None: those of the columns.
         stated: statements about the form of a table.
         choice: process of the plant; the default: as recorded, and of a table the reactor.
+        for_equations: True to read a table in the units of the equations of the chosen process, if it has any; columns
+            of unknown units are taken to be in these.
 
     Raises:
         InputError: as `record`.
     """
     if file_kind(path) == "table":
-        from reactorwatch.description.read import read_signals
+        from reactorwatch.description.read import read_process_table, read_signals
         from recorder.tools.player import samples_of
 
-        # any rig may be watched without equations under the reactor's names, in units of its own
-        measured = read_signals(path, choice, columns, stated)
-        if units is not None:
-            measured = replace(measured, units=units)
+        if for_equations and not choice.is_default:
+            chosen = choice.load()
+            measured = read_process_table(path, chosen, columns, stated)
+            if chosen.model is not None:
+                measured = replace(measured, units={**measured.units, **chosen.model.units})
+        else:  # any rig may be watched without equations under the reactor's names, in units of its own
+            measured = read_signals(path, choice, columns, stated)
         publications = samples_of(measured, plant or DEFAULT_PLANT, measured.stored_zero_ns)
         encoded = (encode(item) for item in publications)
         zero_ns, has_clock_time = measured.stored_zero_ns, bool(measured.zero_ns)
-        return MessageSource(encoded, zero_ns, has_clock_time, measured.read_as, choice.load())
+        return MessageSource(encoded, zero_ns, has_clock_time, measured.read_as, choice.load(), measured)
     from recorder.tools.mcap_file import (
         ZERO_NS,
         has_clock,

@@ -1,0 +1,79 @@
+"""`make outside DATA=FOLDER`: all benchmarks whose data are in the folder, as one page of tables."""
+
+import argparse
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from benchmarks.outside import free_run, tennessee, three_tanks, water_circuit
+from benchmarks.outside.table import Row, markdown
+
+SEED = 1
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A benchmark.
+
+    Attributes:
+        title: heading of its table.
+        data: path of its data in the folder.
+        measure: function of that path and a seed that returns the rows of the table.
+    """
+
+    title: str
+    data: str
+    measure: Callable[[Path, int], list[Row]]
+
+
+BENCHMARKS = (
+    Benchmark("Tennessee Eastman: detection", "tep", tennessee.measure),
+    Benchmark("SKAB: anomalies and change points", "skab", water_circuit.measure),
+    Benchmark("Three tanks: cause and place", "three_tanks", three_tanks.measure),
+    Benchmark("Cascaded tanks: simulation", "cascaded_tanks", free_run.measure_tanks),
+    Benchmark("DaISy reactor: simulation", "daisy_cstr.csv", free_run.measure_reactor),
+)
+
+
+def main() -> int:
+    """Run the benchmarks and print their tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="folder of the benchmarks' data")
+    parser.add_argument("--only", help="part of a title, such as SKAB")
+    parser.add_argument("--write", type=Path, help="file whose text between two marks the tables replace")
+    options = parser.parse_args()
+    parts = [
+        measure_benchmark(item, options.data)
+        for item in BENCHMARKS
+        if (options.only or "").lower() in item.title.lower()
+    ]
+    text = f"{_stamp()}\n\n" + "\n\n".join(parts)
+    print(text)
+    if options.write:
+        page = options.write.read_text(encoding="utf-8")
+        head, _, rest = page.partition(BEGIN)
+        options.write.write_text(f"{head}{BEGIN}\n\n{text}\n\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+    return 0
+
+
+BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
+
+
+def measure_benchmark(benchmark: Benchmark, folder: Path) -> str:
+    """Table of a benchmark, or the reason why there is none."""
+    path = folder / benchmark.data
+    if not path.exists():
+        return f"## {benchmark.title}\n\nNot measured: {path.name} is not in the folder."
+    rows = benchmark.measure(path, SEED)
+    return f"## {benchmark.title}\n\n{markdown(rows)}"
+
+
+def _stamp() -> str:
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], check=True, capture_output=True, text=True).stdout
+    return f"Measured on {datetime.now(UTC):%Y-%m-%d} with commit {commit.strip()}."
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,132 @@
+"""Cascaded tanks and DaISy's reactor: models are fitted to one part of a record and simulated along another.
+
+Cascaded tanks (Schoukens and Noel): a pump and two tanks, the upper one overflows; 1,024 rows, 4 s. The benchmark's
+measure is the root mean square error of the simulation, whose state the first 50 rows may set. Where the folder has
+one half alone, its first part is fitted and its second part is simulated.
+
+DaISy 98-002: the stirred-tank reactor, 7,500 rows; the first half is fitted, the fit in percent is that of the
+simulation of the second. Orders are chosen on the first half.
+"""
+
+import csv
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.outside.command import run
+from benchmarks.outside.table import Row
+from reactorwatch.errors import InputError
+
+MODELS = ("arx", "oe", "armax", "bj", "narx")
+ORDERS = (1, 2, 3, 4)
+SETTLE = 50
+_TANKS = ("--time-unit", "s", "--input", "pump_V", "--output", "level_V")
+
+
+def measure_tanks(folder: Path, _seed: int) -> list[Row]:
+    """Rows of the table of the cascaded tanks, one for each kind of model and one for the equations.
+
+    Args:
+        folder: folder with `estimation.csv`, and `validation.csv` if it is there.
+    """
+    source = folder / "estimation.csv"
+    with tempfile.TemporaryDirectory() as temporary:
+        first, second = split(source, Path(temporary), 512)
+        choose, judge = split(first, Path(temporary), 256)
+        rows = []
+        for model in MODELS:
+            order = _best_order(choose, judge, model, SETTLE, *_TANKS)
+            found = _identify(first, second, model, order, SETTLE, *_TANKS)
+            error = found["rmse"]["free_run"] if found else float("inf")
+            rows.append(
+                Row(
+                    f"reactorwatch identify, {model}",
+                    f"order {order}, by its first half",
+                    {"simulation, V": f"{error:.3f}"},
+                )
+            )
+        rows.append(_equations(first, second, Path(temporary)))
+    return rows
+
+
+def _equations(first: Path, second: Path, folder: Path) -> Row:
+    """Torricelli's equations, and what `diagnose` adds to them."""
+    process = folder / "rig.toml"
+    process.write_text(
+        'name = "rig"\nequations = "cascaded_tanks"\n[time]\ncolumn = "time_s"\nunit = "s"\n'
+        '[[signals]]\nname = "u"\ncolumn = "pump_V"\nrole = "input"\nunit = "V"\n'
+        '[[signals]]\nname = "x2"\ncolumn = "level_V"\nrole = "output"\nunit = "V"\n',
+        encoding="utf-8",
+    )
+    report = folder / "report"
+    found = json.loads(run("diagnose", str(first), "--process", str(process), "-o", str(report), "--json"))
+    named = " + ".join(item["cause"] for item in found["causes"]) or found["location"]
+    process.write_text(
+        process.read_text(encoding="utf-8").replace('"cascaded_tanks"', f'"{report / "extended.json"}"'),
+        encoding="utf-8",
+    )
+    out = folder / "simulated.csv"
+    said = json.loads(
+        run("simulate", str(second), "--process", str(process), "--settle", str(SETTLE), "-o", str(out), "--json")
+    )
+    error = said["outputs"]["x2"]["rmse"] if "outputs" in said else said["rmse"]["x2"]
+    return Row("reactorwatch diagnose, equations", f"{found['verdict']}: {named}", {"simulation, V": f"{error:.3f}"})
+
+
+def measure_reactor(file: Path, _seed: int) -> list[Row]:
+    """Rows of the table of DaISy's reactor, one for each kind of model.
+
+    Args:
+        file: the record.
+    """
+    rows = []
+    with tempfile.TemporaryDirectory() as temporary:
+        first, second = split(file, Path(temporary), 3750)
+        choose, judge = split(first, Path(temporary), 1875)
+        for model in MODELS:
+            cells, orders = {}, []
+            for output in ("C", "T"):
+                columns = ("--input", "qc", "--output", output)
+                order = _best_order(choose, judge, model, 0, *columns)
+                found = _identify(first, second, model, order, 0, *columns)
+                cells[f"simulation of {output}, %"] = f"{found['fit_percent']['free_run']:.2f}" if found else "diverges"
+                orders.append(f"{output}: {order}")
+            rows.append(Row(f"reactorwatch identify, {model}", f"orders {', '.join(orders)}, by the first half", cells))
+    return rows
+
+
+def split(file: Path, folder: Path, rows: int) -> tuple[Path, Path]:
+    """Split a CSV file after some rows; both parts have its header."""
+    with file.open(encoding="utf-8", newline="") as lines:
+        header, *data = csv.reader(lines)
+    parts = []
+    for name, part in (("a", data[:rows]), ("b", data[rows:])):
+        path = folder / f"{file.stem}_{name}.csv"
+        with path.open("w", encoding="utf-8", newline="") as out:
+            csv.writer(out).writerows([header, *part])
+        parts.append(path)
+    return parts[0], parts[1]
+
+
+def _best_order(fitted: Path, judged: Path, model: str, settle: int, *columns: str) -> int:
+    """Order with the best simulation on rows that it was not fitted to."""
+    fits = {}
+    for order in ORDERS:
+        found = _identify(fitted, judged, model, order, settle, *columns)
+        fit = found["fit_percent"]["free_run"] if found else None
+        fits[order] = float("-inf") if fit is None else fit
+    return max(fits, key=lambda order: fits[order])
+
+
+def _identify(fitted: Path, judged: Path, model: str, order: int, settle: int, *columns: str) -> dict[str, Any] | None:
+    """JSON of `identify`; None where the rows do not determine this model."""
+    try:
+        said = run(
+            "identify", str(fitted), "--validate", str(judged), "--settle", str(settle), "--model", model,
+            "--order", str(order), "--json", *columns,
+        )  # fmt: skip
+    except InputError:
+        return None
+    found: dict[str, Any] = json.loads(said)
+    return found

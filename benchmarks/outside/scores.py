@@ -1,0 +1,141 @@
+"""Scores of benchmarks: shares of rows in alarm, and the change-point score of the Numenta benchmark."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Flags = NDArray[np.bool_]
+
+A_TRUE, A_FALSE, A_MISSED = 1.0, -0.11, -1.0
+"""Standard profile of the Numenta benchmark: value of a detection at once, of a false one, and of a missed change."""
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """Comparison of rows in alarm with rows that are labelled anomalous.
+
+    Attributes:
+        true_alarms: number of anomalous rows in alarm.
+        false_alarms: number of sound rows in alarm.
+        missed: number of anomalous rows without alarm.
+        sound: number of sound rows without alarm.
+    """
+
+    true_alarms: int
+    false_alarms: int
+    missed: int
+    sound: int
+
+    @property
+    def false_alarm_percent(self) -> float:
+        """Share of the sound rows that are in alarm, in percent (FAR)."""
+        return 100.0 * self.false_alarms / max(self.false_alarms + self.sound, 1)
+
+    @property
+    def missed_percent(self) -> float:
+        """Share of the anomalous rows that are not in alarm, in percent (MAR)."""
+        return 100.0 * self.missed / max(self.missed + self.true_alarms, 1)
+
+    @property
+    def f1(self) -> float:
+        """Harmonic mean of precision and recall; an alarm in every row has 0.7 on SKAB, so it says little alone."""
+        return self.true_alarms / max(self.true_alarms + (self.missed + self.false_alarms) / 2, 1e-300)
+
+
+def compare_rows(labelled: Sequence[Flags], in_alarm: Sequence[Flags]) -> Outliers:
+    """Compare rows in alarm with labels, over all files together.
+
+    Args:
+        labelled: anomalous rows of each file, shape (rows,).
+        in_alarm: rows in alarm of each file, shape (rows,).
+    """
+    truth, alarm = np.concatenate(labelled), np.concatenate(in_alarm)
+    return Outliers(
+        int(np.sum(truth & alarm)),
+        int(np.sum(~truth & alarm)),
+        int(np.sum(truth & ~alarm)),
+        int(np.sum(~truth & ~alarm)),
+    )
+
+
+@dataclass(frozen=True)
+class ChangePoints:
+    """Score of change points.
+
+    Attributes:
+        score: standard profile of the Numenta benchmark: 100 is perfect, 0 is no detection at all.
+        missed: number of changes without a detection in their window.
+        false_positives: number of detections outside all windows.
+    """
+
+    score: float
+    missed: int
+    false_positives: int
+
+
+def score_change_points(
+    changes: Sequence[NDArray[np.float64]], detections: Sequence[NDArray[np.float64]], window: float
+) -> ChangePoints:
+    """Score detections of changes, over all files together.
+
+    The window of a change begins at the change; where two overlap, the second begins at the end of the first. The first
+    detection in a window counts the more the earlier it is.
+
+    Args:
+        changes: times of the changes of each file, in order.
+        detections: times of the detections of each file, in order.
+        window: length of a window, in the unit of the times.
+    """
+    total, missed, false, count = 0.0, 0, 0, 0
+    for true, found in zip(changes, detections, strict=True):
+        begins, ends = true.copy(), true + window
+        for i in range(1, len(true)):
+            begins[i] = max(begins[i], ends[i - 1])
+        inside = np.zeros(found.size, dtype=bool)
+        for begin, end in zip(begins, ends, strict=True):
+            within = (found >= begin) & (found <= end)
+            inside |= within
+            count += 1
+            if not within.any():
+                missed += 1
+                total += A_MISSED
+                continue
+            share = (found[within][0] - begin) / max(end - begin, 1e-300)
+            total += _value(float(share))
+        false += int(np.sum(~inside))
+    total += A_FALSE * false
+    perfect, none = count * A_TRUE, count * A_MISSED
+    return ChangePoints(100.0 * (total - none) / (perfect - none) if count else float("nan"), missed, false)
+
+
+def _value(share: float) -> float:
+    """Value of a detection at a share of its window: from that of one at once to that of a false one."""
+    x = np.pi * (share - 0.5)
+    half = 0.5 * (A_TRUE - A_FALSE)
+    return float(half + A_FALSE - half * np.tanh(x) / np.tanh(np.pi / 2))
+
+
+def bootstrap_interval(
+    values: NDArray[np.float64], rng: np.random.Generator, resamples: int = 2000
+) -> tuple[float, float]:
+    """95 % interval of a mean over files or blocks, by resampling them.
+
+    Args:
+        values: one value a file or block, shape (n,).
+        rng: generator of the resamples.
+        resamples: number of resamples.
+    """
+    means = values[rng.integers(0, values.size, (resamples, values.size))].mean(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def blocks_of(flags: Flags, length: int) -> NDArray[np.float64]:
+    """Shares of flagged rows in blocks of a length, shape (blocks,).
+
+    Rows that follow each other are not independent, so blocks are resampled, not rows.
+    """
+    count = max(flags.size // length, 1)
+    return np.array([float(part.mean()) for part in np.array_split(flags, count)])

@@ -1,0 +1,110 @@
+"""Tennessee Eastman: faults of a simulated chemical plant with 52 signals, a row every 3 minutes.
+
+Protocol: learn from d00 alone (500 sound rows), all columns; a fault sets in at row 160 of the 960 of its file.
+Detection is the share of the rows from 160 on that are in alarm; false alarms are that of d00_te and of all rows
+before 160.
+Data: camaramm/tennessee-eastman-profBraatz; Russell, Chiang and Braatz (2000).
+"""
+
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.outside.command import backtest
+from benchmarks.outside.peers import PEERS, Array, cross_validated_limits, smooth
+from benchmarks.outside.scores import Flags, blocks_of, bootstrap_interval
+from benchmarks.outside.table import Row
+
+ONSET = 160
+SIGNALS, MEASURED = 52, 41
+LEVEL = 0.99
+HARD = ("03", "09", "15")
+"""Faults that leave hardly a trace; means are without them."""
+_BLOCK = 40
+_WEIGHT = 0.3
+
+
+def rows_of(file: Path) -> Array:
+    """Values of a file, shape (rows, 52); d00 has a line for each signal."""
+    values = np.loadtxt(file)
+    return values.T if values.shape[0] == SIGNALS else values
+
+
+def measure(folder: Path, seed: int) -> list[Row]:
+    """Rows of the table, one for each method.
+
+    Args:
+        folder: folder with `d00.dat` and the files of the faults.
+        seed: seed of the resamples of the intervals.
+    """
+    train, sound = folder / "d00.dat", folder / "d00_te.dat"
+    faults = {re.sub(r"\D", "", path.stem): path for path in sorted(folder.glob("d[0-9][0-9]_te.dat")) if path != sound}
+    files = [sound, *faults.values()]
+    names = [sound.stem, *faults]
+    rows = [_score("reactorwatch", "backtest --train d00.dat, no settings", names, _monitor(train, files), seed)]
+    training = rows_of(train)
+    for name, peer in PEERS.items():
+        model = peer.fit(training)
+        textbook, validated = model.textbook_limits(LEVEL), cross_validated_limits(peer, training, LEVEL)
+        values = [model.statistics(rows_of(file)) for file in files]
+        for statistic in validated:
+            for kind, limits in (("textbook limit", textbook), ("blocked cross-validation", validated)):
+                if statistic in limits:
+                    out = [item[statistic] > limits[statistic] for item in values]
+                    rows.append(_score(f"{name} {statistic}", kind, names, out, seed))
+    rows.append(_score("CVA Tr2, EWMA", "blocked cross-validation", names, _smooth_variates(training, files), seed))
+    return rows
+
+
+def _monitor(train: Path, files: list[Path]) -> list[Flags]:
+    with tempfile.TemporaryDirectory() as temporary:
+        process = Path(temporary) / "tennessee.toml"
+        process.write_text(_description(), encoding="utf-8")
+        watched, _ = backtest(files, Path(temporary), "--process", str(process), "--train", str(train))
+    return [item.in_alarm for item in watched]
+
+
+def _description() -> str:
+    names = [f"XMEAS{n}" for n in range(1, MEASURED + 1)] + [f"XMV{n}" for n in range(1, SIGNALS - MEASURED + 1)]
+    signals = "".join(
+        f'[[signals]]\nname = "{name}"\ncolumn = {column}\nrole = "output"\n' for column, name in enumerate(names, 1)
+    )
+    return f'name = "tennessee"\n[time]\nperiod = "3 min"\n[file]\nheader = false\n{signals}'
+
+
+def _smooth_variates(training: Array, files: list[Path]) -> list[Flags]:
+    """EWMA of CVA's Tr2, its limit from blocks of the training judged by the others."""
+    peer = PEERS["CVA"]
+    held_out = cross_validated_limits(peer, training, LEVEL, transform=_ewma)["Tr2"]
+    model = peer.fit(training)
+    return [_ewma(model.statistics(rows_of(file))["Tr2"]) > held_out for file in files]
+
+
+def _ewma(values: Array) -> Array:
+    return smooth(values, _WEIGHT)
+
+
+def _score(method: str, limits: str, names: list[str], out: list[Flags], seed: int) -> Row:
+    rng = np.random.default_rng(seed)
+    sound, faulty = out[0], dict(zip(names[1:], out[1:], strict=True))
+    before = np.concatenate([sound, *(flags[:ONSET] for flags in faulty.values())])
+    shares = {name: float(flags[ONSET:].mean()) for name, flags in faulty.items()}
+    seen = [name for name in shares if name not in HARD]
+    blocks = np.array(
+        [np.mean(item) for item in zip(*(blocks_of(faulty[name][ONSET:], _BLOCK) for name in seen), strict=True)]
+    )
+    cells = {
+        "mean detection": f"{np.mean([shares[name] for name in seen]):.3f}",
+        "95 % interval": _interval(blocks, rng, lambda value: f"{value:.3f}"),
+        "rows in alarm while sound": f"{100 * before.mean():.2f} %",
+        **{f"fault {int(name)}": f"{share:.2f}" for name, share in shares.items()},
+    }
+    return Row(method, limits, cells)
+
+
+def _interval(values: Array, rng: np.random.Generator, show: Callable[[float], str]) -> str:
+    low, high = bootstrap_interval(values, rng)
+    return f"{show(low)} to {show(high)}"

@@ -1,0 +1,65 @@
+"""Conversion of samples to the units in which a process is judged. Pure."""
+
+from collections.abc import Mapping
+
+from reactorwatch.units import UnknownUnitError, conversion
+
+MOST_UNITS = 1000
+"""Pairs of a signal and a unit whose conversion is kept; publishers choose the texts."""
+
+
+SAME = (1.0, 0.0)
+"""Conversion of a unit to itself, or to another spelling of it."""
+
+
+class SampleUnits:
+    """Converts samples.
+
+    Args:
+        wanted: unit by signal; samples of another signal stay as they are.
+        declared: unit by signal of samples that name none, where it is not the wanted one.
+    """
+
+    def __init__(self, wanted: Mapping[str, str], declared: Mapping[str, str]) -> None:
+        self._wanted, self._declared = dict(wanted), dict(declared)
+        self._conversions: dict[tuple[str, str], tuple[float, float]] = {}
+
+    def convert(self, signal: str, unit: str, value: float) -> tuple[float, str]:
+        """Value and unit of a sample; one in an unknown unit stays as it is.
+
+        Args:
+            signal: name of the signal.
+            unit: unit that the sample names; empty: none.
+            value: value in that unit.
+
+        Raises:
+            InputError: the unit measures another quantity.
+        """
+        wanted = self._wanted.get(signal)
+        if wanted is None or unit == wanted:
+            return value, unit
+        known = self._conversions.get((signal, unit))
+        if known is None:
+            known = _find_conversion(signal, unit or self._declared.get(signal, wanted), wanted)
+            if len(self._conversions) < MOST_UNITS:
+                self._conversions[signal, unit] = known
+        scale, offset = known
+        return (value, unit) if known == SAME else (scale * value + offset, wanted)
+
+
+def _find_conversion(signal: str, unit: str, wanted: str) -> tuple[float, float]:
+    try:
+        return conversion(unit, wanted, f"sample of {signal}")
+    except UnknownUnitError:
+        return SAME
+
+
+def make_sample_units(declared: Mapping[str, str], model_units: Mapping[str, str] | None) -> SampleUnits | None:
+    """Conversion of a plant's samples; None: they are judged in the units that they come in.
+
+    Args:
+        declared: units of the signals as their process describes them.
+        model_units: units of the equations; None: there are none.
+    """
+    wanted = {**declared, **(model_units or {})}
+    return SampleUnits(wanted, declared) if wanted else None

@@ -1,0 +1,164 @@
+"""A monitor that is fed from Python."""
+
+from collections.abc import Iterator, Mapping
+from math import isfinite
+from typing import Any
+
+import msgspec
+
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor as MonitorCore
+from monitor_node.diagnosis_worker import find_deviations
+from monitor_node.watched_process import load_process, watch_process
+from reactorwatch.api.files import DEFAULT_PLANT
+from reactorwatch.api.records import ProcessLike
+from reactorwatch.api.rows import iterate_rows
+from reactorwatch.contract import keys
+from reactorwatch.contract.alarm_text import priority_word
+from reactorwatch.contract.codec import Publication, encode
+from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
+from reactorwatch.description.find import find_process
+from reactorwatch.errors import InputError
+from reactorwatch.records.record import to_minutes, to_time_ns
+from reactorwatch.runtime.config import section
+
+
+class Suspect(msgspec.Struct, frozen=True):
+    """A cause that an alarm may come from.
+
+    Attributes:
+        cause: name in the catalogue, or `unknown`.
+        probability: probability of the cause.
+        text: meaning of its size in words; empty: not known.
+    """
+
+    cause: str
+    probability: float
+    text: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.text or self.cause.replace('_', ' ')} ({100 * self.probability:.0f} %)"
+
+
+class AlarmChange(msgspec.Struct, frozen=True):
+    """A change of an alarm.
+
+    Attributes:
+        time_min: time of the row that caused it, in minutes.
+        alarm: name of the alarm, `chart/signal`.
+        event: `raised`, `cleared`, `suspects` and others, see `docs/alarms.md`.
+        priority: `low`, `medium`, `high` or `critical`.
+        text: a sentence for people.
+        suspect: likely causes, the likeliest first.
+    """
+
+    time_min: float
+    alarm: str
+    event: str
+    priority: str
+    text: str
+    suspect: list[Suspect]
+
+
+class Monitor:
+    """A monitor that is fed row by row, without a bus.
+
+    The first row after the training takes some tenths of a second, in which the training is diagnosed.
+
+    Args:
+        process: name, path of a file that describes it, description or model; None: as the settings say.
+        settings: settings of the monitor, as for `backtest`.
+
+    >>> monitor = Monitor(outputs=("T",), reference="arx", training_min=10.0)
+    >>> monitor.update(0.0, {"qc": 100.0, "T": 440.0})
+    []
+    >>> monitor.phase
+    'training'
+    """
+
+    def __init__(self, process: ProcessLike | None = None, **settings: Any) -> None:
+        config = monitor_settings(settings)
+        named = load_process(config) if process is None else watch_process(config, find_process(process, on_bus=True))
+        self._config, model = named
+        self._core = MonitorCore(self._config, 0, points=False, model=model, diagnose=find_deviations)
+        self._rows = 0
+
+    @property
+    def phase(self) -> str:
+        """`training` or `watching`."""
+        return self._core.phase
+
+    def update(
+        self, time_min: float, values: Mapping[str, float], units: Mapping[str, str] | None = None
+    ) -> list[AlarmChange]:
+        """Process one row.
+
+        Args:
+            time_min: time of the row, at least 0.
+            values: values by signal; a missing signal was not measured.
+            units: units of the signals, by name; None: not known.
+
+        Returns:
+            The changes of alarms that the row causes.
+        """
+        time_ns, changes = to_time_ns(time_min), []
+        for signal, value in values.items():
+            sample = Sample(
+                time_ns=time_ns,
+                sequence=self._rows,
+                value=value,
+                unit=(units or {}).get(signal, ""),
+                quality=Quality.QUALITY_GOOD,
+            )
+            message = encode(Publication(keys.key(self._config.plant, keys.SAMPLE, signal), sample))
+            published = (item.message for item in self._core.on_message(message, time_ns))
+            changes += [_change(item) for item in published if isinstance(item, Alarm)]
+        self._rows += 1
+        return changes
+
+    def feed(self, rows: Any, time: str = "time_min") -> Iterator[AlarmChange]:
+        """Process rows from anywhere, and yield the changes of alarms as they come.
+
+        Args:
+            rows: a record, a data frame (pandas or polars), or an iterable of mappings of names to values, such as a
+                `csv.DictReader` or a generator; an empty or missing value was not measured.
+            time: name of the time: minutes, or clock times (`datetime`), which are counted from the first row.
+
+        Raises:
+            InputError: a row has no time, or a cell is no number.
+        """
+        for minute, values in iterate_rows(rows, time):
+            yield from self.update(minute, {name: value for name, value in values.items() if isfinite(value)})
+
+    def to_bytes(self) -> bytes:
+        """The state; a monitor of the same settings that it is restored into goes on with bit-identical output."""
+        return msgspec.msgpack.encode((self._rows, self._core.to_bytes()))
+
+    def from_bytes(self, state: bytes) -> None:
+        """Restore the state of a monitor of the same settings.
+
+        Raises:
+            InputError: the bytes are no such state.
+        """
+        try:
+            rows, core = msgspec.msgpack.decode(state, type=tuple[int, bytes])
+        except msgspec.DecodeError as error:
+            raise InputError(f"the state of a monitor cannot be read: {error}") from error
+        self._core.from_bytes(core)
+        self._rows = rows
+
+
+def _change(alarm: Alarm) -> AlarmChange:
+    suspects = [Suspect(item.cause, item.probability, item.text) for item in alarm.suspects]
+    return AlarmChange(
+        to_minutes(alarm.time_ns), alarm.alarm, alarm.event, priority_word(alarm.priority), alarm.text, suspects
+    )
+
+
+def monitor_settings(settings: Mapping[str, Any]) -> MonitorConfig:
+    """The monitor's settings.
+
+    Raises:
+        InputError: an unknown name or a value outside its range.
+    """
+    return section(MonitorConfig, "monitor", {}, {"plant": DEFAULT_PLANT} | dict(settings))

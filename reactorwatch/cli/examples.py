@@ -1,0 +1,48 @@
+"""`example`: sample records with their truth."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from reactorwatch.cli.options import Force, check_output
+from reactorwatch.cli.printing import print_lines
+from reactorwatch.records.output import check_output_file
+
+
+def register_commands(app: typer.Typer) -> None:
+    """Register the command."""
+    app.command("example")(example)
+
+
+def example(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="sound, leak, fouling, analyser_drift, two_causes or unknown (a law in no catalogue).",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="The file to write; the truth is written beside it.", show_default=False),
+    ],
+    seed: Annotated[int, typer.Option(help="Of the input and the noise.", min=0, max=2**63 - 1)] = 3,
+    force: Force = False,
+) -> None:
+    """Write a simulated sample record (.csv, .csv.gz, .xlsx or .parquet), its truth in FILE.truth.json."""
+    import msgspec
+
+    from plant_node.examples import EXAMPLES, make_example
+    from reactorwatch.cli.progress import task
+    from reactorwatch.records.atomic import atomic_write
+    from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
+
+    out = check_output(out, WRITTEN_SUFFIXES, (), force=force)
+    beside = check_output_file(out.with_name(f"{out.name}.truth.json"), force=force)
+    with task(f"simulating {name}"):
+        record, truth = make_example(name, seed)
+    write_table(out, record)
+    with atomic_write(beside) as temporary:
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(truth)) + b"\n")
+    print_lines(f"wrote {out}: {record.rows} rows; {EXAMPLES[name].meaning}", f"wrote {beside}")

@@ -1,0 +1,182 @@
+"""Settings of the source of a run's samples: a simulated plant, or a played record."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from plant_node.config import PlantConfig
+from plant_node.process_settings import fit_settings
+from plant_node.record import load_process
+from reactorwatch.cli.options import check_recording
+from reactorwatch.description.catalogue import Catalogue
+from reactorwatch.description.find import DEFAULT_PROCESS, find_process
+from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import GUESS, FileFormat
+from reactorwatch.records.source_text import is_table
+from reactorwatch.runtime.config import section
+from recorder.config import ReplayConfig
+from recorder.tools.convert import plant_name
+from recorder.tools.mcap_file import one_plant_in, recorded_process
+
+Tables = dict[str, dict[str, Any]]
+
+WAIT_FOR = ("monitor", "recorder")
+"""Nodes that must be alive before the first sample."""
+
+
+@dataclass(frozen=True)
+class PlayedRecord:
+    """A record that is played in place of a simulated plant.
+
+    Attributes:
+        path: a recording or a table.
+        stated: statements about the form of a table.
+    """
+
+    path: Path
+    stated: FileFormat = GUESS
+
+
+@dataclass(frozen=True)
+class Source:
+    """Source of a run's samples.
+
+    Attributes:
+        node: `plant` or `replay`.
+        settings: settings of the node.
+        plant: name of the plant.
+        process: name or file of the process.
+        is_named: True if flags or a recording name the process, False if it is that of the plant's settings.
+    """
+
+    node: str
+    settings: PlantConfig | ReplayConfig
+    plant: str
+    process: str
+    is_named: bool
+
+    @property
+    def about(self) -> dict[str, str]:
+        """Metadata of the recording."""
+        settings = self.settings
+        return {"seed": str(settings.seed)} if isinstance(settings, PlantConfig) else {"source": settings.file}
+
+    def monitor_flags(self, tables: Tables) -> dict[str, Any]:
+        """Settings of the monitor that follow from the source, as flags.
+
+        The monitor of a plant whose settings name an extended model judges by the equations that its own settings name,
+        so that the deviations of the plant are found.
+
+        Args:
+            tables: tables of the settings file.
+        """
+        flags: dict[str, Any] = {"plant": self.plant}
+        stated = tables.get("monitor", {}).keys() & {"process", "model", "input", "inputs", "outputs"}
+        is_catalogued = self.process != DEFAULT_PROCESS and not self.process.lower().endswith(".json")
+        if self.is_named or (is_catalogued and not stated):
+            flags["process"] = self.process
+        return flags
+
+
+def load_source(tables: Tables, flags: dict[str, Any], played: PlayedRecord | None) -> Source:
+    """Settings of the source of a run's samples.
+
+    Args:
+        tables: tables of the settings file.
+        flags: flags of the plant by key; None: not given.
+        played: a record that is played; None: a plant is simulated.
+
+    Raises:
+        InputError: invalid settings.
+    """
+    if played is None:
+        waiting = {"plant": {"wait_for": list(WAIT_FOR), **tables.get("plant", {})}}
+        plant = complete_plant_settings(load_plant_settings(waiting, flags))
+        return Source(
+            "plant", plant, plant.name, plant.process or DEFAULT_PROCESS, is_named=flags.get("process") is not None
+        )
+    given = flags.get("process") or tables.get("replay", {}).get("process")
+    process, name = process_of_run(given, played, flags.get("name"))
+    replay = load_replay_settings(tables, played, {**flags, "name": name, "process": process})
+    return Source("replay", replay, name, process, is_named=process != DEFAULT_PROCESS)
+
+
+def load_plant_settings(tables: Tables, flags: dict[str, Any]) -> PlantConfig:
+    """Settings of a plant; one whose process the flags name is named after it.
+
+    Args:
+        tables: tables of the settings file.
+        flags: flags by key; None: not given.
+
+    Raises:
+        InputError: invalid settings, or there is no such process.
+    """
+    process = flags.get("process")
+    if process is not None and not (flags.get("name") or "name" in tables.get("plant", {})):
+        flags = {**flags, "name": plant_name(None, find_process(process))}
+    return section(PlantConfig, "plant", tables, flags)
+
+
+def complete_plant_settings(config: PlantConfig) -> PlantConfig:
+    """Settings in which what the process decides is written out.
+
+    Raises:
+        InputError: the process has no equations, or settings do not fit it.
+    """
+    changed, process = load_process(config)
+    return fit_settings(changed, process).complete(config)
+
+
+def load_replay_settings(tables: Tables, played: PlayedRecord, flags: dict[str, Any]) -> ReplayConfig:
+    """Settings of a replay in place of a plant.
+
+    Args:
+        tables: tables of the settings file.
+        played: the record.
+        flags: flags of the plant by key; None: not given.
+
+    Raises:
+        InputError: invalid settings, there is no such record, or flags for a simulation.
+    """
+    for name, option in (("seed", "--seed"), ("faults", "--fault")):
+        if flags.get(name) is not None:
+            raise InputError(f"--record {played.path}: a record is played, not simulated; leave {option} out")
+    check_recording(played.path)
+    stated = {name: value for name, value in asdict(played.stated).items() if value not in (None, ())}
+    given = {
+        "file": str(played.path),
+        "plant": flags.get("name"),
+        "rate": flags.get("speed"),
+        "process": flags.get("process"),
+        "table": stated or None,
+    }
+    waiting = {"wait_for": list(WAIT_FOR), **tables.get("replay", {})}
+    return section(ReplayConfig, "replay", {"replay": waiting}, given)
+
+
+def process_of_run(process: str | None, played: PlayedRecord | None, plant: str | None) -> tuple[str, str]:
+    """Process of a run, and the name of its plant.
+
+    Args:
+        process: name or file of the process; None: the one that a played recording describes, else the default.
+        played: the played record; None: a plant is simulated.
+        plant: given name of the plant; None: that in a recording, else that of the process.
+
+    Returns:
+        The name or file of the process, and the name of the plant.
+
+    Raises:
+        InputError: there is no such process, or the recording holds several plants and none was named.
+    """
+    if played is not None and not is_table(played.path):
+        plant = plant or one_plant_in(played.path)
+        described = recorded_process(played.path, plant)
+        if process is None and described is not None:
+            process = described.name
+            if process not in Catalogue():
+                raise InputError(
+                    f"--record {played.path}: is of process {process!r}, which is in no catalogue here; name its file "
+                    "by --process"
+                )
+    process = process or DEFAULT_PROCESS
+    return process, plant_name(plant, find_process(process))

@@ -1,0 +1,1 @@
+"""Models of a plant whose equations are unknown, which predict its rows with honest variances."""

@@ -1,0 +1,80 @@
+"""Operation of a process in a simulation: levels of its inputs, noise of its sensors, and named runs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from reactorwatch.process.model import Variable
+
+
+@dataclass(frozen=True)
+class InputLevels:
+    """Levels of an input, from which the programmes of a simulated plant take their defaults, in the input's unit.
+
+    Attributes:
+        level: level of a constant input, and mean of sinusoids.
+        low: lowest level of random steps.
+        high: highest level of random steps.
+        swing: deviation of a square wave from `level`; the amplitudes of sinusoids are below it.
+        hold_min: length of a hold of random steps; the periods of other programmes are multiples of it.
+    """
+
+    level: float
+    low: float
+    high: float
+    swing: float
+    hold_min: float = 1.0
+
+    @classmethod
+    def of(cls, item: Variable, bounds: tuple[float, float]) -> "InputLevels":
+        """Levels of an input of which no more is known: a scale about the middle of its bounds."""
+        low, high = bounds
+        level, swing = 0.5 * (low + high), min(item.scale, 0.25 * (high - low))
+        return cls(level, level - swing, level + swing, swing)
+
+    def defaults(self, kind: str) -> dict[str, Any]:
+        """Default settings of a kind of programme (see `plant_node.scenario`); empty for a kind without levels."""
+        middle = {"low": self.level - self.swing, "high": self.level + self.swing}
+        by_kind: dict[str, dict[str, Any]] = {
+            "random-steps": {"low": self.low, "high": self.high, "hold_min": self.hold_min},
+            "sines": {
+                "mean": self.level,
+                "amplitudes": tuple(share * self.swing / 5 for share in (4, 3, 2)),
+                "periods_min": tuple(period * self.hold_min for period in (3.1, 7.3, 19.7)),
+            },
+            "square": {**middle, "period_min": 20 * self.hold_min},
+            "constant": {"level": self.level},
+        }
+        return by_kind.get(kind, {})
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A named set of settings of the plant.
+
+    Attributes:
+        name: name, as in `--preset NAME`.
+        meaning: a one-line description.
+        settings: settings of `plant_node.config.PlantConfig` by name, as in a settings file.
+    """
+
+    name: str
+    meaning: str
+    settings: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Operation:
+    """Operation of a process in a simulation.
+
+    Attributes:
+        inputs: levels of the inputs by name; those of other inputs follow from their bounds and scales.
+        noise_sd: standard deviation of the sensors' noise by signal, in the unit of the equations; others have none.
+        fault: fault of a demonstration, as `cause:profile:size`; empty: a step of the first effect.
+        presets: named runs.
+    """
+
+    inputs: Mapping[str, InputLevels] = field(default_factory=dict)
+    noise_sd: Mapping[str, float] = field(default_factory=dict)
+    fault: str = ""
+    presets: tuple[Preset, ...] = ()
