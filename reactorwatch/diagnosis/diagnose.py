@@ -110,7 +110,8 @@ def diagnose(
     unknowns = UnknownSearch(model, effects, run, result)
     single = result.best
     if not (np.any(minus_log10_p(single.fit.w, run.inputs) >= DOUBTFUL) and unknowns.is_simple):
-        result = _drop_hidden(search_pairs(search, result), hidden)
+        result = search_pairs(search, result)
+    result = _drop_hidden(result, hidden)
     best = result.best if result.nominal.bic - result.best.bic >= LEAST_GAIN else result.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
     verdict = _decide_verdict(result, best)
