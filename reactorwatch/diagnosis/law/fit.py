@@ -164,6 +164,6 @@ def select_terms(information: Array, by: Array, charge: float) -> list[int]:
 def _solve(information: Array, by: Array, chosen: Sequence[int]) -> tuple[Array, float]:
     """Coefficients of some functions, and by how much they lower twice the loss."""
     inner, right = information[np.ix_(chosen, chosen)], by[list(chosen)]
-    scale = np.sqrt(np.diag(inner))
+    scale = np.sqrt(np.maximum(np.diag(inner), 1e-300))
     scaled = np.linalg.solve(inner / np.outer(scale, scale) + _RIDGE * np.eye(scale.size), right / scale)
     return scaled / scale, float(right @ (scaled / scale))
