@@ -175,7 +175,9 @@ def _likely_noise(model: ProcessModel, run: Run, best: PlaceFit, free: Noise, wi
         return Noise(tuple((np.array(free.measurement_sd) * rms).tolist()), free.process_sd, free.colored)
     best.fitter.ekf.noise = wide
     smallest = [SMALLEST_SHARE * item for item in wide.measurement_sd]
-    return best.fitter.ekf.estimate_noise(run, best.fitter.signals(best.fit.coefficients), smallest)
+    found = best.fitter.ekf.estimate_noise(run, best.fitter.signals(best.fit.coefficients), smallest)
+    # The states that a correction adds, such as that of a lag, are its own; other corrections do not have them.
+    return Noise(found.measurement_sd, found.process_sd[: len(model.states)], found.colored)
 
 
 def _start(model: ProcessModel, place: Place, scales: Mapping[str, Scale], run: Run, wide: Noise) -> PlaceFit:
