@@ -163,15 +163,17 @@ def report(
         as_json: format as a JSON object.
     """
     rmse = root_mean_squares(measured, simulated, model)
+    remarks = [sentence for law in model.laws for sentence in law.outside(simulated.columns)]
     if as_json:
         result = {
             "file": None if out is None else str(out),
             "rows": measured.rows,
             "runs": len(measured.run_starts),
             "rmse": {name: item._asdict() for name, item in rmse.items()},
+            **({"remarks": remarks} if model.laws else {}),
         }
         return msgspec.json.encode(result).decode()
     parts = ", ".join(f"{name} {item.value:.3g} {item.unit}" for name, item in rmse.items())
     written = "not written" if out is None else f"wrote {out}"
     line = f"{written}: {measured.rows} rows; root mean square difference from the record: {parts}"
-    return "\n".join([line, *(f"note: {remark}" for remark in measured.remarks)])
+    return "\n".join([line, *(f"note: {remark}" for remark in [*measured.remarks, *remarks])])

@@ -5,7 +5,8 @@
 - `fitting`: `profiles` of a deviation in time, the `augmented_model` and its `filter`, linearised `signatures`,
   and `hypothesis`: effects with profiles, fitted to a run.
 - `search`: `screen` finds hypotheses worth fitting; `search` the best of them and its alternatives.
-- `unknown_input`: `localise` finds where something acts that no effect explains.
+- `law`: smooth corrections in each place of the process locate an unknown, and formulas give its law.
+- `unknown_input`: `localise` does so for a disturbance that wanders in time.
 - `experiment`: an input that separates alternatives.
 - `whiteness`, `holdout`: test of the innovations, and gain on rows that were not fitted.
 - `result`: the result; `report`: the result as text, JSON and a page.

@@ -8,13 +8,21 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.curves import curves_of, differences_of
-from reactorwatch.diagnosis.estimates import adjusted_parameters, causes_of, convert_to_run_minutes, refine_parameters
+from reactorwatch.diagnosis.estimates import (
+    adjusted_parameters,
+    causes_of,
+    convert_to_run_minutes,
+    covariances_of,
+    refine_parameters,
+)
 from reactorwatch.diagnosis.experiment.constraints import check_limits
 from reactorwatch.diagnosis.experiment.design import propose_experiment
 from reactorwatch.diagnosis.extended import extended_model
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.holdout import Errors, evaluate_holdout
 from reactorwatch.diagnosis.integration_error import looks_like_integration
+from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
+from reactorwatch.diagnosis.law.localise import NOISY_SHARE, Localised, UnknownSearch
 from reactorwatch.diagnosis.parameter_priors import add_priors
 from reactorwatch.diagnosis.practical_significance import exceeds_tolerance, residual_exceeds_tolerance, tolerances_of
 from reactorwatch.diagnosis.record_checks import make_run
@@ -31,16 +39,17 @@ from reactorwatch.diagnosis.result import (
     HeldOut,
 )
 from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.cause_prior import FROM_BEGINNING
 from reactorwatch.diagnosis.search.noise_masking import search_single_cause
 from reactorwatch.diagnosis.search.pairs import search_pairs
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult, smallest_noise
 from reactorwatch.diagnosis.sensor_noise import estimate_sensor_noise
-from reactorwatch.diagnosis.unknown_input.localise import MARGIN, UnknownInput, bic_on, locate
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, minus_log10_p
 from reactorwatch.process import effects_of
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.effect_twins import hidden_sources
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import FREE_NAME
 from reactorwatch.records.record import MAX_SPANS, Record
 
 LEAST_GAIN = 10.0
@@ -52,9 +61,6 @@ SURE = 6.0
 MUCH_RESIDUAL, MUCH_RESIDUAL_OF_TWO = 30.0, 10.0
 """Minus the decimal logarithm of the p-value of whiteness: no right cause leaves so much, nor do two causes, which can
 imitate a third."""
-
-NOISY_SHARE = 0.003
-"""Fraction of a state's scale per square root of a minute: with more process noise the cause may not be complete."""
 
 NEARLY = 1.15
 """Ratio to the noise: a simulation with a smaller error explains what matters, even if its residual is not white."""
@@ -101,7 +107,11 @@ def diagnose(
     result = search_single_cause(search)
     if search.adopt_colored_noise(result.best):
         result = search_single_cause(search)
-    result = _drop_hidden(search_pairs(search, result), hidden)
+    unknowns = UnknownSearch(model, effects, run, result)
+    single = result.best
+    if not (np.any(minus_log10_p(single.fit.w, run.inputs) >= DOUBTFUL) and unknowns.is_simple):
+        result = search_pairs(search, result)
+    result = _drop_hidden(result, hidden)
     best = result.best if result.nominal.bic - result.best.bic >= LEAST_GAIN else result.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
     verdict = _decide_verdict(result, best)
@@ -109,25 +119,32 @@ def diagnose(
     if verdict == UNKNOWN:
         best = result.nominal
     remarks = [*_describe_record(record), *_describe_outliers(whole, run)]
-    unknown_input: UnknownInput | None = None
-    if verdict == UNKNOWN or np.any(adequacy >= DOUBTFUL) or (best.label and _seems_noisy(result, model)):
-        offsets = result.nominal.hypothesis.offsets(result.nominal.fit)
-        corrected = model.with_values({name: model.parameter(name).value + value for name, value in offsets.items()})
-        unknown_input = locate(corrected, effects, run, result.nominal.fit, result.nominal_noise)
-        by_source = verdict == UNKNOWN and not np.any(adequacy >= DOUBTFUL)
-        if verdict == UNKNOWN or _is_unknown(unknown_input, result, best, run, float(np.max(adequacy))):
-            verdict, best = UNKNOWN, result.nominal  # the model is not extended without a cause
-            if unknown_input is not None and not by_source:
-                location = unknown_input.effect.location
-        elif np.any(adequacy >= WHITE):
+    unknown: Localised | None = None
+    by_source = verdict == UNKNOWN and not np.any(adequacy >= DOUBTFUL)
+    if verdict == UNKNOWN or np.any(adequacy >= DOUBTFUL) or (best.label and _may_be_unknown(result, best, model)):
+        unknown = unknowns.localise()
+        if verdict == UNKNOWN or _is_unknown(unknown, result, best, run, float(np.max(adequacy))):
+            verdict, best = UNKNOWN, result.nominal
+            location = location if by_source else unknown.location
+        elif unknown.gain_over(best, run) > -SURE and len(best.label) > 1:
+            verdict = AMBIGUOUS
+            remarks.append(f"one unknown deviation in {unknown.location} explains the record as well")
+        else:
+            unknown = None
+        if unknown is None and np.any(adequacy >= WHITE):
             remarks.append(
                 "the residual is small, but not white: the course in time may be rougher than the fitted profile"
             )
     best.hypothesis.filter.noise, result.nominal.hypothesis.filter.noise = result.noise, result.nominal_noise
-    best, covariances = refine_parameters(search, best)
+    law = unknown.law if unknown is not None and verdict == UNKNOWN and unknown.location == location else None
+    if law is None:
+        best, covariances = refine_parameters(search, best)
+    else:
+        best = law_hypothesis(law, run)
+        covariances, adequacy = covariances_of(run, best), minus_log10_p(best.fit.w, run.inputs)
     before, after = evaluate_holdout(run, result.nominal, best)
     curves = curves_of(whole, run, model, result.nominal, best, covariances)
-    noise_sd = _noise_sd(result, run, model, curves, verdict)
+    noise_sd = _noise_sd(result, run, model, curves, verdict) if law is None else law.noise_sd(model)
     unexplained = verdict == UNKNOWN and residual_exceeds_tolerance(before, noise_sd, model, bands)
     if verdict == UNKNOWN and not unexplained and looks_like_integration(plant, run, result.nominal.fit.innovations):
         location = TIMING
@@ -136,19 +153,23 @@ def diagnose(
             "by a coarser integrator, or its input be stamped late"
         )
     curves = replace(curves, held_out=dict(zip(model.output_names, after.values.T, strict=True)))
-    if verdict == UNKNOWN and unknown_input is not None and unknown_input.effect.location == location:
-        curves = replace(curves, unknown=unknown_input.curve)
+    if unknown is not None and unknown.curve is not None and unknown.location == location:
+        curves = replace(curves, unknown=unknown.curve.curve)
     blind = ~np.all(np.isfinite(result.nominal.fit.innovations.prediction), axis=1)
-    causes = convert_to_run_minutes(causes_of(best, covariances), record)
+    causes = convert_to_run_minutes(causes_of(best, covariances), record) if law is None else ()
     parameters = adjusted_parameters(run, model, uncertain or {}, best)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
     alternatives = _alternatives(result, best)
     experiment = (
-        propose_experiment([best, *alternatives], run, model, result.noise, limits or {}) if alternatives else None
+        propose_experiment([best, *alternatives], run, model, result.noise, limits or {})
+        if alternatives and law is None
+        else None
     )
     if isinstance(experiment, str):
         remarks.append(experiment)
         experiment = None
+    gain = _gain(model, result.nominal.bic - best.bic, noise_sd, before, after)
+    described = None if law is None or unknown is None else describe_law(adjusted, run, unknown.found, gain.held_out)
     return Diagnosis(
         samples=run.time_min.size,
         span_min=record.span_min,
@@ -159,35 +180,51 @@ def diagnose(
         significant=verdict != NOMINAL,
         practical=unexplained or exceeds_tolerance(curves, bands, blind),
         differences=differences_of(model, noise_sd, curves),
-        gain=_gain(model, result.nominal.bic - best.bic, noise_sd, before, after),
+        gain=gain,
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
         experiment=experiment,
-        extended_model=extended_model(adjusted, effects, causes, record.zero_ns),
+        extended_model=extended_model(adjusted, effects, causes, record.zero_ns, None if law is None else law.law),
         remarks=tuple(remarks),
         parameters=parameters,
         curves=curves,
         runs=len(record.run_starts),
+        locations=_locations(best, alternatives) if unknown is None else unknown.locations,
+        law=described,
     )
 
 
-def _is_unknown(
-    unknown_input: UnknownInput | None, result: SearchResult, best: FittedHypothesis, run: Run, log_p: float
-) -> bool:
-    """Return true if the catalogue does not explain the run but an unknown input would.
+def _is_unknown(unknown: Localised, result: SearchResult, best: FittedHypothesis, run: Run, log_p: float) -> bool:
+    """Return true if the catalogue does not explain the run but an unknown would.
 
     Args:
-        unknown_input: the localised unknown input.
+        unknown: the localised unknown.
         result: result of the search.
         best: best hypothesis of the catalogue.
         run: the record.
         log_p: minus the decimal logarithm of the p-value that its innovations are white.
     """
-    better = unknown_input is not None and unknown_input.bic < bic_on(best, unknown_input.used) - MARGIN
+    better = unknown.is_better(best, run)
     if log_p < WHITE:
         return better and bool(best.label)
     if not best.label or log_p >= (MUCH_RESIDUAL if len(best.label) == 1 else MUCH_RESIDUAL_OF_TWO):
         return True
     return better or not _is_nearly_explained(result, evaluate_holdout(run, result.nominal, best)[1])
+
+
+def _may_be_unknown(result: SearchResult, best: FittedHypothesis, model: ProcessModel) -> bool:
+    """Return true if one unknown could explain what the best hypothesis explains with noise, a curve or two causes."""
+    profiles = [profile.name for profile in best.hypothesis.profiles]
+    from_beginning = all(name in FROM_BEGINNING for name in profiles)
+    return _seems_noisy(result, model) or (from_beginning and (len(profiles) > 1 or FREE_NAME in profiles))
+
+
+def _locations(best: FittedHypothesis, alternatives: Sequence[FittedHypothesis]) -> dict[str, float]:
+    """BIC of each location of the explanations over that of the best."""
+    result: dict[str, float] = {}
+    for item in (best, *alternatives):
+        for effect in item.hypothesis.filter.effects:
+            result.setdefault(effect.location, item.bic - best.bic)
+    return result
 
 
 def _seems_noisy(result: SearchResult, model: ProcessModel) -> bool:

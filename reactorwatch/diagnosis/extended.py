@@ -8,6 +8,7 @@ from reactorwatch.diagnosis.result import Cause
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import extended_model_of
 from reactorwatch.process.fault import FaultSpecification
+from reactorwatch.process.law import ExtendedLaw
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES, free_profile
 
@@ -16,7 +17,11 @@ WITHIN = 1.0 - 1e-12
 
 
 def extended_model(
-    model: ProcessModel, effects: Sequence[Effect], causes: Sequence[Cause], zero_ns: int = 0
+    model: ProcessModel,
+    effects: Sequence[Effect],
+    causes: Sequence[Cause],
+    zero_ns: int = 0,
+    law: ExtendedLaw | None = None,
 ) -> dict[str, Any]:
     """Extended model with the causes, as in its file (`reactorwatch.process.extended_model`).
 
@@ -25,11 +30,13 @@ def extended_model(
         effects: the catalogue.
         causes: diagnosed causes.
         zero_ns: time from which the record's minutes count; 0: not known.
+        law: law of an unknown; None: none.
     """
     named = {effect.name: effect for effect in effects}
     before = extended_model_of(model, effects, zero_ns=zero_ns)
     result = [_specification(named[cause.cause], cause) for cause in causes]
-    return replace(before, effects=(*before.effects, *result)).to_object()
+    laws = before.laws if law is None else (*before.laws, law)
+    return replace(before, effects=(*before.effects, *result), laws=laws).to_object()
 
 
 def _specification(effect: Effect, cause: Cause) -> FaultSpecification:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.difference import Difference
+from reactorwatch.process.law import ExtendedLaw
 
 NOMINAL, NAMED, AMBIGUOUS, UNKNOWN = "nominal", "named", "ambiguous", "unknown"
 
@@ -199,6 +200,73 @@ class UnknownInputCurve:
 
 
 @dataclass(frozen=True, eq=False)
+class LawCurve:
+    """A missing term over one variable, averaged over the record's rows with nearly the same value of it.
+
+    Attributes:
+        variable: name of the variable.
+        unit: unit of the variable.
+        values: values of the variable, shape (n,).
+        smooth: smooth correction, shape (n,).
+        smooth_sd: standard deviation of the smooth correction, shape (n,).
+        formula: formula, shape (n,).
+    """
+
+    variable: str
+    unit: str
+    values: Array
+    smooth: Array
+    smooth_sd: Array
+    formula: Array
+
+
+@dataclass(frozen=True)
+class RivalLaw:
+    """A formula that the record cannot tell from the law, worse by `delta_bic`."""
+
+    location: str
+    form: str
+    formula: str
+    delta_bic: float
+
+
+@dataclass(frozen=True)
+class Law:
+    """Law of an unknown: the missing term as a formula.
+
+    Attributes:
+        location: location in which it acts.
+        form: family of the formula.
+        formula: formula with the names of variables and parameters.
+        term: what the formula is added to, in words.
+        unit: unit of the formula's value.
+        variables: names of its variables.
+        parameters: parameters by name.
+        rivals: formulas within `LISTED` BIC, the best first.
+        range: smallest and largest value of each variable with which it was seen.
+        held_out: errors on held-out rows, by output.
+        correlations: for each parameter, the model's parameter with which its estimate would be correlated most if
+            that were uncertain, and the correlation.
+        extended: law for the extended model.
+        curves: curves for figures, one for each variable.
+    """
+
+    location: str
+    form: str
+    formula: str
+    term: str
+    unit: str
+    variables: tuple[str, ...]
+    parameters: dict[str, Estimate]
+    rivals: tuple[RivalLaw, ...]
+    range: dict[str, tuple[float, float]]
+    held_out: dict[str, HeldOut]
+    correlations: dict[str, tuple[str, float]]
+    extended: ExtendedLaw = field(repr=False)
+    curves: tuple[LawCurve, ...] = field(default=(), repr=False, compare=False)
+
+
+@dataclass(frozen=True, eq=False)
 class Curves:
     """Curves for the figures of a diagnosis, all over the rows of the record.
 
@@ -251,6 +319,8 @@ class Diagnosis:
         parameters: uncertain parameters, by name.
         curves: curves for figures; with several runs, over `Record.continuous_min`.
         runs: number of runs in the record.
+        locations: BIC of each location within `LISTED` over that of the best; empty where causes explain the record.
+        law: law of an unknown; None without one.
     """
 
     samples: int
@@ -270,3 +340,10 @@ class Diagnosis:
     parameters: dict[str, AdjustedParameter] = field(default_factory=dict)
     curves: Curves | None = field(default=None, repr=False, compare=False)
     runs: int = 1
+    locations: dict[str, float] = field(default_factory=dict)
+    law: Law | None = None
+
+    @property
+    def is_extended(self) -> bool:
+        """True if causes or a law extend the model."""
+        return bool(self.causes) or self.law is not None

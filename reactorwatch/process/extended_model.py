@@ -10,8 +10,9 @@
 
 An effect is stored as the text that injects it into the plant as a fault (`fault`), to full precision, so a model that
 is read equals the one that was written. `parameters` are those of the model that differ from its nominal values, in its
-units. Times are minutes of the record in which the deviations were found, counted from `zero_ns`, nanoseconds since
-1970-01-01 UTC; 0 where that is unknown, as for a .csv.
+units. Laws of what was unknown (`law`) are items of a list `laws`, which is left out where it is empty. Times are
+minutes of the record in which the deviations were found, counted from `zero_ns`, nanoseconds since 1970-01-01 UTC; 0
+where that is unknown, as for a .csv.
 """
 
 import re
@@ -25,6 +26,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS, named_effects
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
+from reactorwatch.process.law import ExtendedLaw
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, free_profile
 
@@ -32,6 +34,21 @@ FORMAT = "reactorwatch.model.v1"
 
 _MINUTE_NS = 60_000_000_000
 _SIZE = re.compile(r"(.+?)(?:_\d+)?\.size")
+
+
+class _LawFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A law, see `process.law`."""
+
+    place: str
+    form: str
+    variables: tuple[str, ...]
+    references: tuple[float, ...]
+    parameters: dict[str, float]
+    range: dict[str, tuple[float, float]]
+
+    def law(self) -> ExtendedLaw:
+        """Convert to a law."""
+        return ExtendedLaw(self.place, self.form, self.variables, self.references, self.parameters, self.range)
 
 
 class _ModelFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -42,6 +59,7 @@ class _ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     effects: tuple[str, ...] = ()
     parameters: dict[str, float] = {}  # msgspec copies the default
     zero_ns: int = 0
+    laws: tuple[_LawFile, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -53,12 +71,14 @@ class ExtendedModel:
         effects: effects of the model in the order in which they were added; times in minutes of the record.
         parameters: values that differ from the model's nominal ones, by name, in their units.
         zero_ns: time from which the minutes are counted; 0: unknown.
+        laws: laws of what was unknown, which act all the time.
     """
 
     name: str
     effects: tuple[FaultSpecification, ...] = ()
     parameters: Mapping[str, float] = field(default_factory=dict)
     zero_ns: int = 0
+    laws: tuple[ExtendedLaw, ...] = ()
 
     def build(self, models: Sequence[Callable[[], ProcessModel]] = MODELS) -> ProcessModel:
         """Build the model; its clock is that of the record.
@@ -74,6 +94,8 @@ class ExtendedModel:
             raise InputError(f"unknown model {self.name!r} (valid: {', '.join(nominal)})")
         try:
             model = nominal[self.name].with_values(self.parameters)
+            for law in self.laws:
+                model = law.extend(model)
             # A timing effect shifts the times of all others, and so comes last.
             for item in sorted(self.effects, key=lambda item: item.effect.location == TIMING):
                 model = item.extend(model)
@@ -96,7 +118,19 @@ class ExtendedModel:
             "parameters": dict(self.parameters),
             "effects": [str(item) for item in self.effects],
             "zero_ns": self.zero_ns,
+            **({"laws": [_law_object(item) for item in self.laws]} if self.laws else {}),
         }
+
+
+def _law_object(law: ExtendedLaw) -> dict[str, Any]:
+    return {
+        "place": law.place,
+        "form": law.form,
+        "variables": list(law.variables),
+        "references": list(law.references),
+        "parameters": dict(law.parameters),
+        "range": {name: list(ends) for name, ends in law.range.items()},
+    }
 
 
 def parse_extended_model(
@@ -129,6 +163,7 @@ def parse_extended_model(
         tuple(parse_fault(item, effects).with_defaults() for item in file.effects),
         file.parameters,
         file.zero_ns,
+        tuple(item.law() for item in file.laws),
     )
     extended.build(models)  # reports invalid combinations now
     return extended
@@ -162,7 +197,7 @@ def extended_model_of(
         for item in (nominal.parameters if nominal else ())
         if values[item.name] != item.value
     }
-    return ExtendedModel(model.name, tuple(found), differing, zero_ns)
+    return ExtendedModel(model.name, tuple(found), differing, zero_ns, model.laws)
 
 
 def _specification(effect: Effect, values: Mapping[str, float], prefix: str) -> FaultSpecification:

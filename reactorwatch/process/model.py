@@ -16,11 +16,16 @@ may have changed, such as a valve that sticks (`resets`).
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
+from reactorwatch.process.places import Place
+
+if TYPE_CHECKING:
+    from reactorwatch.process.law import ExtendedLaw
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +131,8 @@ class ProcessModel:
         resets: new value of a state when a row begins, from the states before and the new inputs, by name of the state.
         time_offset: minutes by which the clock is ahead of the states; while it grows, the states' time step is
             shorter.
+        places: where something unknown may act; empty: they follow from the equations (`process.places`).
+        laws: laws of what was unknown, which are part of the equations already.
     """
 
     name: str
@@ -140,6 +147,8 @@ class ProcessModel:
     at_rest: Mapping[str, ca.SX] = field(default_factory=dict)
     resets: Mapping[str, ca.SX] = field(default_factory=dict)
     time_offset: ca.SX = field(default_factory=lambda: ca.SX(0))
+    places: tuple[Place, ...] = ()
+    laws: tuple["ExtendedLaw", ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.rhs) != len(self.states):

@@ -1,10 +1,11 @@
 """A diagnosis as an object for JSON; numbers that are not finite are null."""
 
+from collections.abc import Mapping
 from math import isfinite
 from typing import Any
 
 from reactorwatch.diagnosis.difference import Difference
-from reactorwatch.diagnosis.result import Cause, Diagnosis, Experiment
+from reactorwatch.diagnosis.result import Cause, Diagnosis, Experiment, HeldOut, Law
 
 _ESTIMATE = ("value", "sd", "unit")
 
@@ -36,19 +37,37 @@ def as_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None 
             for item in diagnosis.alternatives
         ],
         "location": diagnosis.location or None,
+        "locations": [{"location": name, "delta_bic": _number(worse)} for name, worse in diagnosis.locations.items()],
+        "law": None if diagnosis.law is None else _law(diagnosis.law),
         "significant": bool(diagnosis.significant),
         "practical": bool(diagnosis.practical),
         "gain": {
             "delta_bic": _number(diagnosis.gain.delta_bic),
-            "held_out": {
-                name: _fields(item, "rmse_before", "rmse_after", "noise_sd", "unit")
-                for name, item in diagnosis.gain.held_out.items()
-            },
+            "held_out": _holdout_errors(diagnosis.gain.held_out),
         },
         "adequacy": {name: {"minus_log10_p": _number(value)} for name, value in diagnosis.adequacy.items()},
         "experiment": None if experiment is None else _experiment(experiment),
         "extended_model": diagnosis.extended_model,
         **({"parameters": _parameters(diagnosis)} if diagnosis.parameters else {}),
+    }
+
+
+def _holdout_errors(errors: Mapping[str, HeldOut]) -> dict[str, Any]:
+    return {name: _fields(item, "rmse_before", "rmse_after", "noise_sd", "unit") for name, item in errors.items()}
+
+
+def _law(law: Law) -> dict[str, Any]:
+    return {
+        **_fields(law, "location", "form", "formula", "term", "unit"),
+        "variables": list(law.variables),
+        "parameters": {name: _fields(item, *_ESTIMATE) for name, item in law.parameters.items()},
+        "rivals": [_fields(item, "location", "form", "formula", "delta_bic") for item in law.rivals],
+        "range": {name: [_number(end) for end in ends] for name, ends in law.range.items()},
+        "held_out": _holdout_errors(law.held_out),
+        "correlations": {
+            name: {"parameter": other, "correlation": _number(value)}
+            for name, (other, value) in law.correlations.items()
+        },
     }
 
 

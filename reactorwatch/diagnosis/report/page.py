@@ -22,6 +22,7 @@ from reactorwatch.diagnosis.report.words import (
     describe_timing,
     describe_verdict,
     format_interval,
+    law_rows,
 )
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
 from reactorwatch.diagnosis.whiteness import WHITE
@@ -108,6 +109,9 @@ def as_page(
         closer=pictures.closer(diagnosis, model) if diagnosis.causes else [],
         courses=pictures.courses(diagnosis),
         unknown=pictures.unknown_course(diagnosis),
+        law=pictures.law(diagnosis),
+        law_rows=[] if diagnosis.law is None else law_rows(diagnosis.law),
+        extended=diagnosis.is_extended,
         residuals=pictures.residuals(diagnosis, model),
         differences=[(describe_difference(name, item), _strips(item)) for name, item in diagnosis.differences.items()],
         white=WHITE,
@@ -182,9 +186,10 @@ def _strips(item: Difference) -> list[tuple[str, list[tuple[str, str, int]]]]:
 
 
 def _evidence(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[str, str]]:
-    if not diagnosis.causes:
+    if not diagnosis.is_extended:
         return [("the simulation as it is", "0")]
     best = describe_causes([(cause.cause, cause.profile) for cause in diagnosis.causes], effects)
+    best = best or "the law"
     rows = [(best, "0")]
     rows += [(describe_causes(item.causes, effects), f"{item.delta_bic:.1f}") for item in diagnosis.alternatives]
     return [*rows, ("the simulation as it was", f"{diagnosis.gain.delta_bic:,.1f}")]

@@ -49,7 +49,7 @@ def outputs(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
         else:
             lines = [(MEASURED, curves.measured), (BEFORE, curves.simulated_before)]
         result.append(_picture(f"{output.name}, {output.unit}", curves, output.name, lines, moments))
-        if diagnosis.causes:
+        if diagnosis.is_extended:
             lines[1] = (AFTER, curves.simulated_after)
             result.append(_picture(f"{output.name}, {output.unit}", curves, output.name, lines, moments))
     return result
@@ -74,10 +74,11 @@ def residuals(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
     """One-step-ahead residuals in standard deviations, without and with the cause."""
     curves = _curves(diagnosis)
     kinds = [("simulation as it is", "after" if diagnosis.verdict == NOMINAL else "before", curves.residual_before)]
-    if diagnosis.causes:
+    if diagnosis.is_extended:
+        what = "the cause" if diagnosis.causes else "the law"
         kinds = [
-            ("without the cause", "before", curves.residual_before),
-            ("with the cause", "after", curves.residual_after),
+            (f"without {what}", "before", curves.residual_before),
+            (f"with {what}", "after", curves.residual_after),
         ]
     ends = np.full(curves.time_min.size, SD_95)
     result = []
@@ -147,6 +148,27 @@ def experiment(proposed: Experiment, model: ProcessModel) -> list[Picture]:
 
 def _limits(proposed: Experiment, name: str, rows: int) -> list[Line]:
     return [Line(np.full(rows, end), "limit") for end in proposed.limits[name]]
+
+
+def law(diagnosis: Diagnosis) -> list[Picture]:
+    """Missing term over each of its variables: the smooth curve with its 95 % band, and the formula."""
+    if diagnosis.law is None:
+        return []
+    result = []
+    for curve in diagnosis.law.curves:
+        half = SD_95 * curve.smooth_sd
+        drawing = plot(
+            f"missing term over {curve.variable}",
+            curve.values,
+            [Line(curve.smooth, "after"), Line(curve.formula, "limit")],
+            [Band(curve.smooth - half, curve.smooth + half, "certain")],
+            shown=_with_zero(curve.smooth, curve.smooth - half, curve.smooth + half),
+            unit=curve.unit,
+        )
+        unit = "" if diagnosis.law.unit == "1" else f", {diagnosis.law.unit}"
+        legend = (("smooth curve", "after"), ("95 % interval", "certain"), (diagnosis.law.formula, "limit"))
+        result.append(Picture(f"Missing term{unit}, over {curve.variable}", legend, drawing))
+    return result
 
 
 def unknown_course(diagnosis: Diagnosis) -> list[Picture]:

@@ -7,9 +7,11 @@ from reactorwatch.diagnosis.report.words import (
     describe_explanation,
     describe_holdout,
     describe_parameter,
+    describe_place,
     describe_size,
     describe_timing,
     describe_verdict,
+    law_rows,
 )
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Diagnosis
 from reactorwatch.process.effect import Effect
@@ -37,13 +39,18 @@ def as_text(diagnosis: Diagnosis, file: str, effects: Sequence[Effect]) -> str:
             _line("size", f"{describe_size(cause, effects)}  (95 %)"),
             _line("when", describe_timing(cause, diagnosis.curves)),
         ]
+    if len(diagnosis.locations) > 1:
+        places = [f"{describe_place(name)} ({worse:.1f})" for name, worse in diagnosis.locations.items()]
+        lines.append(_line("where", f"{', '.join(places)}: worse in BIC"))
+    if diagnosis.law is not None:
+        lines += [_line(name, text) for name, text in law_rows(diagnosis.law)]
     if diagnosis.verdict != NOMINAL:
         lines.append(_line("evidence", f"{diagnosis.gain.delta_bic:,.1f} in BIC over the simulation as it was"))
         lines += [_line("differs", describe_difference(name, item)) for name, item in diagnosis.differences.items()]
     for name, known in diagnosis.parameters.items():
         lines.append(_line("parameter", f"{name} {describe_parameter(known)}  (95 %)"))
     for name, item in diagnosis.gain.held_out.items():
-        lines.append(_line("held out", describe_holdout(name, item, improved=bool(diagnosis.causes))))
+        lines.append(_line("held out", describe_holdout(name, item, improved=diagnosis.is_extended)))
     if not ambiguous:
         lines += _alternatives(diagnosis, effects) + _experiment(diagnosis)
     if diagnosis.causes and not diagnosis.alternatives:

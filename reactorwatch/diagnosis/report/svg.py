@@ -53,6 +53,7 @@ def plot(
     bands: Sequence[Band] = (),
     moments_min: Sequence[float] = (),
     shown: tuple[float, float] | None = None,
+    unit: str = "min",
 ) -> str:
     """Plot as an `svg` element.
 
@@ -63,6 +64,7 @@ def plot(
         bands: areas.
         moments_min: times of vertical lines.
         shown: lowest and highest value of the axis; None: those of the data.
+        unit: unit of the horizontal axis, if it is another variable than time.
     """
     values = np.concatenate(
         [*(line.values for line in lines), *(part for band in bands for part in (band.lower, band.upper))]
@@ -80,7 +82,7 @@ def plot(
         *(_vertical(across.place(moment)) for moment in moments_min if across.first <= moment <= across.last),
         *(_line(line, time_min, across, up) for line in lines),
         "</svg>",
-        _frame(across, up),
+        _frame(across, up, unit),
         "</svg>",
     ]
     return "".join(parts)
@@ -168,12 +170,12 @@ def _grid(up: Axis) -> str:
     return f'<path class="grid" d="{drawn}"/>'
 
 
-def _frame(across: _Time, up: Axis) -> str:
+def _frame(across: _Time, up: Axis, unit: str) -> str:
     floor = HEIGHT - BOTTOM
     parts = [f'<path class="frame" d="M{LEFT} {TOP}V{floor}H{WIDTH - RIGHT}"/>']
     ticks = across.ticks()
     for number, (place, text) in enumerate(ticks, start=1):
-        label = text if number < len(ticks) else f"{text} min"
+        label = text if number < len(ticks) else f"{text} {unit}".rstrip()
         parts.append(f'<path class="frame" d="M{place:.1f} {floor}v4"/>')
         at, anchor = (place, "middle") if place < WIDTH - LABEL_ROOM else (WIDTH - RIGHT, "end")
         spare = " spare" if (len(ticks) - number) % 2 else ""  # left out where the text is large

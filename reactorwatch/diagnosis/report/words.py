@@ -18,6 +18,7 @@ from reactorwatch.diagnosis.result import (
     Diagnosis,
     Estimate,
     HeldOut,
+    Law,
 )
 from reactorwatch.process import LOCATION_PHRASES
 from reactorwatch.process.effect import Effect
@@ -44,7 +45,26 @@ def describe_verdict(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == NAMED:
         causes = [f"{cause.label}, {describe_timing(cause, diagnosis.curves)}" for cause in diagnosis.causes]
         return f"The simulation is wrong: {'; and '.join(causes)}. {matters}"
-    return f"The simulation is wrong, and no known cause explains it; it acts {describe_location(diagnosis)}. {matters}"
+    text = f"The simulation is wrong, and no known cause explains it; it acts {describe_location(diagnosis)}."
+    if diagnosis.law is not None:
+        text += f" A law explains it: {diagnosis.law.formula}, {diagnosis.law.term}."
+    return f"{text} {matters}"
+
+
+def law_rows(law: Law) -> list[tuple[str, str]]:
+    """Facts about a law, each with its name."""
+    unit = "" if law.unit == "1" else f", in {law.unit}"
+    rows = [("law", f"{law.formula}{unit}, {law.term}")]
+    rows += [(name, f"{format_interval(item)}  (95 %)") for name, item in law.parameters.items()]
+    for name, (other, value) in law.correlations.items():
+        rows.append((name, f"would have the correlation {value:.2f} with {other}, if that were uncertain"))
+    ranges = ", ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in law.range.items())
+    rows.append(("range", f"seen with {ranges}; it need not hold outside"))
+    rows += [
+        ("or", f"{item.formula} ({item.form}, {describe_place(item.location)}), worse by {item.delta_bic:.1f} in BIC")
+        for item in law.rivals
+    ]
+    return rows
 
 
 def describe_significance(diagnosis: Diagnosis) -> str:

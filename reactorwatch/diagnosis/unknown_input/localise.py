@@ -18,12 +18,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.diagnosis.fitting.fault_filter import huber_loss
 from reactorwatch.diagnosis.fitting.hypothesis import Fit
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.result import UnknownInputCurve
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.search import FittedHypothesis
 from reactorwatch.diagnosis.unknown_input.forcing import (
     Forcing,
     ForcingFit,
@@ -35,9 +33,6 @@ from reactorwatch.diagnosis.unknown_input.unmodelled_loss import balance_losses
 from reactorwatch.kalman.ekf import LEAST_PROCESS_SD, NoiseLevels
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
-
-MARGIN = 25.0
-"""Threshold in BIC, over the best of the catalogue: a forcing is more flexible."""
 
 FIRST_REDS, FIRST_LASTS_MIN = (0.001, 0.03, 0.3, 3.0), (0.4, 3.0, 20.0)
 """Initial grid: red noise in typical magnitudes of the effect, and its time constant."""
@@ -144,14 +139,6 @@ def has_feedback(run: Run, nominal: Fit) -> bool:
 def _has_feedthrough(model: ProcessModel) -> bool:
     """Return true if the outputs of a row depend on the input that holds from then on."""
     return any(ca.depends_on(output.expression, model.arguments()[1]) for output in model.outputs)
-
-
-def bic_on(fitted: FittedHypothesis, known: NDArray[np.bool_]) -> float:
-    """BIC of a hypothesis of the catalogue, by some of the values alone."""
-    w, sd = fitted.fit.w, fitted.fit.innovations.conditional_sd
-    counted = known & np.isfinite(w) & np.isfinite(sd)
-    logs = float(np.sum(np.log(np.where(counted, sd, 1.0))))
-    return 2.0 * (huber_loss(np.where(counted, w, 0.0)) + logs - fitted.fit.loss) + fitted.bic
 
 
 def _reference(model: ProcessModel, run: Run, nominal: Fit) -> ReferenceTrajectory:

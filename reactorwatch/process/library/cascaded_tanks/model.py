@@ -19,12 +19,21 @@ from functools import cache
 import casadi as ca
 
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
+from reactorwatch.process.places import INPUT, SENSOR, SOURCE, Place
 
 SMALL_LEVEL_V = 0.01
 """Level in V below which its root is replaced by a straight line; at 1 V that changes it by less than 3 in 100,000."""
 
 UPPER_OUTLET = "upper outlet"
 """Name of the term that runs from the upper tank, in V^0.5: the root of its level."""
+
+PLACES = (
+    Place("pump", "pump", INPUT, of="u", variables=("u", "x1")),
+    Place("upper tank", "upper_tank", SOURCE, of="x1", variables=("x1", "u")),
+    Place("lower tank", "lower_tank", SOURCE, of="x2", variables=("x2", "x1")),
+    Place("level sensor", "level_sensor", SENSOR, of="x2", variables=("x2",)),
+)
+"""Places where something unknown may act."""
 
 
 @cache
@@ -50,6 +59,7 @@ def tanks() -> ProcessModel:
         outputs=(Output("x2", x2.unit, x2.symbol),),
         clock=new_clock(),
         terms={UPPER_OUTLET: upper},
+        places=PLACES,
     )
 
 

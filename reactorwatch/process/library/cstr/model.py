@@ -18,6 +18,7 @@ from functools import cache
 import casadi as ca
 
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
+from reactorwatch.process.places import CAPACITY, FACTOR, INPUT, SENSOR, SOURCE, Place
 
 SMALLEST_COOLANT_FLOW = 1e-6
 """l/min. A smaller flow counts as this: K2 qc (1 - exp(-K3/qc)) goes to zero with qc, but K3/qc is undefined there."""
@@ -33,6 +34,26 @@ COOLING = "cooling"
 
 FEED = "feed"
 """`feed C` and `feed T` are the terms that say what the feed brings, in the units of the outputs."""
+
+REACTION = "reaction"
+"""`reaction C` and `reaction T` are the terms of the reaction in the balances of mass and energy."""
+
+_TIED = {"C": f"{REACTION} C", "T": f"{REACTION} T"}
+
+PLACES = (
+    Place("reaction", "reaction", FACTOR, flows=_TIED, variables=("T", "C")),
+    Place("second reaction", "reaction", FACTOR, flows=_TIED, variables=("T", "C"), apart="heat of reaction"),
+    Place("heat of reaction", "reaction", FACTOR, flows={"T": f"{REACTION} T"}, variables=("T", "C")),
+    Place("energy balance", "energy_balance", SOURCE, of="T", variables=("T", "C", "qc")),
+    Place("heat capacity", "energy_balance", CAPACITY, of="T", variables=("T",)),
+    Place("mass balance", "mass_balance", SOURCE, of="C", variables=("C", "T")),
+    Place("coolant", "coolant", FACTOR, flows={"T": COOLING}, variables=("qc", "T")),
+    Place("feed temperature", "feed", INPUT, of="Tf", variables=("T",), lag_min=1.0),
+    Place("feed concentration", "feed", INPUT, of="Cf", variables=("C",), lag_min=1.0),
+    Place("thermometer", "temperature_sensor", SENSOR, of="T", variables=("T",)),
+    Place("analyser", "concentration_sensor", SENSOR, of="C", variables=("C", "T")),
+)
+"""Places where something unknown may act; the heat of a reaction is tied to it, but that of a second one is apart."""
 
 
 @cache
@@ -57,16 +78,24 @@ def cstr() -> ProcessModel:
     cooling = K2.symbol * flow * (1 - ca.exp(-K3.symbol / flow))
     dilution = q.symbol / V.symbol
     to_coolant = cooling * (Tcf.symbol - T.symbol)
+    consumption, heating = -k0.symbol * C.symbol * arrhenius, K1.symbol * C.symbol * arrhenius
     return ProcessModel(
         name="cstr",
         states=(C, T),
         inputs=(qc,),
         parameters=(q, V, Cf, Tf, Tcf, E_R, k0, K1, K2, K3),
         rhs=(
-            dilution * (Cf.symbol - C.symbol) - k0.symbol * C.symbol * arrhenius,
-            dilution * (Tf.symbol - T.symbol) + K1.symbol * C.symbol * arrhenius + to_coolant,
+            dilution * (Cf.symbol - C.symbol) + consumption,
+            dilution * (Tf.symbol - T.symbol) + heating + to_coolant,
         ),
         outputs=(Output("C", C.unit, C.symbol), Output("T", T.unit, T.symbol)),
         clock=new_clock(),
-        terms={COOLING: to_coolant, f"{FEED} C": Cf.symbol, f"{FEED} T": Tf.symbol},
+        terms={
+            COOLING: to_coolant,
+            f"{FEED} C": Cf.symbol,
+            f"{FEED} T": Tf.symbol,
+            _TIED["C"]: consumption,
+            _TIED["T"]: heating,
+        },
+        places=PLACES,
     )

@@ -20,11 +20,25 @@ from functools import cache
 import casadi as ca
 
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
+from reactorwatch.process.places import FACTOR, SENSOR, SOURCE, Place
 
 SMALL_LEVEL_CM = 0.01
 """Difference of levels below which the root becomes a straight line; at 1 cm that changes it by 3 in 100,000."""
 
 SECONDS_PER_MIN = 60.0
+
+PLACES = (
+    Place("pipe13", "pipe13", FACTOR, flows={"h1": "flow 13", "h3": "inflow 13"}, variables=("head 13",)),
+    Place("pipe32", "pipe32", FACTOR, flows={"h3": "flow 32", "h2": "inflow 32"}, variables=("head 32",)),
+    Place("pipe20", "pipe20", FACTOR, flows={"h2": "flow 20"}, variables=("h2",)),
+    *(
+        Place(f"pump{i}", f"pump{i}", FACTOR, flows={f"h{i}": f"pump {i}"}, variables=(f"Q{i}", f"h{i}"))
+        for i in (1, 2)
+    ),
+    *(Place(f"tank{i}", f"tank{i}", SOURCE, of=f"h{i}", variables=(f"h{i}",)) for i in (1, 2, 3)),
+    *(Place(f"h{i}", f"h{i}", SENSOR, of=f"h{i}", variables=(f"h{i}",)) for i in (1, 2, 3)),
+)
+"""Places where something unknown may act; a pipe takes from one tank what it gives to another."""
 
 
 @cache
@@ -64,7 +78,19 @@ def three_tanks() -> ProcessModel:
         ),
         outputs=tuple(Output(level.name, level.unit, level.symbol) for level in levels),
         clock=new_clock(),
-        terms={leak_name(i): -per_min * pipe(ca.SX(1), level.symbol) for i, level in enumerate(levels, start=1)},
+        terms={
+            **{leak_name(i): -per_min * pipe(ca.SX(1), level.symbol) for i, level in enumerate(levels, start=1)},
+            "pump 1": per_min * Q1.symbol,
+            "pump 2": per_min * Q2.symbol,
+            "flow 13": -per_min * Q13,
+            "inflow 13": per_min * Q13,
+            "flow 32": -per_min * Q32,
+            "inflow 32": per_min * Q32,
+            "flow 20": -per_min * Q20,
+            "head 13": h1.symbol - h3.symbol,
+            "head 32": h3.symbol - h2.symbol,
+        },
+        places=PLACES,
     )
 
 

@@ -1,0 +1,153 @@
+"""The law of an unknown as a result: intervals, correlations, rivals, curves and the gain on held-out rows."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting import signatures
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
+from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import Constant
+from reactorwatch.diagnosis.law.fit import ShapeFitter
+from reactorwatch.diagnosis.law.path import variables_along
+from reactorwatch.diagnosis.law.shapes import coefficient_effect
+from reactorwatch.diagnosis.law.unknown import FittedLaw, PlaceFit, Unknown
+from reactorwatch.diagnosis.result import LISTED, Estimate, HeldOut, Law, LawCurve, RivalLaw
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.search import FittedHypothesis
+from reactorwatch.process.law import find_form
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.places import CAPACITY, FACTOR, INPUT, SOURCE, Place, unit_of, unit_of_variable
+
+BINS = 30
+"""Number of points of a curve, each the mean of as many rows."""
+
+LEAST_CORRELATION = 0.5
+
+
+def law_hypothesis(law: FittedLaw, run: Run) -> FittedHypothesis:
+    """The law as a hypothesis whose parameters shift those of the law."""
+    hypothesis = Hypothesis(law.fitter.ekf, [Constant(run.time_min)] * law.fit.coefficients.size)
+    parameters = tuple(np.array([value]) for value in law.fit.coefficients)
+    return FittedHypothesis(hypothesis, Fit(parameters, *law.fit.evaluation), law.bic)
+
+
+def describe_law(model: ProcessModel, run: Run, found: Unknown, held_out: dict[str, HeldOut]) -> Law:
+    """Describe the best law.
+
+    Args:
+        model: process model without the law.
+        run: the record.
+        found: evidence with at least one law.
+        held_out: errors on held-out rows, by output.
+    """
+    best = found.laws[0]
+    law, units = best.law, best.law.units(model)
+    information, _ = best.fitter.normal_equations(best.fit)
+    sd = np.sqrt(np.maximum(np.diag(_inverse(information)), 0.0))
+    parameters = {
+        name: Estimate(value, float(sd[index]), units[name])
+        for index, (name, value) in enumerate(law.parameters.items())
+    }
+    rivals = tuple(
+        RivalLaw(item.place.location, find_form(item.law.form).form, item.law.formula(), item.bic - best.bic)
+        for item in found.laws[1:]
+        if item.bic < best.bic + LISTED
+    )
+    smooth = next(item for item in found.places if item.place.name == best.place.name)
+    return Law(
+        location=best.place.location,
+        form=find_form(law.form).form,
+        formula=law.formula(),
+        term=describe_term(best.place),
+        unit=unit_of(model, best.place),
+        variables=law.variables,
+        parameters=parameters,
+        rivals=rivals,
+        range=dict(law.range),
+        held_out=held_out,
+        correlations=_correlations(model, run, best),
+        extended=law,
+        curves=_curves(model, run, best, smooth),
+    )
+
+
+def describe_term(place: Place) -> str:
+    """Describe the term that a correction in a place changes."""
+    if place.kind == SOURCE:
+        return f"added to d{place.of}/dt"
+    if place.kind == FACTOR:
+        return f"factor 1 + ... of {' and '.join(place.flows.values())}"
+    if place.kind == CAPACITY:
+        return f"d{place.of}/dt is divided by 1 + ..."
+    return f"added to the {'input' if place.kind == INPUT else 'reading of'} {place.of}"
+
+
+def _curves(model: ProcessModel, run: Run, best: FittedLaw, smooth: PlaceFit) -> tuple[LawCurve, ...]:
+    """Smooth correction and formula over each variable of the law."""
+    x, law = smooth.fit.evaluation.innovations.x, best.law
+    lag_min = smooth.fit.shape.lag_min(smooth.fit.coefficients)
+    variables = variables_along(model, run, x, best.place, lag_min)
+    formula = find_form(law.form).expression(
+        [variables[name] for name in law.variables], list(law.parameters.values()), law.references
+    )
+    basis = smooth.fit.shape.basis(x, run.inputs)
+    basis = basis[:, : len(smooth.fit.shape.terms)]
+    active = np.flatnonzero(smooth.fit.coefficients[: basis.shape[1]])
+    information, _ = smooth.fitter.normal_equations(smooth.fit)
+    covariance = _inverse(information[np.ix_(active, active)])
+    known = np.all(np.isfinite(basis), axis=1)
+    result = []
+    for name in law.variables:
+        order = np.flatnonzero(known)[np.argsort(variables[name][known], kind="stable")]
+        groups = np.array_split(order, BINS)
+        mean = np.array([basis[rows][:, active].mean(axis=0) for rows in groups])
+        result.append(
+            LawCurve(
+                name,
+                unit_of_variable(model, name),
+                _means(variables[name], groups),
+                mean @ smooth.fit.coefficients[active],
+                np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", mean, covariance, mean), 0.0)),
+                _means(formula, groups),
+            )
+        )
+    return tuple(result)
+
+
+def _means(values: Array, groups: Sequence[NDArray[np.intp]]) -> Array:
+    return np.array([float(np.mean(values[rows])) for rows in groups])
+
+
+def _correlations(model: ProcessModel, run: Run, best: FittedLaw) -> dict[str, tuple[str, float]]:
+    """The model's parameter that each parameter of the law is correlated with most, if it were uncertain."""
+    names = [item.name for item in model.parameters if item.value != 0.0]
+    effects = (*best.fitter.shape.effects, *(coefficient_effect(name) for name in names))
+    ekf = FaultFilter(best.fitter.shape.model, effects, best.fitter.ekf.noise)
+    n_law = best.fit.coefficients.size
+    signals = ShapeFitter.constant_signals(np.concatenate([best.fit.coefficients, np.zeros(len(names))]), run)
+    dynamics = ekf.error_dynamics(run, signals, ekf.evaluate(run, signals).innovations)
+    ones = np.ones((run.time_min.size - 2, 1))
+    g = np.column_stack(
+        [signatures.forward_signatures(dynamics, i, ones, ones).reshape(-1) for i in range(len(effects))]
+    )
+    result = {}
+    for index, name in enumerate(best.law.parameters):
+        largest = ("", 0.0)
+        for other, parameter in enumerate(names, start=n_law):
+            chosen = [*range(n_law), other]
+            part = _inverse(g[:, chosen].T @ g[:, chosen])
+            scale = float(np.sqrt(part[index, index] * part[-1, -1]))
+            value = float(part[index, -1]) / scale if scale > 0.0 else 0.0
+            largest = max(largest, (parameter, value), key=lambda item: abs(item[1]))
+        if abs(largest[1]) >= LEAST_CORRELATION:
+            result[name] = largest
+    return result
+
+
+def _inverse(information: Array) -> Array:
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    inner = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    return np.asarray(inner / np.outer(scale, scale))

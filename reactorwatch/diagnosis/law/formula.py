@@ -1,0 +1,300 @@
+"""Find the formula of a missing term.
+
+About the path of the smooth correction that explains the run best, the innovations are linear in the course of the
+correction. So each form of the library is first fitted to them with one pass over the record a step, and only the best
+ones are fitted inside the simulation, where they are compared by BIC.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
+from math import log
+
+import numpy as np
+
+from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting import signatures
+from reactorwatch.diagnosis.fitting.fault_filter import HUBER
+from reactorwatch.diagnosis.fitting.profiles import hat_functions
+from reactorwatch.diagnosis.law.fit import ShapeFit
+from reactorwatch.diagnosis.law.shapes import Shape, coefficient_effect
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.kalman.error_dynamics import ErrorDynamics
+from reactorwatch.process.law import (
+    APART,
+    CURVATURE,
+    EXPONENT,
+    FORMS,
+    GAIN,
+    LAG,
+    POSITION,
+    RATE,
+    SLOPE,
+    ExtendedLaw,
+    Form,
+)
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.places import Place
+
+STEPS = 12
+"""Steps of a fit about a path."""
+
+KNOTS = {1: 30, 2: 8}
+"""Knots of each variable, by the number of variables."""
+
+EXPONENTS = {1: (-2.0, 1.0, 4.0), 2: (-1.0, 3.0)}
+"""Initial exponents, by the number of variables; and initial rates times the variable's mean."""
+
+POSITIONS = (-1.0, 0.0, 1.0)
+"""Initial positions, in spreads from the mean."""
+
+_DIFFERENCE = 1e-4
+_CONVERGED = 0.01
+_DAMPINGS = (1e-6, 1e-2, 1.0, 100.0)
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateLaw:
+    """A form with parameters.
+
+    Attributes:
+        law: the law.
+        bic: predicted BIC.
+    """
+
+    law: ExtendedLaw
+    bic: float
+
+
+class FormulaSearch:
+    """Fits forms about the path of a smooth correction.
+
+    A correction is represented by its values at knots of its variables, between which it is linear, so that twice the
+    loss is a quadratic form of these values and a form is fitted in well under a millisecond.
+
+    Args:
+        place: place of the correction.
+        fit: fit of the correction.
+        dynamics: error equations about it.
+        run: the record.
+        variables: variables of the place along the path, each of shape (rows,).
+    """
+
+    def __init__(
+        self, place: Place, fit: ShapeFit, dynamics: ErrorDynamics, run: Run, variables: Mapping[str, Array]
+    ) -> None:
+        self._place, self._dynamics, self._unit = place, dynamics, fit.shape.unit_size
+        self._lag_min = fit.shape.lag_min(fit.coefficients)
+        self._variables = {name: item for name, item in variables.items() if np.ptp(item) > 0.0}
+        self._charge = log(run.values)
+        w = np.nan_to_num(fit.evaluation.w[2:])
+        self._weights = np.sqrt(HUBER / np.maximum(np.abs(w), HUBER)).ravel()
+        free = fit.shape.corrections(fit.evaluation.innovations.x, run.inputs, fit.coefficients)
+        self._apart, self._ratio, ratio = len(fit.shape.terms), 0.0, 0.0
+        self._target = w.ravel() + self._response(free[:, :1])[:, 0]
+        if free.shape[1] > 1:
+            self._target += self._respond(free[:, 1:], self._apart)[:, 0]
+            ratio = float(free[:, 0] @ free[:, 1]) / max(float(free[:, 0] @ free[:, 0]), 1e-300)
+        self._ratio = ratio
+
+    def candidates(self) -> list[CandidateLaw]:
+        """Best fit of every form with every choice of variables, the best first."""
+        result = []
+        for count in (1, 2):
+            for names in combinations(self._variables, count):
+                if count > 1 and names[0] != next(iter(self._variables)):
+                    continue  # the likeliest variable is one of two
+                grid = self._grid(names)
+                for form in FORMS:
+                    if form.variables == count:
+                        result += [self._best(form, order, grid) for order in _orders(form, names)]
+        return sorted((item for item in result if item is not None), key=lambda item: item.bic)
+
+    def _grid(self, names: Sequence[str]) -> "_Grid":
+        """Quadratic form of the values at the knots of these variables."""
+        values = [self._variables[name] for name in names]
+        knots = [np.linspace(np.min(item), np.max(item), KNOTS[len(names)]) for item in values]
+        hats = [
+            hat_functions((item - at[0]) / (at[-1] - at[0]), at.size) for item, at in zip(values, knots, strict=True)
+        ]
+        basis = hats[0] if len(hats) == 1 else (hats[0][:, :, None] * hats[1][:, None, :]).reshape(len(hats[0]), -1)
+        g = self._response(basis) * self._weights[:, None]
+        target = self._target * self._weights
+        points = [item.ravel() for item in np.meshgrid(*knots, indexing="ij")]
+        variables = dict(zip(names, points, strict=True))
+        means = {name: float(np.mean(item)) for name, item in zip(names, values, strict=True)}
+        spreads = {name: float(np.std(item)) for name, item in zip(names, values, strict=True)}
+        return _Grid(variables, means, spreads, g.T @ g, g.T @ target, float(target @ target))
+
+    def _response(self, columns: Array) -> Array:
+        """Reduction of the innovations by courses of the correction, shape (values, columns).
+
+        A correction apart from the place is in proportion to that in it.
+        """
+        result = self._respond(columns, 0)
+        return result + self._ratio * self._respond(columns, self._apart) if self._ratio else result
+
+    def _respond(self, columns: Array, index: int) -> Array:
+        """Reduction of the innovations by courses of a constant function's coefficient."""
+        columns = columns / self._unit
+        means = 0.5 * (columns[:-1] + columns[1:])
+        g = signatures.forward_signatures(
+            self._dynamics, index, np.ascontiguousarray(means[1:]), np.ascontiguousarray(columns[2:])
+        )
+        return np.asarray(g.reshape(-1, columns.shape[1]))
+
+    def _best(self, form: Form, names: Sequence[str], grid: "_Grid") -> CandidateLaw | None:
+        if form.positive and min(float(np.min(grid.variables[name])) for name in names) <= 0.0:
+            return None
+        references = [round_reference(grid.means[name], grid.spreads[name]) for name in names]
+        fits = [_fit_form(form, names, references, start, grid) for start in _starts(form, names, grid)]
+        loss, p = min(fits, key=lambda item: item[0])
+        if not (np.isfinite(loss) and _is_in_bounds(form, p, [grid.variables[name] for name in names])):
+            return None
+        parameters = {item.name: float(value) for item, value in zip(form.parameters, p, strict=True)}
+        if self._place.apart:
+            parameters[APART] = self._ratio
+        if self._place.lag_min:
+            parameters[LAG] = self._lag_min
+        values = [self._variables[name] for name in names]
+        ranges = {name: (float(np.min(item)), float(np.max(item))) for name, item in zip(names, values, strict=True)}
+        law = ExtendedLaw(self._place.name, form.key, tuple(names), tuple(references), parameters, ranges)
+        return CandidateLaw(law, loss + len(parameters) * self._charge)
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Quadratic form of the correction's values at knots: twice the loss.
+
+    Attributes:
+        variables: variables at the knots.
+        means: mean of each variable.
+        spreads: standard deviation of each variable.
+        information: curvature, shape (knots, knots).
+        gradient: negative half of the slope at zero, shape (knots,).
+        constant: value at zero.
+    """
+
+    variables: Mapping[str, Array]
+    means: Mapping[str, float]
+    spreads: Mapping[str, float]
+    information: Array
+    gradient: Array
+    constant: float
+
+    def loss(self, course: Array) -> float:
+        """Twice the loss; infinite where the course is not finite."""
+        if not np.all(np.isfinite(course)):
+            return float("inf")
+        return float(self.constant - 2.0 * self.gradient @ course + course @ self.information @ course)
+
+
+def _is_in_bounds(form: Form, p: Array, values: Sequence[Array]) -> bool:
+    """Return true if the positions of a form are where its formula differs from a simpler one."""
+    for item, value in zip(form.parameters, p.tolist(), strict=True):
+        low, high = float(np.min(values[item.of])), float(np.max(values[item.of]))
+        share = (value - low) / (high - low)
+        if item.kind == POSITION and not form.position[0] < share < form.position[1]:
+            return False
+    return True
+
+
+def _orders(form: Form, names: Sequence[str]) -> list[tuple[str, ...]]:
+    return [tuple(names)] if form.symmetric else list(permutations(names))
+
+
+def _starts(form: Form, names: Sequence[str], grid: _Grid) -> list[Array]:
+    """Initial nonlinear parameters; gains follow from the first step."""
+    starts = [np.zeros(len(form.parameters))]
+    for index, item in enumerate(form.parameters):
+        mean, spread = grid.means[names[item.of]], grid.spreads[names[item.of]]
+        options = {
+            EXPONENT: EXPONENTS[form.variables],
+            RATE: [exponent / max(abs(mean), spread) for exponent in EXPONENTS[form.variables]],
+            POSITION: [mean + position * spread for position in POSITIONS],
+        }.get(item.kind, (0.0,))
+        starts = [np.array([*start[:index], option, *start[index + 1 :]]) for start in starts for option in options]
+    return starts
+
+
+def _fit_form(
+    form: Form, names: Sequence[str], references: Sequence[float], start: Array, grid: _Grid
+) -> tuple[float, Array]:
+    """Twice the loss of a form and its parameters, by damped Gauss-Newton steps on the values at the knots."""
+    values = [grid.variables[name] for name in names]
+    linear = [index for index, item in enumerate(form.parameters) if item.kind in (GAIN, SLOPE, CURVATURE)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        p = _solve_linear(form, values, references, start, linear, grid)
+        course = form.expression(values, p, references)
+        best = grid.loss(course)
+        for _ in range(STEPS):
+            if not np.isfinite(best):
+                break
+            columns = np.column_stack([_slope(form, values, p, references, i, names, grid) for i in range(p.size)])
+            size = np.sqrt(np.maximum(np.sum(columns * (grid.information @ columns), axis=0), 1e-300))
+            columns = columns / size
+            information = columns.T @ grid.information @ columns
+            gradient = columns.T @ (grid.gradient - grid.information @ course)
+            before = best
+            for damping in _DAMPINGS:
+                trial = p + np.linalg.solve(information + damping * np.eye(p.size), gradient) / size
+                moved = form.expression(values, trial, references)
+                loss = grid.loss(moved)
+                if loss < best:
+                    p, best, course = trial, loss, moved
+                    break
+            if before - best < _CONVERGED:
+                break
+    return best, p
+
+
+def _slope(
+    form: Form,
+    values: Sequence[Array],
+    p: Array,
+    references: Sequence[float],
+    i: int,
+    names: Sequence[str],
+    grid: _Grid,
+) -> Array:
+    spread = grid.spreads[names[form.parameters[i].of]]
+    unit = {EXPONENT: 1.0, RATE: 1.0 / spread, POSITION: spread}.get(form.parameters[i].kind, max(abs(p[i]), 1e-9))
+    low, high = p.copy(), p.copy()
+    low[i] -= _DIFFERENCE * unit
+    high[i] += _DIFFERENCE * unit
+    difference = form.expression(values, high, references) - form.expression(values, low, references)
+    return np.asarray(difference / (2.0 * _DIFFERENCE * unit))
+
+
+def _solve_linear(
+    form: Form, values: Sequence[Array], references: Sequence[float], start: Array, linear: Sequence[int], grid: _Grid
+) -> Array:
+    columns = []
+    for index in linear:
+        unit = start.copy()
+        unit[index] = 1.0
+        columns.append(form.expression(values, unit, references))
+    g = np.column_stack(columns)
+    result = start.copy()
+    result[list(linear)] = np.linalg.lstsq(g.T @ grid.information @ g, g.T @ grid.gradient, rcond=1e-12)[0]
+    return result
+
+
+def law_shape(model: ProcessModel, place: Place, law: ExtendedLaw) -> Shape:
+    """Model with a law, as a shape whose coefficients shift the law's parameters."""
+    extended = law.extend(model)
+    names = extended.parameter_names[-len(law.parameters) :]
+    return Shape(place, extended, tuple(coefficient_effect(name) for name in names), names, 1.0, ())
+
+
+def round_reference(mean: float, spread: float) -> float:
+    """Round number near a mean: to the decimal below the spread.
+
+    >>> round_reference(438.54, 4.2)
+    440.0
+    """
+    if spread <= 0.0:
+        return mean
+    step = 10.0 ** np.floor(np.log10(4.0 * spread))
+    rounded = float(np.round(mean / step) * step)
+    return float(f"{rounded:.6g}") or mean

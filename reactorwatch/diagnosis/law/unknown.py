@@ -1,0 +1,219 @@
+"""Find where an unknown acts, and its law.
+
+A smooth correction in each place is fitted inside the simulation (`shapes`, `fit`), first with the process noise of the
+nominal filter, which keeps the fit near the record, then without. Where the best correction leaves a coloured residual,
+noise levels are estimated under it, process noise too; then the nearest places are fitted again. In the best places
+formulas are sought (`formula`). A location's evidence is the best BIC of its corrections and formulas.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import HUBER
+from reactorwatch.diagnosis.fitting.hypothesis import Fit
+from reactorwatch.diagnosis.law.fit import ShapeFit, ShapeFitter
+from reactorwatch.diagnosis.law.formula import FormulaSearch, law_shape
+from reactorwatch.diagnosis.law.path import scales_along, variables_along
+from reactorwatch.diagnosis.law.shapes import Scale, make_shape
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.sensor_noise import estimate_sensor_noise
+from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p
+from reactorwatch.process.law import ExtendedLaw
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.places import Place, places_of
+
+FIRST_STEPS, STEPS = 2, 4
+"""Gauss-Newton steps with the nominal filter's process noise, and without."""
+
+NEAR = 60.0
+"""Threshold in BIC: formulas are sought in places that are worse than the best by less."""
+
+NEAREST = 2
+"""Number of places in which formulas are sought."""
+
+PROMISING = 4
+"""Number of places that are fitted without process noise, at least."""
+
+SMALLEST_SHARE = 0.5
+"""Smallest noise of a sensor, as a fraction of the estimate from its highest frequencies."""
+
+FAR = 1000.0
+"""Threshold in BIC: places that are worse by more are not fitted again with other noise levels."""
+
+FORMULAS = 4
+"""Forms that are fitted inside the simulation."""
+
+WORTH = 30.0
+"""Threshold in BIC: forms whose prediction is worse than the best by more are not fitted."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedLaw:
+    """A law fitted inside the simulation.
+
+    Attributes:
+        law: the law with fitted parameters.
+        fit: fit of its parameters.
+        fitter: fitter, for covariances.
+        place: place of the law.
+    """
+
+    law: ExtendedLaw
+    fit: ShapeFit
+    fitter: ShapeFitter
+    place: Place
+
+    @property
+    def bic(self) -> float:
+        """BIC of the fit."""
+        return self.fit.bic
+
+    def noise_sd(self, model: ProcessModel) -> Array:
+        """Standard deviation of each sensor's noise, shape (n_y,)."""
+        return self.fitter.ekf.noise.sensor_sd(model.output_names)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceFit:
+    """The best smooth correction of a place."""
+
+    place: Place
+    fit: ShapeFit
+    fitter: ShapeFitter
+
+
+@dataclass(frozen=True, eq=False)
+class Unknown:
+    """Evidence about an unknown.
+
+    Attributes:
+        places: smooth corrections, the best first.
+        laws: laws, the best first; empty: no formula comes near the smooth correction.
+        noise: noise levels of all of them.
+        log_p: largest minus decimal logarithm of the p-value that the innovations of the best one are white.
+    """
+
+    places: tuple[PlaceFit, ...]
+    laws: tuple[FittedLaw, ...]
+    noise: Noise
+    log_p: float
+
+    @property
+    def bic(self) -> float:
+        """BIC of the best correction or law."""
+        return min([self.places[0].fit.bic, *(law.bic for law in self.laws)])
+
+    @property
+    def locations(self) -> dict[str, float]:
+        """BIC of each location over that of the best, the best first."""
+        result: dict[str, float] = {}
+        for location, bic in (
+            *((item.place.location, item.fit.bic) for item in self.places),
+            *((item.place.location, item.bic) for item in self.laws),
+        ):
+            result[location] = min(bic - self.bic, result.get(location, np.inf))
+        return dict(sorted(result.items(), key=lambda item: item[1]))
+
+
+def fit_places(model: ProcessModel, run: Run, nominal: Fit, noise: Noise) -> Unknown:
+    """Fit smooth corrections in all places of a process.
+
+    Args:
+        model: process model of the plant.
+        run: the record.
+        nominal: fit without any cause.
+        noise: noise levels of its filter.
+    """
+    declared, period_min = places_of(model), float(np.median(np.diff(run.time_min)))
+    places = [place for place in declared if not any(place.name == item.apart for item in declared)]
+    scales = scales_along(model, run, nominal.innovations.x, declared)
+    residual = nominal.innovations.residual
+    sensor_sd = estimate_sensor_noise(noise, model.output_names, residual, run.measured, period_min)
+    own = len(model.states)  # states of uncertain parameters follow
+    wide = Noise(tuple(sensor_sd.tolist()), noise.process_sd[:own], noise.colored)
+    free = Noise(wide.measurement_sd, (0.0,) * own, noise.colored)
+    alone, apart = ([place for place in places if bool(place.apart) is flag] for flag in (False, True))
+    fits = _fit_all([_start(model, place, scales, run, wide) for place in alone], free)
+    if _log_p(fits[0].fit, run) >= DOUBTFUL or any(item.location == fits[0].place.location for item in apart):
+        fits += _fit_all([_start(model, place, scales, run, wide) for place in apart], free)
+        fits.sort(key=_bic)
+    levels = _likely_noise(model, run, fits[0], free, wide)
+    fits = sorted((_refit(item, levels) for item in fits if item.fit.bic < fits[0].fit.bic + FAR), key=_bic)
+    return Unknown(tuple(fits), (), levels, _log_p(fits[0].fit, run))
+
+
+def find_laws(model: ProcessModel, run: Run, found: Unknown) -> Unknown:
+    """Fit laws in the best places."""
+    laws: list[FittedLaw] = []
+    for item in found.places[:NEAREST]:
+        if item.fit.bic < found.places[0].fit.bic + NEAR:
+            laws += _find_laws(model, item, run, found.noise)
+    if not laws:
+        return found
+    laws.sort(key=lambda item: item.bic)
+    best = min(found.places[0].fit, laws[0].fit, key=lambda item: item.bic)
+    return replace(found, laws=tuple(laws), log_p=_log_p(best, run))
+
+
+def _likely_noise(model: ProcessModel, run: Run, best: PlaceFit, free: Noise, wide: Noise) -> Noise:
+    """Noise levels under the best correction or, if that has a kink between two hinges, under a law.
+
+    Process noise is estimated only where the residual calls for it.
+    """
+    fits = [best.fit]
+    if _log_p(best.fit, run) >= DOUBTFUL:
+        fits += [law.fit for law in _find_laws(model, best, run, free)[:1]]
+    fit = min(fits, key=lambda item: item.bic)
+    if _log_p(fit, run) < DOUBTFUL:
+        rms = np.sqrt(np.nanmean(np.square(np.clip(fit.evaluation.w, -HUBER, HUBER)), axis=0))
+        return Noise(tuple((np.array(free.measurement_sd) * rms).tolist()), free.process_sd, free.colored)
+    best.fitter.ekf.noise = wide
+    smallest = [SMALLEST_SHARE * item for item in wide.measurement_sd]
+    return best.fitter.ekf.estimate_noise(run, best.fitter.signals(best.fit.coefficients), smallest)
+
+
+def _start(model: ProcessModel, place: Place, scales: Mapping[str, Scale], run: Run, wide: Noise) -> PlaceFit:
+    """First steps of a fit, with process noise."""
+    fitter = ShapeFitter(make_shape(model, place, scales), run, wide)
+    return PlaceFit(place, fitter.fit(np.zeros(len(fitter.shape.effects)), wide, FIRST_STEPS), fitter)
+
+
+def _fit_all(started: list[PlaceFit], free: Noise) -> list[PlaceFit]:
+    """Fits without process noise of the most promising places, the best first."""
+    started = sorted(started, key=_bic)
+    near = [item for i, item in enumerate(started) if i < PROMISING or item.fit.bic < started[0].fit.bic + NEAR]
+    return sorted((_refit(item, free) for item in near), key=_bic)
+
+
+def _refit(item: PlaceFit, noise: Noise) -> PlaceFit:
+    return replace(item, fit=item.fitter.fit(item.fit.coefficients, noise, STEPS))
+
+
+def _bic(item: PlaceFit) -> float:
+    return item.fit.bic
+
+
+def _log_p(fit: ShapeFit, run: Run) -> float:
+    return float(np.max(minus_log10_p(fit.evaluation.w, run.inputs)))
+
+
+def _find_laws(model: ProcessModel, item: PlaceFit, run: Run, noise: Noise) -> list[FittedLaw]:
+    """Best forms in a place, fitted inside the simulation."""
+    dynamics = item.fitter.dynamics(item.fit)
+    lag_min = item.fit.shape.lag_min(item.fit.coefficients)
+    variables = variables_along(model, run, item.fit.evaluation.innovations.x, item.place, lag_min)
+    candidates = FormulaSearch(item.place, item.fit, dynamics, run, variables).candidates()
+    result = []
+    for candidate in candidates[:FORMULAS]:
+        if candidate.bic > candidates[0].bic + WORTH:
+            break
+        fitter = ShapeFitter(law_shape(model, item.place, candidate.law), run, noise)
+        fit = fitter.fit(np.zeros(len(candidate.law.parameters)), noise, STEPS, select=False)
+        values = dict(zip(candidate.law.parameters, fit.coefficients.tolist(), strict=True))
+        moved = {name: value + values[name] for name, value in candidate.law.parameters.items()}
+        result.append(FittedLaw(replace(candidate.law, parameters=moved), fit, fitter, item.place))
+    return sorted(result, key=lambda item: item.bic)
