@@ -111,7 +111,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
             nearest number that the charts can keep for the number of alarms and the sampling period.
         smallest_sd: least standard deviation of the residual by output, in its unit; smaller deviations do not matter.
-        isolation: true to search the cause of an alarm, if the reference is the reactor's equations.
+        isolation: true to search the cause of an alarm, if the equations of a catalogued process judge.
         isolation_rows: number of newest rows in that search.
         raise_count: number of violating points among the last `window` that raises the Shewhart chart's alarm.
         window: number of points in which `raise_count` is counted.
@@ -174,7 +174,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         check_plant(self.plant)
         check_rule(self.raise_count, self.window, self.clear_count)
-        every = (*self.signals, *self.carried, *self.labels)
+        every = (*self.signals, *self.carried_signals, *self.labels)
         if not self.outputs or len(set(every)) != len(every):
             beside = (
                 f", and {', '.join(every[len(self.signals) :])} beside them" if len(every) > len(self.signals) else ""
@@ -236,7 +236,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         return (*self.inputs, *self.outputs)
 
     @property
-    def carried(self) -> tuple[str, ...]:
+    def carried_signals(self) -> tuple[str, ...]:
         """Signals beside the rows that go with an alarm: set points, then modes."""
         return (*self.setpoints, *self.modes)
 

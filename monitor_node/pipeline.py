@@ -132,6 +132,7 @@ class PlantPipeline:
         self._step: RowStep | None = None
         self._kalman: FilterNumbers | None = None
         self._row = np.empty(len(config.signals))
+        self._inputs = len(config.inputs)
         self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
@@ -289,6 +290,11 @@ class PlantPipeline:
         return max(self._config.training_length.share((last_ns - self._began_ns) / MINUTE_NS, self._training.rows), 0.0)
 
     @property
+    def unjudged_rows(self) -> int:
+        """Number of rows that a black box did not judge, as it knew too little of the point of operation."""
+        return self._reference.unjudged if isinstance(self._reference, BlackBoxReference) else 0
+
+    @property
     def refused_trainings(self) -> int:
         """Number of refused trainings."""
         return self._refusals
@@ -310,10 +316,10 @@ class PlantPipeline:
         if self._update.changes:
             self._change_model(time_ns, publications)
         interval = self._sampling.update(time_ns)
-        inputs, values = self._split(row.values)
+        inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
         follows = interval.follows and not row.restarted
         measured = MeasuredRow(time_ns, inputs, values, units, interval, follows, publications)
-        if self.is_normal and not row.restarted and self._step_row(measured):
+        if self.is_normal and not row.restarted and self._step_row(measured, row.values):
             return
         self._leave_normal()
         if row.restarted:
@@ -321,8 +327,8 @@ class PlantPipeline:
         self.operation.inputs = inputs
         publications.extend(self.signals.check_row(time_ns, row.values))
         if self._is_process or self._config.bounds:
-            inputs, values = self._split(self.signals.mask_values(time_ns, row.values, publications))
-            measured.inputs, measured.values = inputs, values
+            usable = self.signals.mask_values(time_ns, row.values, publications)
+            measured.inputs, measured.values = usable[: self._inputs], list(usable[self._inputs :])
         if self._reference is None:
             self._train(measured)
         else:
@@ -332,29 +338,27 @@ class PlantPipeline:
             self.is_normal = self._find_normal(time_ns)
         self.operation.inputs = ()
 
-    def _split(self, values: tuple[float, ...]) -> tuple[tuple[float, ...], list[float]]:
-        """Inputs and outputs of a row."""
-        inputs = len(self._config.inputs)
-        return values[:inputs], list(values[inputs:])
-
     def snapshots(self, time_ns: int) -> list[Publication]:
         """Snapshots of each output's models: the adaptive one, the one fitted to the training, and the reference.
 
-        With the equations as reference, the fitted model is only compared with the adaptive one.
+        With another reference than `arx`, the fitted model is only compared with the adaptive one.
         """
         publications: list[Publication] = []
         if not self._points:
             return publications
         reference = self._reference
-        for key, output, predictor in zip(self._model_keys, self._config.outputs, self._predictors, strict=True):
+        outputs = zip(self._model_keys, self._config.outputs, self._predictors, strict=True)
+        for index, (key, output, predictor) in enumerate(outputs):
             adaptive, fitted = predictor.adaptive_snapshot(), predictor.reference_snapshot()
-            equations = _filter_snapshot(reference, output) if isinstance(reference, ProcessReference) else None
+            judging = _filter_snapshot(reference, output) if isinstance(reference, ProcessReference) else None
+            if isinstance(reference, BlackBoxReference):
+                judging = reference.snapshot(index, self._config.inputs, self._config.outputs)
             if fitted is not None:
                 fitted.held, fitted.reference = True, isinstance(reference, ArxReference)
-            for snapshot in (fitted, equations):
+            for snapshot in (fitted, judging):
                 if snapshot is not None:
                     snapshot.checks.extend(self._checks)
-            for snapshot in (adaptive, fitted, equations):
+            for snapshot in (adaptive, fitted, judging):
                 if snapshot is not None:
                     snapshot.time_ns = time_ns
                     publications.append(Publication(key, snapshot))
@@ -556,7 +560,7 @@ class PlantPipeline:
         """Search the causes of alarms; an error there costs the state of the search, and no alarm."""
         assert self._suspicion is not None
         try:
-            return self._suspicion.update(row.time_ns, row.inputs[0], row.values, row.units, list(stuck))
+            return self._suspicion.update(row.time_ns, row.inputs, row.values, row.units, list(stuck))
         except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
             self._failures.add("isolation", error, "the search for the cause of this alarm starts again")
             assert self._reference is not None
@@ -595,20 +599,19 @@ class PlantPipeline:
             self._charts.store(self._numbers[0])
             self.is_normal = False
 
-    def _step_row(self, row: MeasuredRow) -> bool:
+    def _step_row(self, row: MeasuredRow, values: tuple[float, ...]) -> bool:
         """Process a row by the compiled step; returns False if it is an event, for which nothing has changed."""
         assert self._step is not None
         assert self._kalman is not None
         assert isinstance(self._reference, ProcessReference | BlackBoxReference)
         time_ns, time_min = row.time_ns, row.time_ns / MINUTE_NS
-        count = len(row.inputs)
-        self._row[:count], self._row[count:] = row.inputs, row.values
+        self._row[:] = values
         verdict = self._step.update(self._numbers, self._kalman, time_ns, time_min, self._row)
         if verdict == EVENT:
             return False
         if verdict == VIOLATING:
             self._charts.store_delays(self._numbers[0])
-        self._reference.accept_row(time_min, tuple(row.inputs))
+        self._reference.accept_row(time_min, row.inputs)
         self.rows_watched += 1
         if self._points:
             self._publish_step(row)
@@ -616,7 +619,7 @@ class PlantPipeline:
             self._buffer(row)
             row.publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
-            self._suspicion.add(time_min, row.inputs[0], row.values)
+            self._suspicion.add(time_min, row.inputs, row.values)
         return True
 
     def _publish_step(self, row: MeasuredRow) -> None:
@@ -636,10 +639,10 @@ class PlantPipeline:
         assert reference is not None
         if self.left_out:
             self._note_late_signals(row.inputs, row.values)
-            row.inputs = [  # as in the training
+            row.inputs = tuple(  # as in the training
                 0.0 if name in self.left_out else value
                 for name, value in zip(self._config.inputs, row.inputs, strict=True)
-            ]
+            )
             row.values = [
                 value if evaluated else nan for value, evaluated in zip(row.values, self._evaluated, strict=True)
             ]
@@ -658,8 +661,8 @@ class PlantPipeline:
             for whitener in self._whiteners:
                 whitener.restart()
         predictions, sds = reference.update(time_ns, row.inputs, values, self._quarantined, row.interval.missing)
-        if isinstance(reference, ArxReference):
-            self._note_inputs_beyond(reference, row.inputs)
+        if isinstance(reference, ArxReference) and reference.beyond:
+            self._note_inputs_beyond(reference.beyond)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
@@ -681,10 +684,15 @@ class PlantPipeline:
             publications.extend(self._search_causes(row, stuck))
         if isinstance(reference, BlackBoxReference):
             reference.set_learning(not self._board.has_unexplained)
+            if reference.unjudged and reference.kind not in self._noted:
+                self._noted.add(reference.kind)
+                self.notes.append(
+                    "rows are not judged while inputs have values that the black box has not learned, and teach it"
+                )
 
-    def _note_inputs_beyond(self, reference: ArxReference, inputs: Sequence[float]) -> None:
+    def _note_inputs_beyond(self, indices: list[int]) -> None:
         """Note once each input that leaves its range in the training, as rows are not judged then."""
-        for name in (self._config.inputs[i] for i in reference.find_beyond(inputs)):
+        for name in (self._config.inputs[i] for i in indices):
             if name not in self._noted:
                 self._noted.add(name)
                 self.notes.append(

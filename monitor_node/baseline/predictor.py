@@ -179,7 +179,8 @@ class ArxPredictor:
         if not follows:
             self._buffer.restart()
         scaled = (value - centre) / spread
-        regressor = self._buffer.update(time_ns, self._scale_inputs(inputs), [scaled])
+        scales = zip(inputs, self._input_scales, strict=False)  # all inputs, or none of a simpler structure
+        regressor = self._buffer.update(time_ns, [(u - middle) / size for u, (middle, size) in scales], [scaled])
         if regressor is None:
             return nan
         innovation = self._rls.update(regressor, scaled)
@@ -295,7 +296,8 @@ class ArxPredictor:
                 buffer.restart()
                 continue
             scaled = (value - centre) / spread
-            regressor = buffer.update(time_ns, self._scale_inputs(inputs), [scaled])
+            scales = zip(inputs, self._input_scales, strict=False)
+            regressor = buffer.update(time_ns, [(u - middle) / size for u, (middle, size) in scales], [scaled])
             if regressor is not None:
                 learn_row(regressor, scaled)
                 self._compare(regressor)
@@ -330,10 +332,6 @@ class ArxPredictor:
         self._scaling = scaling
         self._input_scales = list(zip(scaling.input_centres, scaling.input_spreads, strict=True))
         self._output_scale = scaling.output_centres[0], scaling.output_spreads[0]
-
-    def _scale_inputs(self, inputs: Sequence[float]) -> list[float]:
-        """Scaled inputs that the models have: all or none."""
-        return [(value - centre) / spread for value, (centre, spread) in zip(inputs, self._input_scales, strict=False)]
 
     def _snapshot(
         self, scaled: Array, scaled_covariance: Array, condition: float, rows: int, forgetting: float

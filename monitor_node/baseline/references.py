@@ -7,7 +7,7 @@ serves any plant, but only within the inputs of its training; other rows are not
 """
 
 from collections.abc import Sequence
-from math import isfinite, nan
+from math import isfinite, nan, sqrt
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -31,6 +31,10 @@ MOST_UNKNOWN = 1
 
 MARGIN = 0.1
 """Share of an input's range in training by which it may be beyond it."""
+
+MOST_LEVERAGE = 0.2
+"""Largest variance of a prediction due to an input's coefficient, in variances of the residual. Several inputs are
+often those of controllers, which leave their range with a fault: rows are judged as far as models are determined."""
 
 
 class RowPrediction(NamedTuple):
@@ -321,6 +325,9 @@ class ArxReference:
         self._sds = [1.0] * len(state.uses_inputs)
         self.predictions: list[float] = []
         """Predictions of the next row, one an output."""
+        self.beyond: list[int] = []
+        """Indices of the inputs of the newest row that are beyond the training, for models that have them."""
+        self._ranges = list(enumerate(zip(state.low, state.high, strict=True))) if True in state.uses_inputs else []
 
     @classmethod
     def of_training(cls, inputs: Array, uses_inputs: list[bool]) -> "ArxReference":
@@ -335,6 +342,10 @@ class ArxReference:
             finite = column[np.isfinite(column)]
             low, high = (float(finite.min()), float(finite.max())) if finite.size else (-np.inf, np.inf)
             margin = MARGIN * (high - low)
+            if inputs.shape[1] > 1 and finite.size:  # an input that did not move has no coefficient
+                reach = float(finite.std()) * sqrt(MOST_LEVERAGE * finite.size) if high > low else np.inf
+                middle = 0.5 * (low + high)
+                margin = max(margin, reach - (high - middle))
             lows.append(low - margin)
             highs.append(high + margin)
         return cls(ArxReferenceState(lows, highs, uses_inputs))
@@ -343,17 +354,11 @@ class ArxReference:
         self, time_ns: int, inputs: Sequence[float], values: list[float], accept: tuple[bool, ...], missing: int = 0
     ) -> RowPrediction:
         """See `Reference`. There is no prediction with an input beyond the training, nor after a missing row."""
-        if not self.find_beyond(inputs):
+        self.beyond = [i for i, (low, high) in self._ranges if inputs[i] < low or inputs[i] > high]
+        if not self.beyond:
             return RowPrediction(self.predictions, self._sds)
         pairs = zip(self.predictions, self.state.uses_inputs, strict=True)
         return RowPrediction([nan if uses_inputs else prediction for prediction, uses_inputs in pairs], self._sds)
-
-    def find_beyond(self, inputs: Sequence[float]) -> list[int]:
-        """Indices of the inputs that are beyond the training, for models that have them."""
-        if True not in self.state.uses_inputs:
-            return []
-        ranges = zip(self.state.low, inputs, self.state.high, strict=True)
-        return [i for i, (low, value, high) in enumerate(ranges) if value < low or value > high]
 
     def restart(self) -> None:
         """Do nothing: the models restart by themselves."""

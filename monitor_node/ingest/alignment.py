@@ -12,7 +12,6 @@ The policy uses sample times alone, so that a replay reproduces the live run exa
   explain means a restart of the publisher: pending rows are emitted, and a new run starts.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import nan
 from typing import NamedTuple
@@ -54,7 +53,7 @@ class MeasuredRow:
     """
 
     time_ns: int
-    inputs: Sequence[float]
+    inputs: tuple[float, ...]
     values: list[float]
     units: list[str]
     interval: Interval

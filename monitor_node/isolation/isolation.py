@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from math import exp, inf, isfinite, log, nan
 
 from monitor_node.isolation.candidate import Candidate, Progress, ProgressState
-from monitor_node.isolation.causes import CAUSES
+from monitor_node.isolation.causes import causes_of
 from monitor_node.isolation.fit import Fitter
 from monitor_node.isolation.glr_scan import GlrScan
 from monitor_node.isolation.residual import log_evidence_of_residual
@@ -34,7 +34,7 @@ from monitor_node.isolation.window import Row, newest_rows, window_of
 from reactorwatch.diagnosis.fitting.profiles import Ramp, Step
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.kalman.step_budget import BudgetExceededError, StepBudget
-from reactorwatch.process.effect import Effect
+from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import ProcessModel
 
 UNKNOWN, SENSOR, PROCESS = "unknown", "sensor", "process"
@@ -84,7 +84,7 @@ class Isolation:
         model: process model of the plant.
         noise: noise levels of the plant and its sensors.
         usual_rows: usual number of rows of a look, which its budget depends on.
-        effects: effects of the causes; those that add states are left out.
+        effects: effects of the causes; those that add states are left out. None: `causes_of` the model.
         excluded: names of causes to leave out.
 
     Attributes:
@@ -98,11 +98,12 @@ class Isolation:
         model: ProcessModel,
         noise: NoiseLevels,
         usual_rows: int = 600,
-        effects: Sequence[Effect] = CAUSES,
+        effects: Sequence[Effect] | None = None,
         excluded: Sequence[str] = (),
     ) -> None:
         self.steps = LOOK_STEPS + LOOK_STEPS_A_ROW * usual_rows
         # An effect that adds a state has no infinitesimal deviation.
+        effects = causes_of(model) if effects is None else effects
         linearisable = (effect for effect in effects if effect.extend(model).state_names == model.state_names)
         self._effects = tuple(effect for effect in linearisable if effect.name not in excluded)
         self._nominal = Filter(model, noise)
@@ -180,7 +181,7 @@ def _log_evidence(item: Candidate) -> float:
 
 
 def _suspect(item: Candidate, probability: float) -> Suspect:
-    kind = SENSOR if item.effect.location.endswith("_sensor") else PROCESS
+    kind = SENSOR if isinstance(item.effect, SensorEffect) else PROCESS
     size, onset_min = item.parameters[:2].tolist()
     profile = (Step if item.profile is Step else Ramp).name
     return Suspect(item.effect.name, profile, probability, size, item.size_sd, onset_min, item.onset_sd_min, kind)

@@ -22,10 +22,10 @@ START_STEPS, START_STEPS_A_ROW = 25_000 + STEPS_PER_PREDICTION * MOST_PIECES, ST
 
 
 class ReconstructionState(StoredState, frozen=True):
-    """State of a reconstruction: that of the filter, and the last known input; NaN before the first."""
+    """State of a reconstruction: that of the filter, and the last known inputs; NaN before the first."""
 
     filter: FilterState
-    last_input: float
+    last_inputs: list[float]
 
 
 class Reconstruction:
@@ -45,47 +45,46 @@ class Reconstruction:
         self._filter = Filter(model, noise)
         self._index = index
         self._variance = noise.measurement_sd[index] ** 2
-        self._input = nan
+        self._inputs = [nan] * len(model.inputs)
         past = newest_rows(list(rows))
         self._filter.budget = StepBudget(START_STEPS + START_STEPS_A_ROW * len(past))
         try:
-            for time_min, input_value, measured in past:
-                self._step(time_min, input_value, measured, is_right=time_min < onset_min - MARGIN_MIN)
+            for time_min, inputs, measured in past:
+                self._step(time_min, inputs, measured, is_right=time_min < onset_min - MARGIN_MIN)
         except BudgetExceededError:  # the filter diverges again and again: start with the next row instead
             self._filter.restart()
         self._filter.budget = None
 
     @property
     def state(self) -> ReconstructionState:
-        """State of the filter and the last known input."""
-        return ReconstructionState(self._filter.state, self._input)
+        """State of the filter and the last known inputs."""
+        return ReconstructionState(self._filter.state, list(self._inputs))
 
     def restore(self, state: ReconstructionState) -> None:
         """Resume from the state of another reconstruction of the same sensor."""
-        self._filter.state, self._input = state.filter, state.last_input
+        self._filter.state, self._inputs = state.filter, list(state.last_inputs)
 
-    def update(self, time_min: float, input_value: float, measured: Sequence[float]) -> tuple[float, float]:
+    def update(self, time_min: float, inputs: Sequence[float], measured: Sequence[float]) -> tuple[float, float]:
         """Process a row and return the true reading without noise and its standard deviation, in the output's unit.
 
         Both are NaN in the row with which the filter starts.
 
         Args:
             time_min: time of the row.
-            input_value: input; NaN if missing: the last known one then holds.
+            inputs: one value an input; NaN if missing: the last known one then holds.
             measured: values of all sensors; NaN where missing.
         """
-        return self._step(time_min, input_value, measured, is_right=False)
+        return self._step(time_min, inputs, measured, is_right=False)
 
     def _step(
-        self, time_min: float, input_value: float, measured: Sequence[float], *, is_right: bool
+        self, time_min: float, inputs: Sequence[float], measured: Sequence[float], *, is_right: bool
     ) -> tuple[float, float]:
-        if isfinite(input_value):
-            self._input = input_value
-        if not isfinite(self._input):
+        self._inputs = [now if isfinite(now) else last for now, last in zip(inputs, self._inputs, strict=True)]
+        if not all(map(isfinite, self._inputs)):
             return nan, nan
         seen = list(measured)
         if not is_right:
             seen[self._index] = nan
-        found = self._filter.update(time_min, (self._input,), seen)
+        found = self._filter.update(time_min, self._inputs, seen)
         variance = found.sd[self._index] ** 2 - self._variance
         return found.prediction[self._index], sqrt(max(variance, 0.0)) if variance == variance else nan

@@ -10,7 +10,7 @@ The result depends on the samples alone. While the most likely cause is a sensor
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 
 import msgspec
@@ -20,7 +20,7 @@ from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.references import ProcessReference, output_indices
 from monitor_node.config import MonitorConfig
 from monitor_node.isolation.candidate import ProgressState
-from monitor_node.isolation.causes import CAUSES
+from monitor_node.isolation.causes import causes_of
 from monitor_node.isolation.isolation import UNKNOWN, Isolation, Suspect
 from monitor_node.isolation.reconstruction import Reconstruction, ReconstructionState
 from monitor_node.isolation.window import Row, newest_rows
@@ -29,7 +29,6 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Reconstruction as ReconstructionMessage
 from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.effect import SensorEffect
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
@@ -48,9 +47,6 @@ LEAST = 0.01
 
 CONVINCED = 0.5
 """Probability from which a suspected sensor is reconstructed."""
-
-EFFECTS = {effect.name: effect for effect in CAUSES}
-OUTPUTS = {effect.name: effect.output for effect in CAUSES if isinstance(effect, SensorEffect)}
 
 
 def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[None]:
@@ -74,15 +70,15 @@ def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[N
 
 
 def has_causes(config: MonitorConfig, model: ProcessModel) -> bool:
-    """Return true if causes are searched with this model; the catalogue of causes is that of the reactor."""
-    return config.isolation and model.name == cstr().name
+    """Return true if causes are searched with this model: the catalogue has some, and the plant is driven."""
+    return config.isolation and bool(model.inputs and causes_of(model))
 
 
 class SuspicionState(StoredState, frozen=True):
     """State of the search for causes.
 
     Attributes:
-        rows: newest rows as doubles: time in minutes, input, outputs of the model.
+        rows: newest rows as doubles: time in minutes, inputs, outputs of the model.
         incident: number of the latest incident with a search.
         since: number of rows since its first alarm; None: no active alarm has an unknown cause.
         way: `ProgressState` of a large fault; None without one. Earlier versions stored another structure, which is
@@ -114,8 +110,10 @@ class Suspicion:
         self._config, self._board, self._reference = config, board, reference
         self._indices = output_indices(reference.model, config.outputs)
         self._all_watched = self._indices == list(range(len(reference.model.outputs)))
+        self._effects = {effect.name: effect for effect in causes_of(reference.model)}
         self._isolation: Isolation | None = None
-        self._rows: deque[Row] = deque(maxlen=config.isolation_rows)
+        # Flat, as most of the memory of a plant: time in minutes, inputs, outputs of the model.
+        self._rows: deque[tuple[float, ...]] = deque(maxlen=config.isolation_rows)
         self._incident = 0
         self._since: int | None = None
         self._reconstruction: Reconstruction | None = None
@@ -126,7 +124,7 @@ class Suspicion:
         """A copy of the state."""
         progress = None if self._isolation is None else self._isolation.progress
         return SuspicionState(
-            pack_numbers([(time_min, input_value, *measured) for time_min, input_value, measured in self._rows]),
+            pack_numbers(list(self._rows)),
             self._incident,
             self._since,
             None if progress is None else msgspec.to_builtins(progress),
@@ -144,8 +142,7 @@ class Suspicion:
         model = self._reference.model
         self._incident = state.incident
         self._set_since(state.since)
-        rows = unpack_numbers(state.rows, 2 + len(model.outputs)).tolist()
-        self._rows.extend((row[0], row[1], row[2:]) for row in rows)
+        self._rows.extend(map(tuple, unpack_numbers(state.rows, 1 + len(model.inputs) + len(model.outputs)).tolist()))
         if state.way is not None:
             with suppress(msgspec.ValidationError):  # stored by an earlier version
                 self._made_isolation().progress = msgspec.convert(state.way, ProgressState)
@@ -156,19 +153,19 @@ class Suspicion:
         self._output, self._cause = state.output, state.cause
 
     def update(
-        self, time_ns: int, input_value: float, values: list[float], units: list[str], stuck: list[bool]
+        self, time_ns: int, inputs: Sequence[float], values: list[float], units: list[str], stuck: list[bool]
     ) -> list[Publication]:
         """Process a row after its alarms.
 
         Args:
             time_ns: time of the row.
-            input_value: input; NaN if missing.
+            inputs: one value an input; NaN if missing.
             values: outputs; NaN where missing.
             units: units of the outputs.
             stuck: flags of the outputs whose sensors are stuck; their values are missing.
         """
         time_min = time_ns / MINUTE_NS
-        measured = self.add(time_min, input_value, values)
+        measured = self.add(time_min, inputs, values)
         board = self._board
         if not board.has_unexplained and True not in stuck:  # the usual case
             self._reconstruction = None
@@ -176,10 +173,10 @@ class Suspicion:
                 self._set_since(None)
             return []
         if True in stuck:
-            self._reconstruct(self._config.outputs[stuck.index(True)], STUCK_SENSOR, time_min, list(self._rows)[:-1])
+            self._reconstruct(self._config.outputs[stuck.index(True)], STUCK_SENSOR, time_min, self._split_rows()[:-1])
         elif self._cause == STUCK_SENSOR or not board.has_unexplained:
             self._reconstruction = None
-        publications = self._publish_reconstruction(time_ns, input_value, measured, values, units)
+        publications = self._publish_reconstruction(time_ns, inputs, measured, values, units)
         if not board.has_unexplained:
             self._set_since(None)
             return publications
@@ -210,23 +207,27 @@ class Suspicion:
     def _rows_of_look(self, since: int) -> list[Row]:
         """Rows for a look: the usual number, and later `ROWS_BEFORE` rows before the first alarm and all since."""
         usual = self._config.isolation_rows
-        return list(self._rows)[-max(usual, min(usual, ROWS_BEFORE) + since) :]
+        return self._split_rows()[-max(usual, min(usual, ROWS_BEFORE) + since) :]
+
+    def _split_rows(self) -> list[Row]:
+        inputs = 1 + len(self._reference.model.inputs)
+        return [(row[0], row[1:inputs], row[inputs:]) for row in self._rows]
 
     def _look(self, time_ns: int, since: int) -> list[Publication]:
         isolation = self._made_isolation()
         suspects = isolation.suspects(self._rows_of_look(since), min(since, FEW_ROWS))
-        causes = [_suspected_cause(item) for item in suspects if item.probability >= LEAST]
+        causes = [self._suspected_cause(item) for item in suspects if item.probability >= LEAST]
         publications = self._board.set_suspects(time_ns, causes, stopped=isolation.stopped)
         self._follow(suspects[0])
         return publications
 
-    def add(self, time_min: float, input_value: float, values: list[float]) -> list[float]:
+    def add(self, time_min: float, inputs: Sequence[float], values: list[float]) -> list[float]:
         """Add a row; returns its outputs of the model."""
         measured = self._model_outputs(values)
         if self._rows and time_min <= self._rows[-1][0]:  # the plant's clock was set back
             self._rows.clear()
             self._isolation = None
-        self._rows.append((time_min, input_value, measured))
+        self._rows.append((time_min, *inputs, *measured))
         return measured
 
     def _made_isolation(self) -> Isolation:
@@ -247,9 +248,10 @@ class Suspicion:
 
     def _follow(self, suspect: Suspect) -> None:
         """Start or stop the reconstruction of a sensor."""
-        output = OUTPUTS.get(suspect.cause, "")
+        effect = self._effects.get(suspect.cause)
+        output = effect.output if isinstance(effect, SensorEffect) else ""
         if suspect.probability >= CONVINCED and output in self._config.outputs:
-            self._reconstruct(output, suspect.cause, suspect.onset_min, self._rows)
+            self._reconstruct(output, suspect.cause, suspect.onset_min, self._split_rows())
         elif self._cause != STUCK_SENSOR:
             self._reconstruction = None
 
@@ -262,31 +264,30 @@ class Suspicion:
         self._output, self._cause = output, cause
 
     def _publish_reconstruction(
-        self, time_ns: int, input_value: float, measured: list[float], values: list[float], units: list[str]
+        self, time_ns: int, inputs: Sequence[float], measured: list[float], values: list[float], units: list[str]
     ) -> list[Publication]:
         if self._reconstruction is None:
             return []
-        value, sd = self._reconstruction.update(time_ns / MINUTE_NS, input_value, measured)
+        value, sd = self._reconstruction.update(time_ns / MINUTE_NS, inputs, measured)
         index = self._config.outputs.index(self._output)
         message = ReconstructionMessage(
             time_ns=time_ns, value=value, sd=sd, unit=units[index], measured=values[index], cause=self._cause
         )
         return [Publication(keys.key(self._config.plant, keys.RECONSTRUCTION, self._output), message)]
 
-
-def _suspected_cause(suspect: Suspect) -> SuspectedCause:
-    if suspect.cause == UNKNOWN:
-        return SuspectedCause(UNKNOWN, suspect.probability)
-    effect = EFFECTS[suspect.cause]
-    return SuspectedCause(
-        suspect.cause,
-        suspect.probability,
-        suspect.profile,
-        suspect.size,
-        suspect.size_sd,
-        effect.unit,
-        round(suspect.onset_min * MINUTE_NS),
-        suspect.onset_sd_min,
-        suspect.kind,
-        effect.describe(suspect.size),
-    )
+    def _suspected_cause(self, suspect: Suspect) -> SuspectedCause:
+        if suspect.cause == UNKNOWN:
+            return SuspectedCause(UNKNOWN, suspect.probability)
+        effect = self._effects[suspect.cause]
+        return SuspectedCause(
+            suspect.cause,
+            suspect.probability,
+            suspect.profile,
+            suspect.size,
+            suspect.size_sd,
+            effect.unit,
+            round(suspect.onset_min * MINUTE_NS),
+            suspect.onset_sd_min,
+            suspect.kind,
+            effect.describe(suspect.size),
+        )

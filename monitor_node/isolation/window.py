@@ -25,8 +25,8 @@ from reactorwatch.kalman.ekf import LONGEST_GAP_MIN, Filter, FilterState
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.kalman.input_uncertainty import InputUncertainty
 
-Row: TypeAlias = tuple[float, float, Sequence[float]]
-"""Time in minutes, input, outputs; missing values are NaN."""
+Row: TypeAlias = tuple[float, Sequence[float], Sequence[float]]
+"""Time in minutes, inputs, outputs; missing values are NaN."""
 
 BURN_IN_ROWS = 20
 """Number of rows at the start in which the filter settles: no onset is sought there."""
@@ -52,7 +52,7 @@ class Window:
 
     Attributes:
         time_min: shape (rows,).
-        inputs: shape (rows, 1).
+        inputs: shape (rows, n_u).
         measured: shape (rows, n_y); NaN where missing or an outlier.
         residual: innovations, shape (rows, n_y); NaN where missing or an outlier.
         used: mask of values that corrected the filter, shape (rows, n_y).
@@ -102,7 +102,7 @@ def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf)
         not_before_min: time before which nothing was wrong.
     """
     kept = _since_gap(_running_on(rows))
-    times, inputs = np.array([row[0] for row in kept]), np.array([[row[1]] for row in kept])
+    times, inputs = np.array([row[0] for row in kept]), np.array([row[1] for row in kept], dtype=float)
     first_onset = max(BURN_IN_ROWS, int(np.searchsorted(times, not_before_min)))
     if first_onset >= times.size:
         return None
@@ -183,7 +183,7 @@ def _count_missing(time_min: Array, inputs: Array) -> NDArray[np.intp] | None:
     """Number of missing rows before each row whose input differs from the row before; None if none are missing."""
     if time_min.size < 2:
         return None
-    spacing, changed = np.diff(time_min), inputs[1:, 0] != inputs[:-1, 0]
+    spacing, changed = np.diff(time_min), (inputs[1:] != inputs[:-1]).any(axis=1)
     period, missing = float(np.median(spacing)), np.zeros(time_min.size, dtype=np.intp)
     for row in np.flatnonzero(changed).tolist():
         missing[row + 1] = missing_rows(float(spacing[row]) / period)
@@ -209,13 +209,13 @@ def _stands_out(values: Array, sd: Array) -> NDArray[np.bool_]:
 def _running_on(rows: Sequence[Row]) -> list[Row]:
     """Select the newest rows with increasing times, inputs filled, from the first row with a measurement on."""
     kept: list[Row] = []
-    flow = nan
+    inputs: Sequence[float] = (nan,) * (len(rows[0][1]) if rows else 0)
     for row in rows:
         if kept and not row[0] > kept[-1][0]:
             kept = []
-        flow = row[1] if isfinite(row[1]) else flow
-        if isfinite(flow) and (kept or any(isfinite(value) for value in row[2])):
-            kept.append((row[0], flow, row[2]))
+        inputs = [now if isfinite(now) else last for now, last in zip(row[1], inputs, strict=True)]
+        if all(map(isfinite, inputs)) and (kept or any(isfinite(value) for value in row[2])):
+            kept.append((row[0], inputs, row[2]))
     return kept
 
 

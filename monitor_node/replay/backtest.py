@@ -158,7 +158,8 @@ def run(
         alarms.extend(item.message for item in publications if isinstance(item.message, Alarm))
 
     for message in _samples(messages, config.plant):
-        keep(monitor.on_message(message, message.received_ns))
+        if publications := monitor.on_message(message, message.received_ns):
+            keep(publications)
         if first_ns is None:
             first_ns = monitor.first_ns
     keep(monitor.finish())

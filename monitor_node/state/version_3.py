@@ -21,6 +21,9 @@ def upgrade(body: bytes) -> bytes:
         watched = fields["watch"]["watched"]
         if watched is not None:
             _upgrade_reference(watched["reference"], len(fields["settings"]["outputs"]))
+            reconstruction = watched["suspicion"] and watched["suspicion"]["reconstruction"]
+            if reconstruction:
+                reconstruction["last_inputs"] = [reconstruction.pop("last_input")]
     except (msgspec.DecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"the input cannot be read: {error}") from error
     return msgspec.msgpack.encode(fields)

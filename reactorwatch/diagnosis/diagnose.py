@@ -120,13 +120,14 @@ def diagnose(
         best = result.nominal
     remarks = [*_describe_record(record), *_describe_outliers(whole, run)]
     unknown: Localised | None = None
-    by_source = verdict == UNKNOWN and not np.any(adequacy >= DOUBTFUL)
     if verdict == UNKNOWN or np.any(adequacy >= DOUBTFUL) or (best.label and _may_be_unknown(result, best, model)):
         unknown = unknowns.localise()
+        by_source = verdict == UNKNOWN and not np.any(adequacy >= DOUBTFUL)
         if verdict == UNKNOWN or _is_unknown(unknown, result, best, run, float(np.max(adequacy))):
             verdict, best = UNKNOWN, result.nominal
-            location = location if by_source else unknown.location
-        elif unknown.gain_over(best, run) > -SURE and len(best.label) > 1:
+            if not by_source:
+                location = unknown.location
+        elif unknown.gain_over(best) > -SURE and len(best.label) > 1:
             verdict = AMBIGUOUS
             remarks.append(f"one unknown deviation in {unknown.location} explains the record as well")
         else:
@@ -136,11 +137,16 @@ def diagnose(
                 "the residual is small, but not white: the course in time may be rougher than the fitted profile"
             )
     best.hypothesis.filter.noise, result.nominal.hypothesis.filter.noise = result.noise, result.nominal_noise
-    law = unknown.law if unknown is not None and verdict == UNKNOWN and unknown.location == location else None
+    is_located = unknown is not None and verdict == UNKNOWN and unknown.location == location
+    law = unknown.law if unknown is not None and is_located else None
     if law is None:
         best, covariances = refine_parameters(search, best)
     else:
         best = law_hypothesis(law, run)
+        if unknown is not None and unknown.approximation > LISTED:
+            remarks.append(
+                f"the law is an approximation: a smooth correction there is better by {unknown.approximation:.0f} BIC"
+            )
         covariances, adequacy = covariances_of(run, best), minus_log10_p(best.fit.w, run.inputs)
     before, after = evaluate_holdout(run, result.nominal, best)
     curves = curves_of(whole, run, model, result.nominal, best, covariances)
@@ -203,7 +209,7 @@ def _is_unknown(unknown: Localised, result: SearchResult, best: FittedHypothesis
         run: the record.
         log_p: minus the decimal logarithm of the p-value that its innovations are white.
     """
-    better = unknown.is_better(best, run)
+    better = unknown.is_better(best)
     if log_p < WHITE:
         return better and bool(best.label)
     if not best.label or log_p >= (MUCH_RESIDUAL if len(best.label) == 1 else MUCH_RESIDUAL_OF_TWO):

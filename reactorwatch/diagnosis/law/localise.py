@@ -46,11 +46,15 @@ class Localised:
 
     @property
     def law(self) -> FittedLaw | None:
-        """Law that explains the record as well as the smooth correction; None without one."""
-        if self.curve is not None or not self.found.laws or self.found.log_p >= WHITE:
+        """Best law, if it leaves a white residual; else None."""
+        if self.curve is not None or not self.found.laws or self.found.laws[0].log_p >= WHITE:
             return None
-        best = self.found.laws[0]
-        return best if best.bic < self.found.places[0].fit.bic + LISTED else None
+        return self.found.laws[0]
+
+    @property
+    def approximation(self) -> float:
+        """BIC of the best law over that of the smooth correction; negative if it explains more."""
+        return self.found.laws[0].bic - self.found.places[0].fit.bic if self.found.laws else np.inf
 
     @property
     def locations(self) -> dict[str, float]:
@@ -64,15 +68,15 @@ class Localised:
         """Best location."""
         return next(iter(self.locations))
 
-    def gain_over(self, best: FittedHypothesis, run: Run) -> float:
+    def gain_over(self, best: FittedHypothesis) -> float:
         """BIC of a hypothesis of the catalogue over that of the unknown."""
         if self.curve is not None:
             return _bic_on(best, self.curve.used) - self.curve.bic
         return best.bic - self.found.bic
 
-    def is_better(self, best: FittedHypothesis, run: Run) -> bool:
+    def is_better(self, best: FittedHypothesis) -> bool:
         """Return true if the unknown explains the run clearly better than a hypothesis of the catalogue."""
-        return self.gain_over(best, run) > (LAW_MARGIN if self.curve is None else CURVE_MARGIN)
+        return self.gain_over(best) > (LAW_MARGIN if self.curve is None else CURVE_MARGIN)
 
 
 class UnknownSearch:
@@ -93,10 +97,14 @@ class UnknownSearch:
     @property
     def is_simple(self) -> bool:
         """True if a law with few parameters explains all of the run, so that a pair of causes cannot be much better."""
-        if self._evidence.log_p >= DOUBTFUL or not self._evidence.laws:
+        if not self._evidence.laws:
             return False
         law = self._evidence.laws[0]
-        return len(law.law.parameters) <= SIMPLE and law.bic < self._evidence.places[0].fit.bic + LISTED
+        return (
+            law.log_p < DOUBTFUL
+            and len(law.law.parameters) <= SIMPLE
+            and law.bic < self._evidence.places[0].fit.bic + LISTED
+        )
 
     def localise(self) -> Localised:
         """Localise the unknown."""
@@ -126,7 +134,7 @@ def _is_noisy(found: Unknown, model: ProcessModel) -> bool:
 def _bic_on(fitted: FittedHypothesis, used: NDArray[np.bool_]) -> float:
     """BIC of a hypothesis of the catalogue, by some of the values alone."""
     evaluation = FilterEvaluation(fitted.fit.loss, fitted.fit.w, fitted.fit.innovations)
-    return _evaluate_on(evaluation, used) + fitted.bic - 2.0 * fitted.fit.loss
+    return _evaluate_on(evaluation, used) - 2.0 * fitted.fit.loss + fitted.bic
 
 
 def _evaluate_on(evaluation: FilterEvaluation, used: NDArray[np.bool_]) -> float:

@@ -60,12 +60,14 @@ class FittedLaw:
         fit: fit of its parameters.
         fitter: fitter, for covariances.
         place: place of the law.
+        log_p: largest minus decimal logarithm of the p-value that its innovations are white.
     """
 
     law: ExtendedLaw
     fit: ShapeFit
     fitter: ShapeFitter
     place: Place
+    log_p: float
 
     @property
     def bic(self) -> float:
@@ -215,5 +217,6 @@ def _find_laws(model: ProcessModel, item: PlaceFit, run: Run, noise: Noise) -> l
         fit = fitter.fit(np.zeros(len(candidate.law.parameters)), noise, STEPS, select=False)
         values = dict(zip(candidate.law.parameters, fit.coefficients.tolist(), strict=True))
         moved = {name: value + values[name] for name, value in candidate.law.parameters.items()}
-        result.append(FittedLaw(replace(candidate.law, parameters=moved), fit, fitter, item.place))
+        law = replace(candidate.law, parameters=moved)
+        result.append(FittedLaw(law, fit, fitter, item.place, _log_p(fit, run)))
     return sorted(result, key=lambda item: item.bic)

@@ -1,6 +1,7 @@
 """Diagnoses made up by hand, for what is said and drawn of them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import nan
 
 import numpy as np
@@ -18,8 +19,12 @@ from reactorwatch.diagnosis.result import (
     ExperimentCurves,
     Gain,
     HeldOut,
+    Law,
+    LawCurve,
+    RivalLaw,
     Separation,
 )
+from reactorwatch.process.law import ExtendedLaw
 
 ROWS = 2000
 
@@ -161,6 +166,29 @@ CASES = {
     "curve": diagnosis_of("named", (CURVE,), practical=False),
     "ambiguous": diagnosis_of("ambiguous", (LEAK,), (FEED,), experiment=EXPERIMENT, ran_away=True),
     "unknown": diagnosis_of("unknown", location="energy_balance"),
+    "law": replace(
+        diagnosis_of("unknown", location="energy_balance"),
+        locations={"energy_balance": 0.0, "coolant": 4.5},
+        law=Law(
+            location="energy_balance",
+            form="power",
+            formula="a (T/440)^n",
+            term="added to dT/dt",
+            unit="K/min",
+            variables=("T",),
+            parameters={"a": Estimate(-0.88, 0.01, "K/min"), "n": Estimate(4.1, 0.2, "1")},
+            rivals=(RivalLaw("coolant", "linear", "a + b (qc - 100)", 4.5),),
+            range={"T": (425.0, 452.0)},
+            held_out={"T": HeldOut(0.98, 0.301, 0.31, 0.3, 0.3, "K")},
+            correlations={"a": ("Tf", 0.97)},
+            extended=ExtendedLaw(
+                "energy balance", "power", ("T",), (440.0,), {"a": -0.88, "n": 4.1}, {"T": (425.0, 452.0)}
+            ),
+            curves=(
+                LawCurve("T", "K", np.array([425.0, 440.0, 452.0]), *(np.array([-0.8, -0.9, -1.0]) for _ in range(3))),
+            ),
+        ),
+    ),
 }
 ROUGHLY = {
     "K3": AdjustedParameter(700.0, 14.0, Estimate(711.2, 1.5, "l/min")),

@@ -67,7 +67,8 @@ def test_a_number_has_the_digits_that_its_95_percent_interval_allows(estimate: E
 def test_the_size_of_every_cause_is_said_in_its_unit_and_meaning(effect: Effect, profile: str) -> None:
     for sign in (1.0, -1.0) if effect.lower < 0.0 else (1.0,):
         size = Estimate(sign * abs(effect.typical), 0.01 * abs(effect.typical), effect.unit)
-        cause = Cause(effect.name, profile, effect.label, effect.location, {"size": size})
+        constants = {item.name: Estimate(item.value, item.sd, item.unit) for item in effect.constants}
+        cause = Cause(effect.name, profile, effect.label, effect.location, {"size": size} | constants)
         said = describe_size(cause, (effect,))
         unit = "%" if "%" in effect.larger else effect.unit
         value = abs(size.value) * (100.0 if unit == "%" else 1.0)
@@ -115,7 +116,7 @@ def test_the_object_has_the_keys_that_are_promised_and_nothing_else(case: str) -
     said = json.loads(msgspec.json.encode(as_object(CASES[case], "run.csv", 1.23456)))
     assert list(said) == [
         "file", "zero", "samples", "runs", "span_min", "seconds", "verdict", "causes", "alternatives", "location",
-        "significant", "practical", "gain", "adequacy", "experiment", "extended_model",
+        "locations", "law", "significant", "practical", "gain", "adequacy", "experiment", "extended_model",
     ]  # fmt: skip
     assert said["seconds"] == 1.235
     for item in said["gain"]["held_out"].values():
@@ -124,6 +125,18 @@ def test_the_object_has_the_keys_that_are_promised_and_nothing_else(case: str) -
         assert list(cause) == ["cause", "profile", "label", "location", "parameters"]
         assert next(iter(cause["parameters"])) == "size"
         assert all(list(item) == ["value", "sd", "unit"] for item in cause["parameters"].values())
+
+
+def test_a_law_has_its_intervals_its_rivals_and_its_range() -> None:
+    law = as_object(CASES["law"], "run.csv", 1.0)["law"]
+    assert (law["location"], law["form"], law["formula"]) == ("energy_balance", "power", "a (T/440)^n")
+    assert law["parameters"]["n"] == {"value": 4.1, "sd": 0.2, "unit": "1"}
+    assert law["rivals"] == [{"location": "coolant", "form": "linear", "formula": "a + b (qc - 100)", "delta_bic": 4.5}]
+    assert law["range"] == {"T": [425.0, 452.0]}
+    assert law["held_out"]["T"]["rmse_after"] == 0.301
+    text = as_text(CASES["law"], "run.csv", EFFECTS)
+    for part in ("a (T/440)^n", "4.1 ± 0.4", "425 to 452", "worse by 4.5 in BIC", "correlation 0.97 with Tf"):
+        assert part in text
 
 
 def test_the_object_holds_what_was_found() -> None:

@@ -28,5 +28,5 @@ def rows_of(*faults: str, seed: int, after_min: float, begin_min: float = 0.0, *
     config = PlantConfig(seed=seed, faults=said, **settings)
     record = simulate_record(config, int((ONSET_MIN + after_min) / config.period_min) + 1)
     columns = (record.time_min, record.columns["qc"], record.columns["C"], record.columns["T"])
-    found = [(t, u, (c, T)) for t, u, c, T in zip(*(column.tolist() for column in columns), strict=True)]
+    found: list[Row] = [(t, (u,), (c, T)) for t, u, c, T in zip(*(column.tolist() for column in columns), strict=True)]
     return [row for row in found if begin_min <= row[0] < inf]

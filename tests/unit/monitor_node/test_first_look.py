@@ -87,7 +87,7 @@ def faulty_rows(fault: str, period_min: float, after: int) -> list[Row]:
     record = simulate_record(config, ROWS + after)
     columns = (record.time_min, record.columns["qc"], record.columns["C"], record.columns["T"])
     rows = zip(*(item.tolist() for item in columns), strict=True)
-    faulty: list[Row] = [(time_min, flow, (C, T)) for time_min, flow, C, T in rows]
+    faulty: list[Row] = [(time_min, (flow,), (C, T)) for time_min, flow, C, T in rows]
     return faulty[-ROWS:]
 
 
@@ -201,7 +201,7 @@ def test_a_fault_is_found_within_the_budget_where_rows_are_far_apart(fault: str,
 
 @pytest.mark.parametrize("period_min", [0.1, 1.0, 5.0, 29.0])
 def test_of_rows_far_apart_the_newest_are_looked_at_and_all_since_the_alarm(period_min: float) -> None:
-    rows = [(period_min * place, 100.0, (0.1, 440.0)) for place in range(ROWS)]
+    rows: list[Row] = [(period_min * place, (100.0,), (0.1, 440.0)) for place in range(ROWS)]
     kept = newest_rows(rows)
     pieces = max(round(period_min / 0.1) - 1, 0)
     assert list(kept) == rows[-len(kept) :]

@@ -206,7 +206,7 @@ def test_rows_before_a_gap_or_a_clock_that_went_back_do_not_count(isolation: Iso
 
 def test_a_missing_input_is_taken_to_be_as_it_was(isolation: Isolation) -> None:
     rows = rows_of("temperature_bias:step:2", seed=10, after_min=5.0)
-    missing = [(t, flow if place % 10 == 0 else nan, y) for place, (t, flow, y) in enumerate(rows)]
+    missing: list[Row] = [(t, flow if place % 10 == 0 else (nan,), y) for place, (t, flow, y) in enumerate(rows)]
     assert suspects_of(isolation, missing) == suspects_of(isolation, rows)
 
 

@@ -13,6 +13,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, UNKNOWN, Isolation
 from monitor_node.isolation.reconstruction import START_STEPS, START_STEPS_A_ROW, Reconstruction
+from monitor_node.isolation.window import Row
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.kalman.ekf import Filter
@@ -135,7 +136,9 @@ def test_a_large_fault_of_the_catalogue_is_found_within_the_budget(fault: str, a
 
 def test_the_start_of_a_reconstruction_has_a_budget() -> None:
     """Without its thermometer and with a wild analyser the filter begins again row after row, by a search each."""
-    rows = [(time_min, flow, (2.0 * (place % 2), T)) for place, (time_min, flow, (_, T)) in enumerate(_sound())]
+    rows: list[Row] = [
+        (time_min, flow, (2.0 * (place % 2), T)) for place, (time_min, flow, (_, T)) in enumerate(_sound())
+    ]
     steps = []
     spend = StepBudget.spend
 
@@ -160,14 +163,14 @@ def test_a_filter_without_a_budget_counts_nothing_and_one_with_stops_at_it() -> 
     kalman = Filter(cstr(), SENSORS)
     rows = _sound()
     for time_min, flow, measured in rows[:20]:
-        kalman.update(time_min, (flow,), measured)
+        kalman.update(time_min, flow, measured)
     kalman.budget = StepBudget(100)
     for time_min, flow, measured in rows[20:24]:
-        kalman.update(time_min, (flow,), measured)
+        kalman.update(time_min, flow, measured)
     time_min, flow, measured = rows[24]
     with pytest.raises(BudgetExceededError, match="100 filter steps"):
-        kalman.update(time_min, (flow,), measured)
+        kalman.update(time_min, flow, measured)
 
 
-def _sound() -> list[tuple[float, float, tuple[float, ...]]]:
-    return [(t, u, (m[0], m[1])) for t, u, m in rows_of(seed=6, after_min=1.0)]
+def _sound() -> list[Row]:
+    return rows_of(seed=6, after_min=1.0)

@@ -125,7 +125,7 @@ def test_rows_far_apart_have_no_look_that_could_not_use_all_rows_since_the_alarm
     monkeypatch.setattr(Isolation, "suspects", suspects)
     search, board = suspicion()
     board.has_unexplained = True
-    feed(search, [(2.0 * index, 100.0, (0.1, 438.5)) for index in range(LOOKS[-1] + 1)])
+    feed(search, [(2.0 * index, (100.0,), (0.1, 438.5)) for index in range(LOOKS[-1] + 1)])
     assert looks == list(LOOKS[:4])
 
 

@@ -38,7 +38,7 @@ def test_without_outliers_everything_counts(rows: list[Row]) -> None:
     window = settled(rows)
     assert missing(window) == []
     np.testing.assert_array_equal(window.measured, [row[2] for row in rows])
-    np.testing.assert_array_equal(window.inputs[:, 0], [row[1] for row in rows])
+    np.testing.assert_array_equal(window.inputs, [row[1] for row in rows])
     assert window.first_onset == BURN_IN_ROWS
     assert np.all(window.used[1:])
 
@@ -78,9 +78,9 @@ def test_only_rows_since_the_last_gap_count(rows: list[Row]) -> None:
 
 
 def test_where_the_input_is_missing_it_is_as_it_was(rows: list[Row]) -> None:
-    holes = [(t, nan if place % 3 else flow, y) for place, (t, flow, y) in enumerate(rows[1:])]
+    holes: list[Row] = [(t, (nan,) if place % 3 else flow, y) for place, (t, flow, y) in enumerate(rows[1:])]
     window = settled(holes)
-    assert window.inputs[:6, 0].tolist() == [rows[1][1]] * 3 + [rows[4][1]] * 3
+    assert window.inputs[:6, 0].tolist() == [rows[1][1][0]] * 3 + [rows[4][1][0]] * 3
 
 
 def test_nothing_sets_in_before_it_may(rows: list[Row]) -> None:
@@ -102,7 +102,7 @@ def test_rows_filtered_in_chunks_are_those_of_a_filter_that_takes_row_by_row(fau
     window, kalman = settled(rows), Filter(cstr(), SENSORS)
     accept = [False, False]
     for index, (time_min, flow, values) in enumerate(rows):
-        result = kalman.update(time_min, (flow,), values, gate=GATE, accept=accept)
+        result = kalman.update(time_min, flow, values, gate=GATE, accept=accept)
         accept = [abs(size) > GATE * sd for size, sd in zip(result.residual, result.sd, strict=True)]
         assert tuple(window.x[index].tolist()) == kalman.state.x
         assert tuple(window.covariance[index].ravel().tolist()) == kalman.state.P

@@ -14,8 +14,10 @@ from monitor_node.replay.verification import verify
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Quality, Sample
+from reactorwatch.process import EFFECTS_OF
 from reactorwatch.process.library.three_tanks.model import three_tanks
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
+from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 
 from .samples import Rows
@@ -104,7 +106,18 @@ def test_live_resumed_replayed_and_back_tested_alarms_are_the_same(
 ) -> None:
     """And each output is watched, or named with the reason."""
     plant = linear_plant(inputs, outputs, seed, missing)
-    config, messages = plant.config(), plant.messages()
+    check_equality(plant, plant.config(reference="arx"), stopped)
+
+
+@pytest.mark.parametrize("inputs", [0, 2])
+def test_with_a_black_box_they_are_the_same_too(inputs: int) -> None:
+    plant = linear_plant(inputs, 2, seed=7)
+    check_equality(plant, plant.config(), stopped=0.6)
+
+
+def check_equality(plant: Plant, config: MonitorConfig, stopped: float) -> None:
+    """Alarms live, resumed at a share of the samples, replayed and back-tested."""
+    messages = plant.messages()
     monitor = Monitor(config, START_NS)
     published = live(monitor, messages) + monitor.finish()
     before, resumed, last = Monitor(config, START_NS), Monitor(config, START_NS), int(stopped * len(messages))
@@ -125,7 +138,7 @@ def test_live_resumed_replayed_and_back_tested_alarms_are_the_same(
 @pytest.mark.parametrize("outputs", [1, 5])
 def test_a_fault_of_one_output_is_seen_with_any_number_of_inputs(inputs: int, outputs: int) -> None:
     plant = linear_plant(inputs, outputs, seed=3)
-    result = backtest.run(plant.messages(), plant.config())
+    result = backtest.run(plant.messages(), plant.config(reference="arx"))
     assert result.left_out == {}
     raised = {alarm.alarm: alarm.raised_ns for alarm, _ in result.raised_alarms}
     assert raised[f"shewhart/y{outputs - 1}"] < START_NS + (FAULT_ROW + 6) * ROW_NS
@@ -135,7 +148,11 @@ def test_models_with_too_few_rows_for_their_parameters_lose_lags_then_inputs_and
     """80 rows suffice for seven parameters: three lags of the output, one of three inputs, and the constant."""
     few, many = (linear_plant(inputs, 2, seed=1) for inputs in (3, 8))
     notes = [
-        [note for note in backtest.run(plant.messages(), plant.config()).notes if note.startswith("training")]
+        [
+            note
+            for note in backtest.run(plant.messages(), plant.config(reference="arx")).notes
+            if note.startswith("training")
+        ]
         for plant in (few, many)
     ]
     least = "as there are fewer than 10 rows a parameter"
@@ -158,7 +175,7 @@ def test_an_input_that_says_nothing_hinders_no_watch(kind: str) -> None:
         "rare": np.where(np.arange(ROWS) % 20, np.nan, u),
         "gone": np.where(np.arange(ROWS) > 20, np.nan, u),
     }[kind]
-    monitor = Monitor(plant.config(), START_NS)
+    monitor = Monitor(plant.config(reference="arx"), START_NS)
     published = live(monitor, plant.messages()) + monitor.finish()
     assert monitor.failures.by_stage == {}
     assert not set(plant.outputs) & set(monitor.excluded_signals)
@@ -167,17 +184,18 @@ def test_an_input_that_says_nothing_hinders_no_watch(kind: str) -> None:
     assert ("u1" in monitor.excluded_signals) == (kind in ("never there", "rare", "gone"))
 
 
-def tanks(seed: int = 2, rows: int = ROWS) -> Plant:
+def tanks(seed: int = 2, rows: int = ROWS, model: ProcessModel | None = None) -> Plant:
     """The three tanks in closed loop, a row every six seconds: each pump holds the level of its tank."""
-    generator, simulator = np.random.default_rng(seed), Simulator(three_tanks())
+    generator, simulator = np.random.default_rng(seed), Simulator(model or three_tanks())
     state, u = np.array([41.0, 32.0, 36.6]), np.array([21.37, 53.80])
     values = np.empty((rows, 5))
     for row in range(rows):
         measured = state + generator.normal(size=3) * 0.1
         u = np.clip(u + 2.0 * (np.array([41.0, 32.0]) + (row // 30) % 2 - measured[:2]) * 0.1, 0.0, 150.0)
         values[row] = *u, *measured
-        state = simulator.run(np.array([0.0, 0.1]), np.array([u, u]), state).states[-1]
-    values[FAULT_ROW:, 4] += 2.0
+        state = simulator.run(np.array([row, row + 1]) * 0.1, np.array([u, u]), state).states[-1]
+    if model is None:
+        values[FAULT_ROW:, 4] += 2.0
     return Plant(("Q1", "Q2"), ("h1", "h2", "h3"), values)
 
 
@@ -207,6 +225,32 @@ def test_equations_with_two_inputs_judge_a_plant_in_closed_loop(missing: float) 
         **{name: getattr(config, name) for name in config.__struct_fields__} | {"inputs": ("Q2", "Q1")}
     )
     assert [live(other, [m]) for other in [Monitor(swapped, START_NS, model=model)] for m in messages] == published
+
+
+@pytest.mark.parametrize(("cause", "size", "kind"), [("clog13", 0.3, "process"), ("h3.bias", 2.0, "sensor")])
+def test_the_cause_of_an_alarm_is_sought_among_the_effects_of_a_process_with_two_inputs(
+    cause: str, size: float, kind: str
+) -> None:
+    """And a monitor that was stopped in the search names the same suspects."""
+    effect = next(item for item in EFFECTS_OF["three_tanks"] if item.name == cause)
+    model = effect.extend(three_tanks(), STEP)
+    faulty = model.with_values({f"{cause}.size": size, f"{cause}.onset": FAULT_ROW * 0.1})
+    plant = tanks(seed=5, model=faulty)
+    if kind == "sensor":
+        plant.values[FAULT_ROW:, 4] += size
+    config, messages = plant.config(diagnose_training=False, isolation=True), plant.messages()
+    monitor = Monitor(config, START_NS, model=three_tanks())
+    last = 5 * (FAULT_ROW + 8)
+    live(monitor, messages[:last])
+    resumed = Monitor(config, START_NS, model=three_tanks())
+    resumed.from_bytes(monitor.to_bytes())
+    resumed.on_history_end()
+    told = live(monitor, messages[last:])
+    assert live(resumed, messages[last:]) == told
+    suspects = [item.message.suspects[0] for item in told if isinstance(item.message, Alarm) and item.message.suspects]
+    assert suspects[-1].cause == cause
+    assert suspects[-1].kind == kind
+    assert suspects[-1].size == pytest.approx(size, rel=0.3)
 
 
 def decay() -> ProcessModel:

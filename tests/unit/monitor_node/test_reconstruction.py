@@ -77,16 +77,16 @@ def test_it_leaves_the_sensor_out_some_time_before_the_onset_that_was_found() ->
     early = rows[: -len(late)]
     wrong: list[Row] = [(t, flow, (C, T + 50.0)) for t, flow, (C, T) in late]
     one, other = (Reconstruction(cstr(), SENSORS, 1, early + item, ONSET_MIN) for item in (late, wrong))
-    row = (ONSET_MIN, 100.0, (0.1, 440.0))
+    row = (ONSET_MIN, (100.0,), (0.1, 440.0))
     assert one.update(*row) == other.update(*row)
 
 
 def test_a_missing_input_is_as_it_was_and_without_any_nothing_is_said() -> None:
     reconstruction = Reconstruction(cstr(), SENSORS, 1, [], 0.0)
-    assert all(isnan(item) for item in reconstruction.update(0.0, nan, (0.1, 440.0)))
-    assert all(isnan(item) for item in reconstruction.update(0.1, 100.0, (0.1, 440.0)))
-    known, held = reconstruction.update(0.2, nan, (0.1, 440.0)), nan
+    assert all(isnan(item) for item in reconstruction.update(0.0, (nan,), (0.1, 440.0)))
+    assert all(isnan(item) for item in reconstruction.update(0.1, (100.0,), (0.1, 440.0)))
+    known, held = reconstruction.update(0.2, (nan,), (0.1, 440.0)), nan
     other = Reconstruction(cstr(), SENSORS, 1, [], 0.0)
     for time_min in (0.1, 0.2):
-        held = other.update(time_min, 100.0, (0.1, 440.0))[0]
+        held = other.update(time_min, (100.0,), (0.1, 440.0))[0]
     assert known[0] == pytest.approx(held, rel=1e-12)
