@@ -167,6 +167,7 @@ def report_memory(endpoint: str, plants: int) -> None:
     node = Counting(FAST, bus, stop)
     node.learn(plants)
     assert isinstance(node._watched, WatchedPlants)
+    assert isinstance(node._watched, WatchedPlants)
     quiet = node._watched._quiet
     assert quiet is not None
     due_ns = quiet._slots.health_due_ns

@@ -97,8 +97,8 @@ class DiagnosisRunner:
 
     def _command(self, folder: Path) -> list[str]:
         command = ["diagnose", str(folder / RECORDING), "--plant", self._config.plant, "--out", str(folder)]
-        if self._config.model is not None:
-            command += ["--model", self._config.model]
+        if self._config.process is not None:
+            command += ["--process", self._config.process]
         if self._config.tolerance:
             command += ["--tolerance", ",".join(f"{name}={value!r}" for name, value in self._config.tolerance.items())]
         return command

@@ -8,9 +8,10 @@ If the plant stops or no data arrive while a diagnosis is pending, it starts wit
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from math import inf
-from typing import Annotated, NamedTuple
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import msgspec
 
@@ -46,7 +47,8 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         window_min: length of the diagnosed record, in minutes of plant time.
         after_min: delay from the alarm to the diagnosis, in minutes of plant time.
         apart_min: minutes after a diagnosis in which alarms are attributed to the same fault.
-        model: file of an extended model, whose causes are known already; None for the nominal process.
+        process: process of the plant, by name or file; the causes in an extended model are known already. None: the
+            nominal reactor.
         tolerance: differences without practical significance, by output, in its unit.
     """
 
@@ -55,8 +57,13 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     window_min: Annotated[float, msgspec.Meta(ge=20.0, le=1e6)] = 240.0
     after_min: Annotated[float, msgspec.Meta(ge=1.0, le=1e6)] = 30.0
     apart_min: Annotated[float, msgspec.Meta(ge=0.0, le=1e6)] = 60.0
-    model: str | None = None
+    process: str | None = None
     tolerance: dict[str, float] = {}
+
+    older_keys: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = MappingProxyType(
+        {"model": ("process", lambda name: name)}
+    )
+    """Older names of keys, each with the present one and the function from a value of the older to one of it."""
 
     def __post_init__(self) -> None:
         check_plant(self.plant)

@@ -174,7 +174,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         check_plant(self.plant)
         check_rule(self.raise_count, self.window, self.clear_count)
-        every = (*self.signals, *self.carried, *self.labels)
+        every = (*self.signals, *self.carried_signals, *self.labels)
         if not self.outputs or len(set(every)) != len(every):
             beside = (
                 f", and {', '.join(every[len(self.signals) :])} beside them" if len(every) > len(self.signals) else ""
@@ -236,7 +236,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         return (*self.inputs, *self.outputs)
 
     @property
-    def carried(self) -> tuple[str, ...]:
+    def carried_signals(self) -> tuple[str, ...]:
         """Signals beside the rows that go with an alarm: set points, then modes."""
         return (*self.setpoints, *self.modes)
 

@@ -81,7 +81,7 @@ class Monitor:
         self.rejects = RejectCounter()
         self.failures = Failures()
         self._signals = config.signals
-        known = (*self._signals, *config.carried)
+        known = (*self._signals, *config.carried_signals)
         self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in known}
         self._label_keys = {keys.key(config.plant, keys.SAMPLE, signal) for signal in config.labels}
         self._indices = {signal: place for place, signal in enumerate(self._signals)}
@@ -417,6 +417,11 @@ class Monitor:
     def watching_since_ns(self) -> int | None:
         """Time of the first evaluated row; None before it."""
         return self._watching_since_ns
+
+    @property
+    def unjudged_rows(self) -> int:
+        """Number of rows that were not judged, see `PlantPipeline.unjudged_rows`."""
+        return self.pipeline.unjudged_rows
 
     @property
     def expected_false_alarms(self) -> float:

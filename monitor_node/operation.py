@@ -57,7 +57,7 @@ class Operation:
         self._bounds = list(zip(config.inputs, bounds, strict=True))
         self.inputs: Sequence[float] = ()
         """Inputs of the row that is being evaluated; empty between rows."""
-        self._carried = {name: CarriedState() for name in config.carried}
+        self._carried = {name: CarriedState() for name in config.carried_signals}
 
     @property
     def state(self) -> dict[str, CarriedState]:

@@ -290,6 +290,11 @@ class PlantPipeline:
         return max(self._config.training_length.share((last_ns - self._began_ns) / MINUTE_NS, self._training.rows), 0.0)
 
     @property
+    def unjudged_rows(self) -> int:
+        """Number of rows that a black box did not judge, as it knew too little of the point of operation."""
+        return self._reference.unjudged if isinstance(self._reference, BlackBoxReference) else 0
+
+    @property
     def refused_trainings(self) -> int:
         """Number of refused trainings."""
         return self._refusals
@@ -336,21 +341,24 @@ class PlantPipeline:
     def snapshots(self, time_ns: int) -> list[Publication]:
         """Snapshots of each output's models: the adaptive one, the one fitted to the training, and the reference.
 
-        With the equations as reference, the fitted model is only compared with the adaptive one.
+        With another reference than `arx`, the fitted model is only compared with the adaptive one.
         """
         publications: list[Publication] = []
         if not self._points:
             return publications
         reference = self._reference
-        for key, output, predictor in zip(self._model_keys, self._config.outputs, self._predictors, strict=True):
+        outputs = zip(self._model_keys, self._config.outputs, self._predictors, strict=True)
+        for index, (key, output, predictor) in enumerate(outputs):
             adaptive, fitted = predictor.adaptive_snapshot(), predictor.reference_snapshot()
-            equations = _filter_snapshot(reference, output) if isinstance(reference, ProcessReference) else None
+            judging = _filter_snapshot(reference, output) if isinstance(reference, ProcessReference) else None
+            if isinstance(reference, BlackBoxReference):
+                judging = reference.snapshot(index, self._config.inputs, self._config.outputs)
             if fitted is not None:
                 fitted.held, fitted.reference = True, isinstance(reference, ArxReference)
-            for snapshot in (fitted, equations):
+            for snapshot in (fitted, judging):
                 if snapshot is not None:
                     snapshot.checks.extend(self._checks)
-            for snapshot in (adaptive, fitted, equations):
+            for snapshot in (adaptive, fitted, judging):
                 if snapshot is not None:
                     snapshot.time_ns = time_ns
                     publications.append(Publication(key, snapshot))
@@ -676,6 +684,11 @@ class PlantPipeline:
             publications.extend(self._search_causes(row, stuck))
         if isinstance(reference, BlackBoxReference):
             reference.set_learning(not self._board.has_unexplained)
+            if reference.unjudged and reference.kind not in self._noted:
+                self._noted.add(reference.kind)
+                self.notes.append(
+                    "rows are not judged while inputs have values that the black box has not learned, and teach it"
+                )
 
     def _note_inputs_beyond(self, indices: list[int]) -> None:
         """Note once each input that leaves its range in the training, as rows are not judged then."""

@@ -13,7 +13,8 @@ import numpy as np
 from monitor_node.baseline.references import GATE, RowPrediction
 from monitor_node.ingest.sampling import TOLERANCE, regular_intervals
 from reactorwatch.arrays import Array
-from reactorwatch.identification.black_box.filter import BlackBoxFilter, BlackBoxState
+from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
+from reactorwatch.identification.black_box.filter import MEMORY, BlackBoxFilter, BlackBoxState
 from reactorwatch.identification.black_box.fit import fit_black_box
 from reactorwatch.identification.black_box.model import BlackBoxModel
 from reactorwatch.records.record import MINUTE_NS
@@ -160,6 +161,36 @@ class BlackBoxReference:
         """Copies of the parameters and their covariance, of scaled signals."""
         return self._filter.parameters
 
+    def snapshot(self, output: int, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> ModelSnapshot | None:
+        """Snapshot of the model of an output, of scaled signals; None if the output is not predicted.
+
+        Args:
+            output: index of the output among the monitored ones.
+            inputs: names of the inputs.
+            outputs: names of the monitored outputs.
+        """
+        if output not in self._outputs:
+            return None
+        shape, (theta, covariance) = self.model.shape, self._filter.parameters
+        names = [f"{outputs[i]}{lag}" for lag in range(1, shape.lags + 1) for i in self._outputs]
+        names += [f"{name}{lag + shape.delay}" for lag in range(shape.lags) for name in inputs]
+        first = self._outputs.index(output) * shape.terms
+        terms = ["*".join(names[i] for i in product if i >= 0) or "1" for product in shape.products().tolist()]
+        values = theta[first : first + shape.terms].tolist()
+        sds = np.sqrt(np.diag(covariance)[first : first + shape.terms]).tolist()
+        return ModelSnapshot(
+            structure=self.kind,
+            order=shape.lags,
+            delay=shape.delay,
+            parameters=[
+                Parameter(name=name, value=value, sd=sd) for name, value, sd in zip(terms, values, sds, strict=True)
+            ],
+            rows=self.model.rows + self._rows,
+            forgetting=1.0 - 1.0 / MEMORY,
+            reference=True,
+            held=not self._filter.learning,
+        )
+
     @property
     def weakness(self) -> str:
         """Reason why the promise may not hold at set points that the training has not seen; empty if it does."""
@@ -194,7 +225,7 @@ class BlackBoxReference:
         if predicted is not None and predicted.judged:
             for i, output in enumerate(self._outputs):
                 prediction[output], sd[output] = predicted.prediction[i], predicted.sd[i]
-        else:
+        elif predicted is not None:
             self.unjudged += 1
         return RowPrediction(prediction, sd)
 

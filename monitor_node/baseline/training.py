@@ -42,6 +42,10 @@ MOST_ROWS = 10_000
 FEWEST_ROWS = 50
 """Least number of residuals; the training continues until there are as many."""
 
+FEWEST_FAMILIAR_ROWS = 200
+"""Least number of rows of a training after which `auto` takes a black box: after fewer, too many values of the inputs
+are unfamiliar to it, and it judges too few rows."""
+
 MOST_REFUSALS = 2
 
 Residuals: TypeAlias = tuple[Array, list[float]]
@@ -229,7 +233,7 @@ class Training:
         ]
         if isinstance(reference, BlackBoxReference) and reference.weakness:
             checks.append(Check(name=reference.kind, result=reference.weakness))
-        if self._without_black_box:
+        if self._without_black_box and self._config.reference == "black-box":
             checks.append(Check(name=BlackBoxReference.kind, result=f"the ARX models judge: {self._without_black_box}"))
         if isinstance(reference, ArxReference):
             checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
@@ -277,11 +281,12 @@ class Training:
                 return reference, z, judged
         black_box = None
         is_driven = bool(inputs.shape[1] and has_values.all())  # without inputs there is nothing to simulate
-        if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven):
+        is_long = len(time_min) >= FEWEST_FAMILIAR_ROWS
+        if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven and is_long):
             black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
         if black_box is not None:
-            residuals = black_box[1] * np.array(black_box[0].typical_sd)
-            if self._config.reference == "black-box" or _predicts_as_well(residuals, identified):
+            residuals, is_sure = black_box[1] * np.array(black_box[0].typical_sd), not black_box[0].weakness
+            if self._config.reference == "black-box" or (is_sure and _predicts_as_well(residuals, identified)):
                 return black_box
         return self._arx_reference(given_inputs), identified, screenings
 

@@ -115,7 +115,9 @@ class FleetMonitor:
         self._registered: dict[str, None] = {}  # all plants, with any owner
         self._unverified = UnverifiedPlants()
         configs = [kind.config for kind in all_kinds]
-        self._signals = tuple(dict.fromkeys(name for item in configs for name in (*item.signals, *item.carried)))
+        self._signals = tuple(
+            dict.fromkeys(name for item in configs for name in (*item.signals, *item.carried_signals))
+        )
         self._plants: dict[str, str] = {}  # plants that are not quiet, by key of a sample
         self._handed_over, self._recent = HandedOverAlarms(self._watched.alarms), RecentlyAdopted()
         self._paused_messages: list[Encoded] | None = None  # buffered in a pause

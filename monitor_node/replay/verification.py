@@ -138,7 +138,7 @@ class _Replay:
         self._diff = diff
         self._waited_for = dict(session.heard_from_ns)
         self._newest: dict[str, dict[bytes, None]] = {}
-        signals = (*config.signals, *config.carried)
+        signals = (*config.signals, *config.carried_signals)
         self._signals = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in signals}
 
     def run(self, messages: Iterable[Encoded]) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from reactorwatch.api.files import described_process
 from reactorwatch.api.files import record as read_file
 from reactorwatch.api.views.page import write_page
 from reactorwatch.api.views.record import plot_record, record_frame, record_html
@@ -176,7 +177,7 @@ def read_record(
         file: a table (`.csv`, `.xlsx`, `.parquet` and others), a recording (`.mcap`), a folder of recordings, several
             files in a row, or a data frame (pandas, polars, Arrow).
         process: decides which signals the file must have, and how it is read; the functions that take the record use
-            it. None: the reactor.
+            it. None: the one that a recording describes, else the reactor.
         plant: name of the plant in a recording; None: the only one in it.
         columns: names of the columns in a table, by signal, where they differ.
         form: what is not to be guessed about a table: `time`, `time_unit`, `time_format`, `zone`, `period`, `missing`,
@@ -195,12 +196,16 @@ def read_record(
     missing = form.pop("missing", ())
     words = (missing,) if isinstance(missing, str | float | int) else missing
     stated = FileFormat(**form, missing=tuple(map(str, words)))
-    described = find_process() if process is None else find_process(process)
+    names = dict(columns or {})
     if hasattr(file, "__arrow_c_stream__") or hasattr(file, "__dataframe__"):
-        read = [_read_frame(file, described, dict(columns or {}), stated)]
+        described = find_process(process or DEFAULT_PROCESS)
+        read = [_read_frame(file, described, names, stated)]
     else:
-        files = [file] if isinstance(file, str | Path) else file
-        read = [read_file(Path(item), plant, dict(columns or {}), described, stated) for item in files]
+        files = [Path(item) for item in ([file] if isinstance(file, str | Path) else file)]
+        described = described_process(files[0], plant) if process is None else find_process(process)
+        read = [read_file(item, plant, names, described, stated) for item in files]
+    if process is None and described.name != DEFAULT_PROCESS:
+        process = described  # as the recording has it
     return Record(**measured_fields(join_files(read)), process=process)
 
 

@@ -111,7 +111,7 @@ def _list(config: Path | None, endpoint: str | None, name: str | None, timeout: 
     try:
         listed += send_command(RECORDER, config, endpoint, name, timeout, LIST_RECORDER_ALARMS, ListAlarms()).alarms
     except LateReplyError as late:
-        typer.echo(f"the alarms of the recorder are missing: {late}", err=True)
+        print_lines(f"the alarms of the recorder are missing: {late}", err=True)
     except NoReplyError:
         pass  # a plant may be watched and not be recorded
     return listed

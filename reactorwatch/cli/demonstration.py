@@ -7,6 +7,7 @@ the alarms, a comparison with the alarms of a back-test, value for value, and a 
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,17 +22,20 @@ from reactorwatch.cli.bus_settings import (
     restrict_to_plant,
     write_node_settings,
 )
+from reactorwatch.cli.display import format_age, print_report
 from reactorwatch.cli.plant_settings import WAIT_FOR, complete_plant_settings
-from reactorwatch.cli.printing import print_lines, print_text
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.processes import Processes, settings_text
 from reactorwatch.cli.progress import bar, task
-from reactorwatch.contract import keys
+from reactorwatch.cli.run_progress import POLL_S, RunProgress
 from reactorwatch.contract.alarm_text import suspects_text
-from reactorwatch.contract.codec import Encoded, decode
-from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Fault, Sample
+from reactorwatch.contract.codec import decode
+from reactorwatch.contract.messages_pb2 import Alarm, Fault, Sample
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
+from reactorwatch.diagnosis.result import NAMED, Diagnosis
 from reactorwatch.errors import InputError
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import make_folder
@@ -50,59 +54,9 @@ NODES = ("recorder", "monitor", "plant")
 ONSET_MIN = 150.0
 """Onset of the fault: the training ends after 100 minutes."""
 START_WITHIN_S = 60.0
-DRAIN_WITHIN_S = 60.0
-POLL_S = 0.1
 SETTINGS_FILE = "settings.toml"
 DIAGNOSIS_FOLDER = "diagnosis"
 DRAIN_TIMEOUT_S = 1.0  # for the recorder, which is stopped last
-
-
-class Progress:
-    """Progress of plant and monitor, observed on the bus.
-
-    Args:
-        bus: the bus of the run.
-        span_ns: time from the first row of the run to its last.
-    """
-
-    def __init__(self, bus: ZenohBus, span_ns: int) -> None:
-        self._span_ns = span_ns
-        self._lock = threading.Lock()
-        self._first_ns: int | None = None
-        self._plant_ns = 0
-        self._evaluated_ns = 0
-        bus.subscribe(keys.all_keys(PLANT, keys.SAMPLE), self._on_sample)
-        bus.subscribe(keys.all_keys(PLANT, keys.ESTIMATE), self._on_estimate)
-
-    @property
-    def started(self) -> bool:
-        """True once a sample has arrived."""
-        return self._first_ns is not None
-
-    @property
-    def plant_min(self) -> float:
-        """Plant time since the first sample, in minutes."""
-        with self._lock:
-            return 0.0 if self._first_ns is None else (self._plant_ns - self._first_ns) / MINUTE_NS
-
-    @property
-    def all_evaluated(self) -> bool:
-        """True once the monitor has evaluated the last row of the run."""
-        with self._lock:
-            return self._first_ns is not None and self._evaluated_ns >= self._first_ns + self._span_ns
-
-    def _on_sample(self, message: Encoded) -> None:
-        sample = decode(message.payload, message.encoding)
-        assert isinstance(sample, Sample)
-        with self._lock:
-            self._first_ns = sample.time_ns if self._first_ns is None else self._first_ns
-            self._plant_ns = max(self._plant_ns, sample.time_ns)
-
-    def _on_estimate(self, message: Encoded) -> None:
-        estimate = decode(message.payload, message.encoding)
-        assert isinstance(estimate, Estimate)
-        with self._lock:
-            self._evaluated_ns = max(self._evaluated_ns, estimate.time_ns)
 
 
 @dataclass(frozen=True)
@@ -207,7 +161,7 @@ def _run_nodes(
     stop.call_on_set(woken.set)
     assert plant.rows is not None, "a demonstration has an end"
     duration_min = plant.rows * plant.period_min
-    progress = Progress(bus, to_time_ns((plant.rows - 1) * plant.period_min))
+    progress = RunProgress(bus, PLANT, to_time_ns((plant.rows - 1) * plant.period_min))
     with Processes(settings, logs=folder) as processes, bar("starting the nodes", duration_min) as advance:
         for node in NODES:
             processes.start(node)
@@ -223,9 +177,7 @@ def _run_nodes(
             if not progress.started and time.monotonic() - started > START_WITHIN_S:
                 raise InputError(f"no sample within {START_WITHIN_S:g} s of the start; see the .log files in {folder}")
             advance(progress.plant_min, "starting the nodes" if not progress.started else f"running {process}")
-        deadline = time.monotonic() + DRAIN_WITHIN_S
-        while not stop.is_set and not progress.all_evaluated and time.monotonic() < deadline:
-            woken.wait(POLL_S)
+        progress.wait_until_evaluated(lambda seconds: woken.wait(seconds) or stop.is_set)
         processes.stop(("plant", "monitor", "recorder"))
     return not stop.is_set
 
@@ -269,8 +221,11 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     def minutes(time_ns: int) -> str:
         return f"{to_minutes(time_ns, first_ns):.1f} min"
 
+    delay_s = None if onset_ns is None or not after else (after[0].time_ns - onset_ns) / 1e9
     lines = [
         "# What happened",
+        "",
+        headline(delay_s, diagnosis, case.effects),
         "",
         f"- Fault injected: `{fault}`, set in at {minutes(onset_ns)}."
         if onset_ns is not None
@@ -307,11 +262,31 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         "",
     ]
     text = printable_lines(lines)
-    print_text(text)
+    print_report(text)
     with atomic_write(folder / "summary.md") as temporary:
         temporary.write_text(text, encoding="utf-8")
     print_lines(f"All of it is in {folder}")
     return 0 if after and not before and same else 1
+
+
+def headline(delay_s: float | None, diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
+    """Delay of the detection, and the cause that the diagnosis names, in a sentence.
+
+    Args:
+        delay_s: seconds of plant time from the fault to the first alarm; None: there was none.
+        diagnosis: diagnosis of the recording.
+        effects: possible causes.
+    """
+    detected = "Not detected" if delay_s is None else f"Detected after {format_age(delay_s)}"
+    catalogue = {effect.name: effect for effect in effects}
+    causes = [
+        f"{cause.label}, {catalogue[cause.cause].describe(cause.parameters['size'].value)}"
+        for cause in diagnosis.causes
+        if cause.cause in catalogue
+    ]
+    if diagnosis.verdict == NAMED and causes:
+        return f"{detected}; cause named: {' and '.join(causes)}."
+    return f"{detected}; no single cause named: the diagnosis is {diagnosis.verdict}."
 
 
 def _program(name: str) -> str:

@@ -18,6 +18,7 @@ from reactorwatch.diagnosis.parameter_priors import parse_priors
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import report_object
 from reactorwatch.diagnosis.result import Diagnosis, Experiment
+from reactorwatch.process import MODELS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
@@ -29,9 +30,6 @@ from reactorwatch.runtime.model_file import write_extended_model
 
 PAGE, OBJECT, MODEL, DRAWING = "report.html", "report.json", "extended.json", "report.rrd"
 """Files of a report."""
-
-PLANT = "cstr"
-"""The process that the plant node simulates and the monitor watches."""
 
 EXPERIMENT = "experiment.csv"
 """File of the proposed input, if there is one; it can drive a plant."""
@@ -138,11 +136,11 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
 
     assert case.folder is not None
     folder = case.folder
-    on_the_bus = case.model.name == PLANT
+    on_the_bus = any(make().name == case.model.name for make in MODELS)  # so that its extended model can be loaded
     files = (str(case.file), str(folder / MODEL), str(folder / EXPERIMENT))
     asked = case.asked
     settings = {
-        "process": asked.process.process or "cstr",
+        "process": asked.process.process or case.model.name,
         "plant": asked.plant,
         "without": ", ".join(asked.without),
         "uncertain": asked.uncertain,

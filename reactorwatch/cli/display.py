@@ -58,6 +58,11 @@ def print_rows(rows: Iterable[Row], indent: int = 0) -> None:
         typer.echo(text)
 
 
+def print_formatted(text: str) -> None:
+    """Print what a function of this module has formatted, in which all texts are printable."""
+    typer.echo(text)
+
+
 def print_headline(text: str, style: str = STRONG) -> None:
     """Print a sentence, wrapped at words on a terminal."""
     width = screen_width()

@@ -224,6 +224,9 @@ def replay(
             "messages. Ends with 0 if all are equal, 1 if not.",
         ),
     ] = False,
+    up: Annotated[
+        bool, typer.Option("--up", help="Bring a router, a monitor and a recorder, as `up --record` does.")
+    ] = False,
     as_json: Json = False,
     stated: FileFormat = GUESS,
 ) -> None:
@@ -235,10 +238,29 @@ def replay(
         from reactorwatch.cli.verification import run
 
         given = {"--rate": rate, "--from": begin, "--to": end, "--loop": loop, "--column": column, "--process": process}
+        given["--up"] = up
         for option, value in given.items():
             if value:
                 raise InputError(f"--verify publishes nothing and takes the whole recording; leave out {option}")
         raise typer.Exit(run(check_recording(file), config, name, as_json=as_json))
+    if up:
+        from reactorwatch.cli.plant_settings import PlayedRecord
+        from reactorwatch.cli.supervise import run_until_stopped
+
+        part = {
+            "--from": begin,
+            "--to": end,
+            "--loop": loop,
+            "--column": column,
+            "--input": inputs,
+            "--output": outputs,
+        }
+        for option, value in part.items():
+            if value:
+                raise InputError(f"--up plays the whole file with its own names; leave out {option}")
+        pace = {"name": name, "speed": parse_pace(rate, "--rate"), "process": process}
+        played = PlayedRecord(check_recording(file), stated)
+        raise typer.Exit(run_until_stopped(config, endpoint, None, pace, None, None, played))
     from reactorwatch.records.record import MINUTE_NS
     from reactorwatch.records.source_text import is_table
     from reactorwatch.runtime.config import section

@@ -7,6 +7,9 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from reactorwatch.description.find import find_process
+from reactorwatch.description.plants import PlantProcesses
+from reactorwatch.description.process import Process
 from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.logs import configure
 from recorder.config import RecorderConfig
@@ -46,3 +49,19 @@ def load_recorder_settings(
     """
     tables, bus = load_settings(config, endpoint, level)
     return bus, section(RecorderConfig, "recorder", tables, {"plant": plant})
+
+
+def observed_process(process: str | None, recorder: RecorderConfig) -> Process | None:
+    """Process of the plant that is observed.
+
+    Args:
+        process: name or file of the process; None: the one that the recorder's settings name.
+        recorder: settings of the recorder, which name the plant.
+
+    Returns:
+        The process; None: it is not stated.
+
+    Raises:
+        InputError: it cannot be loaded.
+    """
+    return PlantProcesses(recorder.processes).find(recorder.plant) if process is None else find_process(process)

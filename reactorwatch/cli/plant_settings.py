@@ -4,9 +4,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from monitor_node.config import DEFAULT_TRAINING_ROWS
 from plant_node.config import PlantConfig
 from plant_node.process_settings import fit_settings
 from plant_node.record import load_process
+from reactorwatch.api.files import record
 from reactorwatch.cli.options import check_recording
 from reactorwatch.description.catalogue import Catalogue
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
@@ -47,6 +49,7 @@ class Source:
         plant: name of the plant.
         process: name or file of the process.
         is_named: True if flags or a recording name the process, False if it is that of the plant's settings.
+        rows: number of rows of a played record, of which a third is the longest training; None: it does not matter.
     """
 
     node: str
@@ -54,6 +57,13 @@ class Source:
     plant: str
     process: str
     is_named: bool
+    rows: int | None = None
+
+    @property
+    def has_end(self) -> bool:
+        """True if the source ends by itself."""
+        settings = self.settings
+        return settings.rows is not None if isinstance(settings, PlantConfig) else not settings.loop
 
     @property
     def about(self) -> dict[str, str]:
@@ -75,6 +85,9 @@ class Source:
         is_catalogued = self.process != DEFAULT_PROCESS and not self.process.lower().endswith(".json")
         if self.is_named or (is_catalogued and not stated):
             flags["process"] = self.process
+        is_stated = tables.get("monitor", {}).keys() & {"training_min", "training_rows"}
+        if self.rows is not None and not is_stated:
+            flags["training_rows"] = max(1, min(DEFAULT_TRAINING_ROWS, self.rows // 3))
         return flags
 
 
@@ -98,7 +111,11 @@ def load_source(tables: Tables, flags: dict[str, Any], played: PlayedRecord | No
     given = flags.get("process") or tables.get("replay", {}).get("process")
     process, name = process_of_run(given, played, flags.get("name"))
     replay = load_replay_settings(tables, played, {**flags, "name": name, "process": process})
-    return Source("replay", replay, name, process, is_named=process != DEFAULT_PROCESS)
+    is_named, rows = process != DEFAULT_PROCESS, None
+    if is_named:
+        described = find_process(process).without_equations()
+        rows = record(played.path, None, replay.columns, described, replay.table).rows
+    return Source("replay", replay, name, process, is_named=is_named, rows=rows)
 
 
 def load_plant_settings(tables: Tables, flags: dict[str, Any]) -> PlantConfig:
@@ -166,11 +183,11 @@ def process_of_run(process: str | None, played: PlayedRecord | None, plant: str 
         The name or file of the process, and the name of the plant.
 
     Raises:
-        InputError: there is no such process, or the recording holds several plants and none was named.
+        InputError: there is no such process, or the recording holds several plants.
     """
     if played is not None and not is_table(played.path):
-        plant = plant or one_plant_in(played.path)
-        described = recorded_process(played.path, plant)
+        recorded = one_plant_in(played.path)
+        plant, described = plant or recorded, recorded_process(played.path, recorded)
         if process is None and described is not None:
             process = described.name
             if process not in Catalogue():

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Process, Settings, choose_process
+from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Process, Settings
 from reactorwatch.cli.printing import print_lines
 
 
@@ -162,11 +162,11 @@ def status(
     as_json: Json = False,
 ) -> None:
     """Show the current state of plants, nodes, rates and alarms, until stopped."""
-    from reactorwatch.cli.observer import load_recorder_settings
+    from reactorwatch.cli.observer import load_recorder_settings, observed_process
     from reactorwatch.cli.status import run
 
-    described = choose_process(process, None, None).load() if process is not None else None
     bus, recorder = load_recorder_settings(config, endpoint, name)
+    described = observed_process(process, recorder)
     # a certificate is for one plant, and messages of others are not received
     plant = recorder.plant if name is not None or bus.ca is not None else None
     run(bus, plant, seconds, described, once=once, as_json=as_json)

@@ -8,10 +8,9 @@ from math import isnan
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-import typer
 
 from reactorwatch.cli.alarm_rows import ANNUNCIATED, Now, age_s, sort_alarms
-from reactorwatch.cli.display import has_colour, screen_width
+from reactorwatch.cli.display import has_colour, print_formatted, screen_width
 from reactorwatch.cli.status_view import format_plant
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import priority_word, state_word
@@ -201,7 +200,7 @@ def run(
             if once or as_json:
                 stopped.wait(listen_s)
                 _query_alarms(bus, board)
-                typer.echo(_text(board, as_json=as_json))
+                print_formatted(_text(board, as_json=as_json))
             else:
                 _show(bus, board, stopped)
         finally:

@@ -25,6 +25,7 @@ from reactorwatch.cli.bus_settings import (
 )
 from reactorwatch.cli.plant_settings import PlayedRecord, load_source
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
+from reactorwatch.cli.run_progress import RunProgress
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
@@ -91,13 +92,14 @@ def run_until_stopped(
     metrics = section(MetricsConfig, "metrics", tables, {})
     if Path(recorder.out).suffix != ENDING:
         check_folder_name(Path(recorder.out), "--out")
-    with open_router(site, join):  # before anything is written, in case the address is taken
+    with open_router(site, join) as bus:  # before anything is written, in case the address is taken
         tables_written = {source.node: source.settings, "monitor": monitor, "diagnosis": diagnosis, "metrics": metrics}
         nodes = ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", source.node)
         settings = _write_settings(recorder, source.about, {**tables_written, "log": log_config}, join, nodes)
         with stop_on_signals() as stop, Processes(settings) as processes_running:
             woken = threading.Event()
             stop.call_on_set(woken.set)
+            progress = RunProgress(bus, source.plant) if source.has_end else None
             for node in nodes:
                 processes_running.start(node)
             log.info("running", plant=source.plant, router=join[VIEWER].endpoint, out=recorder.out, stop="Ctrl-C")
@@ -106,6 +108,8 @@ def run_until_stopped(
                 if ended:
                     for node, code in ended.items():
                         log.info("ended by itself", node=node, code=code)
+                    if progress is not None and ended == {source.node: 0}:
+                        progress.wait_until_evaluated(woken.wait)
                     return 1 if any(ended.values()) else 0
             return 0
 
@@ -115,14 +119,17 @@ def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig
 
     Args:
         tables: tables of the settings file.
-        monitor: settings of the monitor, whose plant and model are the defaults.
+        monitor: settings of the monitor, whose plant and process are the defaults.
         out: folder for the reports; None: as in the settings.
 
     Raises:
         InputError: invalid settings, or a folder that is a file.
     """
-    of_monitor = {"plant": monitor.plant, **({"model": monitor.process} if monitor.process else {})}
-    tables = {"diagnosis": {**of_monitor, **tables.get("diagnosis", {})}}
+    of_monitor = {"plant": monitor.plant, **({"process": monitor.process} if monitor.process else {})}
+    stated = tables.get("diagnosis", {})
+    if "model" in stated:  # the older name
+        of_monitor.pop("process", None)
+    tables = {"diagnosis": {**of_monitor, **stated}}
     settings = section(DiagnosisConfig, "diagnosis", tables, {"out": str(out) if out is not None else None})
     if settings.out is not None:
         if Path(settings.out).exists() and not Path(settings.out).is_dir():
@@ -137,7 +144,7 @@ def check_against_model(config: DiagnosisConfig) -> None:
     Raises:
         InputError: there is no such model, or a tolerance is for none of its outputs.
     """
-    model = find_process(config.model or DEFAULT_PROCESS).require_model()
+    model = find_process(config.process or DEFAULT_PROCESS).require_model()
     try:
         check_tolerance(model, config.tolerance)
     except InputError as error:

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Endpoint, Plant, Process, Settings, choose_process
+from reactorwatch.cli.options import Endpoint, Plant, Process, Settings
 from reactorwatch.cli.printing import print_lines
 
 LOOPBACK = "127.0.0.1"
@@ -38,11 +38,12 @@ def view(
     """
     import logging
 
-    from reactorwatch.cli.observer import load_recorder_settings
+    from reactorwatch.cli.observer import load_recorder_settings, observed_process
+    from reactorwatch.description.find import find_process
     from recorder.dashboard.live import DisplayTarget, show
 
-    described = choose_process(process, None, None).load() if process is not None else None
-    if described is not None and config is None:
-        name = name or described.name
+    if process is not None and config is None:
+        name = name or find_process(process).name
     bus, recorder = load_recorder_settings(config, endpoint, name, logging.INFO)
+    described = observed_process(process, recorder)
     show(recorder.plant, bus, DisplayTarget(web=web, bind=bind, port=port), print_lines, described)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from math import inf
 
 import numpy as np
 
@@ -38,6 +39,7 @@ from reactorwatch.diagnosis.unknown_input.localise import MARGIN, UnknownInput, 
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, minus_log10_p
 from reactorwatch.process import effects_of
 from reactorwatch.process.effect import TIMING, Effect
+from reactorwatch.process.effect_twins import hidden_sources
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MAX_SPANS, Record
 
@@ -93,12 +95,13 @@ def diagnose(
     whole = make_run(record, model)
     bands = tolerances_of(whole, model, tolerance or {})
     plant = add_priors(model, uncertain or {})
-    search = Search(plant, effects, whole, smallest_noise(model))
+    hidden = hidden_sources(model, tuple(effects))
+    search = Search(plant, (*effects, *hidden), whole, smallest_noise(model))
     run = search.run
     result = search_single_cause(search)
     if search.adopt_colored_noise(result.best):
         result = search_single_cause(search)
-    result = search_pairs(search, result)
+    result = _drop_hidden(search_pairs(search, result), hidden)
     best = result.best if result.nominal.bic - result.best.bic >= LEAST_GAIN else result.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
     verdict = _decide_verdict(result, best)
@@ -111,9 +114,11 @@ def diagnose(
         offsets = result.nominal.hypothesis.offsets(result.nominal.fit)
         corrected = model.with_values({name: model.parameter(name).value + value for name, value in offsets.items()})
         unknown_input = locate(corrected, effects, run, result.nominal.fit, result.nominal_noise)
+        by_source = verdict == UNKNOWN and not np.any(adequacy >= DOUBTFUL)
         if verdict == UNKNOWN or _is_unknown(unknown_input, result, best, run, float(np.max(adequacy))):
             verdict, best = UNKNOWN, result.nominal  # the model is not extended without a cause
-            location = unknown_input.effect.location if unknown_input is not None else location
+            if unknown_input is not None and not by_source:
+                location = unknown_input.effect.location
         elif np.any(adequacy >= WHITE):
             remarks.append(
                 "the residual is small, but not white: the course in time may be rougher than the fitted profile"
@@ -215,6 +220,13 @@ def _decide_verdict(result: SearchResult, best: FittedHypothesis) -> str:
     if all(_is_source(item) for item in (best, *close)):
         return UNKNOWN
     return AMBIGUOUS if close else NAMED
+
+
+def _drop_hidden(result: SearchResult, hidden: Sequence[Effect]) -> SearchResult:
+    """Result without the hypotheses of sources that the catalogue does not have, unless nothing else comes near."""
+    named = [item for item in result.hypotheses if not set(item.hypothesis.filter.effects) & set(hidden)]
+    best = min((item.bic for item in named), default=inf)
+    return replace(result, hypotheses=named) if best < result.best.bic + SURE else result
 
 
 def _is_source(item: FittedHypothesis) -> bool:

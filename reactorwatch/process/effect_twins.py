@@ -12,7 +12,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.generic_effects import generic_effects
+from reactorwatch.process.generic_effects import Source, exchanges, generic_effects
 from reactorwatch.process.model import ProcessModel
 
 POINTS, SEED = 8, 1
@@ -92,6 +92,28 @@ def add_generic(model: ProcessModel, own: tuple[Effect, ...]) -> tuple[Effect, .
     """Effects of a process's own, then the generic ones of its model that are no twins of one of them."""
     changes = [EffectChanges(model, effect) for effect in own]
     return (*own, *(effect for effect in generic_effects(model) if not _has_twin(model, effect, changes)))
+
+
+@lru_cache(maxsize=64)
+def hidden_sources(model: ProcessModel, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
+    """Unmodelled sources of a model, and flows between two balances; what only these explain is unknown.
+
+    A source that an effect of the catalogue adds already is left out.
+    """
+    names = {effect.name for effect in effects}
+    sources = (item for item in generic_effects(model) if isinstance(item, Source) and item.name not in names)
+    alone = tuple(item for item in sources if not any(_adds_rate(model, effect, item) for effect in effects))
+    return (*alone, *exchanges(model))
+
+
+def _adds_rate(model: ProcessModel, effect: Effect, source: Source) -> bool:
+    """Return true if an effect is a twin of a source; most act elsewhere, too, which is known without numbers."""
+    size = ca.SX.sym("m")
+    extended = effect.apply(model, size)
+    acts = [ca.depends_on(item, size) for item in extended.rhs]
+    alone = [name == source.state for name in model.state_names]
+    shown = any(ca.depends_on(item.expression, size) for item in extended.outputs)
+    return acts == alone and not shown and are_twins(EffectChanges(model, effect), EffectChanges(model, source))
 
 
 def _has_twin(model: ProcessModel, effect: Effect, others: Sequence[EffectChanges]) -> bool:

@@ -61,6 +61,55 @@ class Source(Effect):
         return model.add_rate(self.state, size)
 
 
+class Exchange(Source):
+    """An unmodelled flow adds m to the balance of a state and takes it from that of another one.
+
+    Attributes:
+        other: name of the other state.
+        ratio: rate that m takes from it.
+    """
+
+    other: str
+    ratio: float
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Source`."""
+        return super().apply(model, size).add_rate(self.other, -self.ratio * size)
+
+
+@lru_cache(maxsize=64)
+def exchanges(model: ProcessModel) -> tuple[Effect, ...]:
+    """Unmodelled flows between each two states of one unit that the model joins in both directions."""
+    own = [index for index, item in enumerate(model.states) if item.name not in model.at_rest]
+    x, u, p = model.arguments()
+    clock = [model.clock.now, model.clock.middle]
+    by = ca.Function("by", [x, u, p, *clock], [ca.jacobian(ca.vertcat(*model.rhs), x)])
+    start, inputs = reference_point(model)
+    slopes = np.array(by(start, inputs, model.values(), 0.0, 0.0))
+    result = []
+    for i in own:
+        for j in own[:i]:
+            one, other = model.states[j], model.states[i]
+            if one.unit == other.unit and slopes[i, j] > 0.0 and slopes[j, i] > 0.0:
+                reach = LARGEST_SCALES * one.scale
+                facts = {"unit": f"{one.unit}/min", "lower": -reach, "upper": reach}
+                result.append(
+                    _make(
+                        Exchange,
+                        f"{one.name}.{other.name}.exchange",
+                        f"An unmodelled flow from {other.name} to {one.name}.",
+                        label=f"unknown flow between {one.name} and {other.name}",
+                        location=balance_of(one),
+                        typical=TYPICAL_SCALES * one.scale,
+                        state=one.name,
+                        other=other.name,
+                        ratio=float(slopes[i, j] / slopes[j, i]),
+                        **facts,
+                    )
+                )
+    return tuple(result)
+
+
 @lru_cache(maxsize=64)
 def generic_effects(model: ProcessModel) -> tuple[Effect, ...]:
     """Effects of every output, input, parameter and state of a model; not of what effects have added to it."""

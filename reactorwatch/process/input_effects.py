@@ -109,7 +109,7 @@ class InputStiction(InputEffect):
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`; raises what `command` does."""
-        state, command = self.new_state(model), self.command(model).symbol
+        state, command = replace(self.new_state(model), scale=self.typical), self.command(model).symbol
         free = ca.logic_or(ca.fabs(command - state.symbol) > size, size <= 0)
         moved = ca.if_else(free, command, state.symbol)
         stuck = model.substitute(command, state.symbol)

@@ -1,5 +1,6 @@
 """The whole chain, as real processes on a real router: what `make demo` promises."""
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -52,6 +53,8 @@ def test_it_leaves_a_recording_a_drawing_and_a_summary(demo: tuple[Path, str]) -
     assert not [name for name in names if name.endswith(".part")]
     summary = (folder / "summary.md").read_text()
     assert "set in at 150.0 min" in summary
+    headline = summary.splitlines()[2]
+    assert re.fullmatch(r"Detected after \d+ s; cause named: coolant leak, 15 % of the coolant lost\.", headline)
     assert "Alarm raised" in summary
     assert "demo.rrd" in summary
     assert "Diagnosis of the whole recording: The simulation is wrong: coolant leak, since 1" in summary

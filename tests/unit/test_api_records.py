@@ -8,7 +8,10 @@ import pyarrow as pa
 import pytest
 
 import reactorwatch as rw
+from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.records.record import Record as MeasuredRecord
+from reactorwatch.records.write_table import write_table
+from recorder.tools.convert import import_csv
 
 ROWS = 300
 RIG = rw.Process(
@@ -70,6 +73,32 @@ def test_a_record_is_taken_with_its_process_by_all_functions(from_arrays: rw.Rec
     for function in (rw.simulate, rw.diagnose):
         with pytest.raises(rw.InputError, match="process 'rig': must have equations for this, got none"):
             function(from_arrays)
+
+
+def test_a_monitor_that_is_fed_its_rows_raises_the_alarms_of_the_back_test(from_arrays: rw.Record) -> None:
+    shifted = {name: values.copy() for name, values in from_arrays.signals.items()}
+    shifted["y"][200:] += 1.0
+    record = rw.Record(time_min=from_arrays.time_min, signals=shifted, process=RIG)
+    result, changes = rw.backtest(record, training_rows=100), []
+    monitor = rw.Monitor(RIG, training_rows=100)
+    for row, minute in enumerate(record.time_min.tolist()):
+        values = {name: float(values[row]) for name, values in record.signals.items()}
+        changes += monitor.update(minute, values)
+    raised = [(item.alarm, item.time_min) for item in changes if item.event == "raised"]
+    assert raised
+    assert raised == [(item.alarm, item.raised_min) for item in result.alarms]
+
+
+def test_a_recording_describes_the_process_of_its_record(from_arrays: rw.Record, tmp_path: Path) -> None:
+    write_table(tmp_path / "rig.csv", from_arrays)
+    (tmp_path / "rig.toml").write_text(
+        'name = "rig"\n[[signals]]\nname = "u"\nrole = "input"\n[[signals]]\nname = "y"\nrole = "output"\n'
+    )
+    import_csv(tmp_path / "rig.csv", tmp_path / "rig.mcap", choice=ProcessChoice(str(tmp_path / "rig.toml")))
+    record = rw.read_record(tmp_path / "rig.mcap")
+    assert isinstance(record.process, rw.Process)
+    assert (record.process.inputs, record.process.outputs) == (("u",), ("y",))
+    assert rw.backtest(record).signals == rw.backtest(from_arrays).signals
 
 
 def test_values_outside_the_bounds_of_a_signal_are_not_measured() -> None:

@@ -129,7 +129,7 @@ class Conversion:
         step = RowStep.of(config, model)
         if model is None or step is None:
             return None
-        if len(config.inputs) != 1 or config.carried:  # the ring keeps the levels of one input, and no others
+        if len(config.inputs) != 1 or config.carried_signals:  # the ring keeps the levels of one input, and no others
             return None
         form = Conversion(config, model, step)
         return form if form.keeps >= form.remembered else None

@@ -26,7 +26,7 @@ from scipy import special
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.grid_search import fit_hypothesis
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
-from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, Sine
+from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, LateSine, Sine
 from reactorwatch.diagnosis.result import LISTED
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.integrate import SimulationError
@@ -135,9 +135,10 @@ def extrapolate(
         pattern_min: see `Prediction`.
     """
     if isinstance(profile, Sine) and parameters[2] <= LARGEST_SHARE * pattern_min:
-        angle = 2.0 * np.pi / parameters[2] * (float(time_min[0]) - profile.start_min)
+        zero_min = parameters[3] if isinstance(profile, LateSine) else profile.start_min
+        angle = 2.0 * np.pi / parameters[2] * (float(time_min[0]) - zero_min)
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        return Sine(time_min), np.append(turn @ parameters[:2], parameters[2])
+        return Sine(time_min), np.append(turn @ parameters[:2], parameters[2:3])
     return Constant(time_min), profile.signal(parameters).sample_value[-1:]
 
 

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from math import atan2, hypot, pi
+from math import atan2, cos, hypot, pi, sin
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -307,6 +307,31 @@ class Sine(FittedProfile):
         """Limit the amplitude to the smaller bound; of a one-sided effect, to the other bound."""
         reach = min(-lower, upper) if lower < 0.0 else upper
         return np.asarray(by * min(1.0, reach / max(hypot(*by), 1e-300)))
+
+
+class LateSine(Sine):
+    """Sine about zero that sets in at its onset."""
+
+    @property
+    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
+        """See `FittedProfile`."""
+        return (*super().nonlinear_parameters, self._onset())
+
+    def basis_functions(self, shape: Array) -> tuple[Array, Array]:
+        """See `FittedProfile`."""
+        rate, age = 2.0 * pi / shape[0], np.maximum(self.time_min - shape[1], 0.0)
+        on, sine, cosine = self.time_min >= shape[1], np.sin(rate * age), np.cos(rate * age)
+        return np.stack([sine, cosine * on], axis=1), np.stack([(1.0 - cosine) / rate, sine / rate], axis=1)
+
+    def profile_values(self, parameters: Array) -> dict[str, float]:
+        """See `FittedProfile`."""
+        return super().profile_values(parameters) | {"onset": float(parameters[3])}
+
+    def from_sine(self, parameters: Array, onset_min: float) -> Array:
+        """Parameters of a sine that is the same from an onset on."""
+        angle = 2.0 * pi / parameters[2] * (onset_min - self.start_min)
+        turn = np.array([[cos(angle), -sin(angle)], [sin(angle), cos(angle)]])
+        return np.concatenate([turn @ parameters[:2], [parameters[2], onset_min], parameters[3:]])
 
 
 class PiecewiseLinear(FittedProfile):

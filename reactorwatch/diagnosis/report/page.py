@@ -25,6 +25,7 @@ from reactorwatch.diagnosis.report.words import (
 )
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
 from reactorwatch.diagnosis.whiteness import WHITE
+from reactorwatch.process import MODELS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES
@@ -115,7 +116,7 @@ def as_page(
         experiment=[] if diagnosis.experiment is None else pictures.experiment(diagnosis.experiment, model),
         separations=[] if diagnosis.experiment is None else _separations(diagnosis.experiment),
         experiment_file=experiment_file,
-        experiment_command=_experiment_command(diagnosis.experiment, experiment_file),
+        experiment_command=_experiment_command(diagnosis.experiment, experiment_file, model.name),
         model_file=model_file,
         commands=_commands(file, model_file, on_the_bus=on_the_bus),
         origin=origin,
@@ -201,10 +202,11 @@ def _percent(share: float) -> str:
     return "over 99 %" if share > 0.99 else f"{100.0 * share:.0f} %"
 
 
-def _experiment_command(experiment: Experiment | None, experiment_file: str) -> str:
+def _experiment_command(experiment: Experiment | None, experiment_file: str, process: str) -> str:
     if experiment is None:
         return ""
-    return f"reactorwatch plant --scenario {quote(experiment_file)} --duration {experiment.span_min:g}"
+    named = "" if process == MODELS[0]().name else f" --process {quote(process)}"
+    return f"reactorwatch plant{named} --scenario {quote(experiment_file)} --duration {experiment.span_min:g}"
 
 
 def _commands(file: str, model_file: str, *, on_the_bus: bool) -> list[str]:

@@ -207,8 +207,8 @@ class PairScreen:
 
 
 def can_be_together(one: Effect, other: Effect) -> bool:
-    """Return true if two effects make a pair: a filter delays one output, and an unmodelled source is no cause."""
-    if one is other or one.is_source or other.is_source:
+    """Return true if two effects make a pair: a filter delays one output, and an unmodelled source names nothing."""
+    if one is other or one.is_source != other.is_source:
         return False
     return one.delays_output is None or other.delays_output is None
 

@@ -292,6 +292,8 @@ class Screen:
         interval_mean, sample_value = profile.basis_signals(shape)[:2]
         candidates = []
         for cause, effect in enumerate(effects):
+            if isinstance(profile, Sine) and 0.0 in (effect.lower, effect.upper):
+                continue  # a one-sided effect cannot be a sine about zero
             a, b = signatures.gram(dynamics, cause, interval_mean[1:-1], sample_value[2:])
             if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
                 continue

@@ -22,7 +22,7 @@ from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvalu
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.knot_selection import fine_grid, select_knots
 from reactorwatch.diagnosis.fitting.outliers import find_gross_outliers, find_outliers, remove_outliers
-from reactorwatch.diagnosis.fitting.profiles import PiecewiseLinear, Signal
+from reactorwatch.diagnosis.fitting.profiles import LateSine, PiecewiseLinear, Signal, Sine
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.cause_prior import CausePrior
 from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
@@ -55,6 +55,9 @@ LEAST_SENSOR_GAIN = 10.0
 """Minimum gain in BIC of coloured sensor noise."""
 
 ROUNDS = 5
+
+SINE_ONSETS = 24
+"""Onsets that are tried for a sine."""
 
 CONVERGED_NOISE = 10.0
 """Threshold in BIC: noise levels that gain less are not worth another round."""
@@ -288,7 +291,7 @@ class Search:
         return fine_grid(self.run.time_min)
 
     def with_selected_knots(self, item: FittedHypothesis, steps: int = MOST_STEPS) -> FittedHypothesis:
-        """Refit piecewise-linear profiles with the number of knots that they need."""
+        """Refit piecewise-linear profiles with the number of knots that they need, and sines that set in later."""
         hypothesis = item.hypothesis
         for index, profile in enumerate(hypothesis.profiles):
             if not isinstance(profile, PiecewiseLinear) or index == hypothesis.filter.delay_index:
@@ -298,6 +301,23 @@ class Search:
             if profiles[index].n_linear != profile.n_linear:
                 other = self.fit(Hypothesis(hypothesis.filter, profiles), parameters, steps, scan=False)
                 item = min(item, other, key=lambda item: item.bic)
+        return self._with_late_sines(item, steps)
+
+    def _with_late_sines(self, item: FittedHypothesis, steps: int) -> FittedHypothesis:
+        """Refit sines with an onset, where they gain by setting in later."""
+        for index, profile in enumerate(item.hypothesis.profiles):
+            if type(profile) is not Sine:
+                continue
+            late, profiles = LateSine(self.run.time_min), list(item.hypothesis.profiles)
+            profiles[index] = late
+            hypothesis = Hypothesis(item.hypothesis.filter, profiles)
+            onsets = late.start_min + self.run.span_min * np.linspace(0.0, 0.9, SINE_ONSETS + 1)[1:]
+            tried = [list(item.fit.parameters) for _ in onsets]
+            for parameters, onset in zip(tried, onsets.tolist(), strict=True):
+                parameters[index] = late.from_sine(parameters[index], onset)
+            first = min(hypothesis.evaluate_all(self.run, tried), key=lambda fit: fit.loss)
+            if first.loss < item.fit.loss:
+                item = min(item, self.fit(hypothesis, first.parameters, steps, scan=False), key=lambda each: each.bic)
         return item
 
     def _sort(self, candidates: Sequence[Candidate]) -> list[Candidate]:

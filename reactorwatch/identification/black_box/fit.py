@@ -7,11 +7,11 @@
 2. A normal prior keeps products small that the training does not excite. So degree and terms need not be selected: the
    posterior covariance says which are known.
 3. The variances of process and measurements maximise the likelihood of the filter (`log_likelihood`).
-4. The number of lags is the one of largest likelihood less half the effective parameters times the logarithm of the
-   rows (Schwarz, Ann. Statist. 6 (1978) 461).
+4. The number of lags is that of the largest likelihood less half the effective parameters times the logarithm of the
+   rows (Schwarz, Ann. Statist. 6 (1978) 461). Then `FINEST_DEGREE` is tried by Akaike's criterion, with a margin.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,17 +27,21 @@ MOST_PARAMETERS = 90
 
 LARGEST_DEGREE, MOST_LAGS = 3, 3
 
+FINEST_DEGREE = 4
+"""Degree that is taken where it is likelier: with little noise a cubic is visibly wrong."""
+
 ROWS_A_PARAMETER = 4
 """Least number of measured values for each parameter."""
 
-PRIOR_SD = (1.0, 1.0, 0.17, 0.07)
+PRIOR_SD = (1.0, 1.0, 0.17, 0.07, 0.03)
 """Standard deviations of the parameters by degree, of scaled signals."""
 
 GAINS = (1.0, 0.6, 0.3, 0.1, 0.03, 0.0)
 MARGIN = 10.0
-"""Gain of log-likelihood that a larger gain has to bring; `NOISE_MARGIN` the same for noise of the process."""
+"""Difference of log-likelihoods that a larger gain has to bring, or the finest degree."""
 
 NOISE_MARGIN = 5.0
+"""The same for noise of the process."""
 
 _ITERATIONS, _LAST_ITERATIONS = 5, 20
 _CONVERGED = 1e-4  # relative decrease of the cost
@@ -106,31 +110,42 @@ def fit_black_box(
     count = outputs.shape[1]
     y, u = (outputs - centres[:count]) / spreads[:count], (inputs - centres[count:]) / spreads[count:]
     smallest = np.square(smallest_sd / spreads[:count])
-    shapes = largest_shapes(count, inputs.shape[1], int(np.isfinite(outputs).all(axis=1).sum()), delay)
-    best: tuple[float, BlackBoxModel] | None = None
-    for shape in shapes:
+    complete = int(np.isfinite(outputs).all(axis=1).sum())
+
+    def fit(shape: Shape) -> tuple[float, float, BlackBoxModel] | None:
+        """Log-likelihood of a shape, its effective parameters and its model; None if the rows are too few."""
         lagged = lagged_inputs(shape, u)
         rows = Rows(y, lagged, row_kinds(shape, y, lagged, follows), smallest)
         measured = int(np.isfinite(y[rows.kinds == NEXT]).all(axis=1).sum())
         if measured * count < ROWS_A_PARAMETER * shape.parameters:
-            continue
+            return None
         fitted = _fit_shape(shape, rows)
         r, q, likelihood = _fit_variances(shape, rows, fitted)
         effective = shape.parameters - float(np.sum(np.diag(fitted.covariance) / prior_variances(shape)))
-        score = likelihood - 0.5 * effective * np.log(measured)
-        if best is None or score > best[0]:
-            share = effective / count
-            inflation = measured / max(measured - share, 0.1 * measured)
-            variances = r * inflation, q * inflation
-            scaling, parameters = (centres, spreads), (fitted.theta, fitted.covariance)
-            best = score, BlackBoxModel.of(shape, measured, share, fitted.gain, scaling, variances, *parameters)
+        share = effective / count
+        inflation = measured / max(measured - share, 0.1 * measured)
+        variances, scaling = (r * inflation, q * inflation), (centres, spreads)
+        parameters = fitted.theta, fitted.covariance
+        model = BlackBoxModel.of(shape, measured, share, fitted.gain, scaling, variances, *parameters)
+        return likelihood, effective, model
+
+    best = max(
+        (item for shape in largest_shapes(count, inputs.shape[1], complete, delay) if (item := fit(shape)) is not None),
+        key=lambda item: item[0] - 0.5 * item[1] * np.log(item[2].rows),
+        default=None,
+    )
+    if best is not None:
+        finer = replace(best[2].shape, degree=FINEST_DEGREE)
+        other = fit(finer) if finer.parameters <= MOST_PARAMETERS else None
+        if other is not None and other[0] - other[1] > best[0] - best[1] + MARGIN:
+            best = other
     if best is None:
         raise InputError(
             f"a model of {count} outputs and {inputs.shape[1]} inputs needs at least "
             f"{ROWS_A_PARAMETER * (1 + count + inputs.shape[1])} complete rows in succession and at most "
             f"{MOST_PARAMETERS} parameters, got {len(y)} rows"
         )
-    return best[1]
+    return best[2]
 
 
 def row_kinds(shape: Shape, y: Array, lagged: Array, follows: NDArray[np.bool_]) -> NDArray[np.int64]:

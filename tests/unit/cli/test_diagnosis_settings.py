@@ -17,7 +17,7 @@ def test_plant_and_model_are_those_of_the_monitor(tmp_path: Path) -> None:
     (tmp_path / "known.json").write_text(MODEL)
     monitor = MonitorConfig(plant="unit_2", process=str(tmp_path / "known.json"))
     found = diagnosis_settings({}, monitor, tmp_path / "reports")
-    assert found == DiagnosisConfig(plant="unit_2", out=str(tmp_path / "reports"), model=monitor.process)
+    assert found == DiagnosisConfig(plant="unit_2", out=str(tmp_path / "reports"), process=monitor.process)
 
 
 def test_settings_say_otherwise_and_a_flag_says_more(tmp_path: Path) -> None:

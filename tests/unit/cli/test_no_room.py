@@ -39,6 +39,7 @@ LINES = {
         "diagnose good.csv -o there --json",
         "diagnose good.csv other.csv --jobs 1 -o new",
     ],
+    "example": ["example leak -o new.csv"],
     "reproduce": ["reproduce --only 7 --jobs 1 -o new"],
 }
 ANSWERED = {"simulate", "backtest", "diagnose"}

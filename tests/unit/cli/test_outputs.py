@@ -75,11 +75,17 @@ CASES = {
     "merge": [Case("merge other.mcap run.mcap", {"files": "run.mcap"}, "new.mcap")],
     "backtest": [
         Case(
-            "backtest run.csv run.mcap --model model.json --config settings.toml",
-            {"files": "run.csv", "model": "model.json", "config": "settings.toml"},
+            "backtest run.csv run.mcap --train other.csv --process model.json --config settings.toml",
+            {"files": "run.csv", "train": "other.csv", "process": "model.json", "config": "settings.toml"},
             "folder",
             SUMMARY,
-        )
+        ),
+        Case(
+            "backtest run.csv --train other.csv --process model.json --config settings.toml",
+            {"files": "run.csv", "train": "other.csv", "process": "model.json", "config": "settings.toml"},
+            "new.csv",
+            option="--rows",
+        ),
     ],
     "diagnose": [
         Case("diagnose run.csv --process model.json", {"files": "run.csv", "process": "model.json"}, "folder", REPORT),
@@ -96,8 +102,8 @@ CASES = {
     "record": [
         Case(f"record {NO_ROUTER} --config settings.toml", {"config": ""}, "new.mcap", never_overwrites=True),
     ],
-    "up": [Case(f"up {NO_ROUTER}", {"config": "", "diagnose": "", "site": ""}, "folder")],
-    "demo": [Case("demo", {"site": ""}, "folder", never_overwrites=True)],
+    "up": [Case(f"up {NO_ROUTER}", {"config": "", "diagnose": "", "site": "", "record": "", "process": ""}, "folder")],
+    "demo": [Case("demo", {"site": "", "process": ""}, "folder", never_overwrites=True)],
 }
 ALL = [case for cases in CASES.values() for case in cases]
 FOLDERS = ("folder", "pictures")
@@ -121,7 +127,7 @@ def commands(of: typer.Typer = app, before: str = "") -> Iterator[tuple[str, Cal
 
 
 def test_every_command_with_an_output_is_tested_here_with_every_file_that_it_reads() -> None:
-    outputs = {"out", "png"}
+    outputs = {"out", "png", "rows"}
     found = {name: paths(command) for name, command in commands() if outputs & paths(command)}
     assert {"export", "diagnose", "record"} <= found.keys()
     assert found.keys() == CASES.keys()

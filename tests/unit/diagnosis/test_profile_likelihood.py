@@ -79,9 +79,9 @@ def test_an_onset_of_which_the_likelihood_has_two_humps_may_be_at_either() -> No
     search.update_noise(fitted)
     fitted = search.refit(fitted)
     best, (sds,) = refine(search, fitted, [np.sqrt(np.diag(hypothesis.covariance(run, fitted.fit)))])
-    sd, (found, estimate) = sds[1], best.fit.parameters[0]
+    sd, (found, estimate, *constants) = sds[1], best.fit.parameters[0].tolist()
     grid = np.arange(estimate - 1.0, estimate + 1.0, 0.02)
-    losses = np.array([hypothesis.evaluate(run, (np.array([found, onset]),)).loss for onset in grid])
+    losses = np.array([hypothesis.evaluate(run, (np.array([found, onset, *constants]),)).loss for onset in grid])
     likelihood = np.exp(losses.min() - losses)
     spread = np.sqrt(np.sum(likelihood * (grid - estimate) ** 2) / np.sum(likelihood))
     assert sd == pytest.approx(spread, rel=0.15)

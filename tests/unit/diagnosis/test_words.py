@@ -67,7 +67,8 @@ def test_a_number_has_the_digits_that_its_95_percent_interval_allows(estimate: E
 def test_the_size_of_every_cause_is_said_in_its_unit_and_meaning(effect: Effect, profile: str) -> None:
     for sign in (1.0, -1.0) if effect.lower < 0.0 else (1.0,):
         size = Estimate(sign * abs(effect.typical), 0.01 * abs(effect.typical), effect.unit)
-        cause = Cause(effect.name, profile, effect.label, effect.location, {"size": size})
+        constants = {item.name: Estimate(item.value, item.sd, item.unit) for item in effect.constants}
+        cause = Cause(effect.name, profile, effect.label, effect.location, {"size": size} | constants)
         said = describe_size(cause, (effect,))
         unit = "%" if "%" in effect.larger else effect.unit
         value = abs(size.value) * (100.0 if unit == "%" else 1.0)

@@ -87,7 +87,7 @@ def faulty_rows(fault: str, period_min: float, after: int) -> list[Row]:
     record = simulate_record(config, ROWS + after)
     columns = (record.time_min, record.columns["qc"], record.columns["C"], record.columns["T"])
     rows = zip(*(item.tolist() for item in columns), strict=True)
-    faulty: list[Row] = [(time_min, flow, (C, T)) for time_min, flow, C, T in rows]
+    faulty: list[Row] = [(time_min, (flow,), (C, T)) for time_min, flow, C, T in rows]
     return faulty[-ROWS:]
 
 

@@ -140,9 +140,12 @@ def reference_of(said: list[Publication]) -> ModelSnapshot:
     return next(model for model in models if isinstance(model, ModelSnapshot) and model.held)
 
 
-@pytest.mark.parametrize(("setting", "judge"), [("auto", "equations"), ("process", "equations"), ("arx", "arx")])
+@pytest.mark.parametrize(
+    ("setting", "judge"),
+    [("auto", "equations"), ("process", "equations"), ("black-box", "black-box"), ("arx", "arx")],
+)
 def test_what_judges_is_published_with_its_noise_levels_and_nothing_else_says_that_it_judges(
-    leak: list[Encoded], setting: Literal["auto", "process", "arx"], judge: str
+    leak: list[Encoded], setting: Literal["auto", "process", "black-box", "arx"], judge: str
 ) -> None:
     monitor, said = watch(leak, MonitorConfig(reference=setting, isolation=False))
     models = [(item.key, item.message) for item in said if isinstance(item.message, ModelSnapshot)]

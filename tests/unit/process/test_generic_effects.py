@@ -9,7 +9,7 @@ import pytest
 from reactorwatch.process import EFFECTS_OF, MODELS, effects_of, named_effects
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.effect_states import reset_function
-from reactorwatch.process.effect_twins import EffectChanges, add_generic, are_twins
+from reactorwatch.process.effect_twins import EffectChanges, add_generic, are_twins, hidden_sources
 from reactorwatch.process.generic_effects import generic_effects, reference_point
 from reactorwatch.process.library.cstr.effects.temperature_bias import TemperatureBias
 from reactorwatch.process.library.three_tanks.model import three_tanks
@@ -108,3 +108,24 @@ def test_a_model_without_a_catalogue_has_the_generic_ones_and_a_text_may_name_th
     assert {"leak1", "h1.bias", "h2.lag", "h3.source"} <= set(names)
     first: Effect = next(effect for effect in named_effects(three_tanks()) if effect.name == "h1.bias")
     assert first in EFFECTS_OF["three_tanks"]
+
+
+def test_a_source_is_hidden_unless_an_effect_adds_its_rate_already() -> None:
+    own = EFFECTS_OF["three_tanks"]
+    assert [item.name for item in hidden_sources(three_tanks(), own)] == [
+        "h3.source",
+        "h1.h3.exchange",
+        "h2.h3.exchange",
+    ]
+    fewer = tuple(effect for effect in own if effect.name != "pump1")
+    assert "h1.source" in [item.name for item in hidden_sources(three_tanks(), fewer)]
+    assert hidden_sources(MODELS[0](), EFFECTS_OF["cstr"]) == ()
+
+
+def test_what_an_exchange_takes_from_one_tank_the_other_gets() -> None:
+    model = three_tanks()
+    exchange = next(item for item in hidden_sources(model, ()) if item.name == "h1.h3.exchange")
+    extended = exchange.extend(model).with_values({"h1.h3.exchange.size": 0.7})
+    x, u = reference_point(model)
+    before, after = (np.array(item.function()(x, u, item.values(), 0.0, 0.0)[0]).ravel() for item in (model, extended))
+    np.testing.assert_allclose(after - before, [0.7, 0.0, -0.7], atol=1e-9)

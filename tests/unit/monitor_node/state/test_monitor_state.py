@@ -75,9 +75,9 @@ def stopped_at(
 
 
 @pytest.mark.parametrize("points", [True, False], ids=["with points", "without"])
-@pytest.mark.parametrize("reference", ["process", "arx", "auto"])
+@pytest.mark.parametrize("reference", ["process", "black-box", "arx", "auto"])
 def test_who_was_stopped_at_any_samples_says_the_same(
-    reference: Literal["process", "arx", "auto"], points: bool, leak: list[Encoded]
+    reference: Literal["process", "black-box", "arx", "auto"], points: bool, leak: list[Encoded]
 ) -> None:
     """In training and watching, in an alarm, acknowledged and shelved, in the middle of a row."""
     config = msgspec.structs.replace(CONFIG, reference=reference)
