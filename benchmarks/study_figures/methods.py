@@ -17,7 +17,11 @@ METHODS = (
     ("ARX, least squares", "linear in its parameters", "`identify --model arx`, also row by row (`--recursive`)"),
     ("ARMAX", "ARX with a model of the noise", "`identify --model armax`"),
     ("output error", "fitted by its simulation", "`identify --model oe`"),
-    ("Shewhart limits, mean +- 3 sigma", "one point at a time", "chart `shewhart`; `backtest --scheme report`"),
+    (
+        "Shewhart limits, mean +- 3 sigma",
+        "one point at a time",
+        "chart `shewhart`; option `--scheme report` of `backtest`",
+    ),
     ("multivariate control charts", "outputs judged together, with their correlation", "charts `t2` and `mewma`"),
     (
         "PCA, contribution plots",

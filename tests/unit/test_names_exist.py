@@ -21,8 +21,9 @@ QUOTED = re.compile(r"(?<!`)`([a-z_][a-z0-9_]*(?:\.[a-z_][a-z0-9_]*)*)`(?!`)")
 COMMENT = re.compile(r"(?:^|\s)#\s(.*)$", re.MULTILINE)
 WORD = re.compile(r"\w+")
 
-MADE = {"summary.md"}
-"""Files that the commands write."""
+WRITTEN = re.compile(r"<!-- run: file (\S+) -->")
+MADE = {"summary.md"}.union(*(WRITTEN.findall(path.read_text(encoding="utf-8")) for path in DOCUMENTS))
+"""Files that the commands write, and those that a page shows for the reader to write."""
 PREFIXES = ("reactorwatch_", "process_", "keep_", "_total")
 """Parts of names that the code puts together: metrics (tests/end_to_end/test_metrics.py has them all) and settings."""
 ELSEWHERE = ("xdist_group", "nohup", "openssl", "trustme", "uv", "zenohd")
