@@ -41,6 +41,9 @@ WIDEST_ONSET_MIN = 0.5
 JUMPING = {effect.name for effect in EFFECTS if effect.is_discontinuous}
 """A valve that sticks shows it when it should move."""
 
+WITH_CONSTANTS = {effect.name for effect in EFFECTS if effect.constants}
+"""Fitting their constants beside the size costs more than a fit of the size alone."""
+
 LONGEST_LIST, USUAL_LENGTH, MEAN_LENGTH = 8, 1, 1.75
 """Explanations on a list: at most, in the median and on average."""
 UNLUCKY = 1e-3
@@ -126,7 +129,7 @@ def test_intervals_are_about_as_narrow_as_the_record_allows() -> None:
         if not judged.first or judged.profiles != (course.kind,):
             continue
         (cause,) = said.causes
-        if not next(effect for effect in named() if effect.name == name).constants:  # these cost more than a size alone
+        if name not in WITH_CONSTANTS:
             widths[name] = cause.parameters["size"].sd / abs(course.size) * sqrt(hidden.strength)
         if cause.profile == "step" and name not in JUMPING:
             onsets[name] = cause.parameters["onset"].sd
