@@ -1,0 +1,69 @@
+"""The plants of `make promise` are the reactor by an independent integration, each with its difference."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.promise import plants
+from benchmarks.promise.__main__ import poisson_interval
+from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
+from plant_node.record import simulate_record
+from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.simulate import Simulator
+
+RANDOM_STEPS = INPUTS["a new flow in 90 to 111 each minute"]
+EFFECT_OF = {
+    "reaction 3 % slower": "reaction_rate:constant:-0.03",
+    "valve lag of 0.12 min": "valve_lag:constant:0.12",
+    "feed 1 K warmer": "feed_temperature:constant:1",
+    "3 % more volume": "volume:constant:0.03",
+    "heat loss of 0.003 1/min": "heat_loss:constant:0.003",
+}
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plants, "SPAN_MIN", 30.0)
+    monkeypatch.setattr(plants, "NOISE", {"C": 0.0, "T": 0.0})
+
+
+def test_the_nominal_plant_is_that_of_the_simulator() -> None:
+    record = simulate(Kind("nominal"), RANDOM_STEPS, 3)
+    run = Simulator(cstr()).run(record.time_min, record.columns["qc"], np.array([0.1, 438.54]))
+    np.testing.assert_allclose(record.columns["C"], run.outputs[:, 0], atol=1e-6)
+    np.testing.assert_allclose(record.columns["T"], run.outputs[:, 1], atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind.name in EFFECT_OF], ids=lambda kind: kind.name)
+def test_a_difference_since_ever_is_that_of_the_catalogue_s_effect(kind: Kind) -> None:
+    from plant_node.config import PlantConfig
+
+    record = simulate(kind, RANDOM_STEPS, 3)
+    config = PlantConfig(faults=(EFFECT_OF[kind.name],), noise_sd={"C": 0.0, "T": 0.0})
+    other = simulate_record(config, record.rows, driver=record)
+    settled = record.time_min > 10.0  # both begin at the same state, the effect's own states elsewhere
+    np.testing.assert_allclose(record.columns["C"][settled], other.columns["C"][settled], atol=2e-5)
+    np.testing.assert_allclose(record.columns["T"][settled], other.columns["T"][settled], atol=1e-2)
+
+
+def test_each_kind_of_noise_loss_and_step_is_in_the_record() -> None:
+    by_name = {kind.name: kind for kind in KINDS}
+    nominal = simulate(Kind("nominal"), RANDOM_STEPS, 3)
+    assert simulate(replace(by_name["2 % of the rows lost"], lost=0.5), RANDOM_STEPS, 3).rows < 0.7 * nominal.rows
+    assert np.isfinite(simulate(by_name["C every tenth row"], RANDOM_STEPS, 3).columns["C"]).mean() == pytest.approx(
+        0.1
+    )
+    stepped = simulate(by_name["sensors in steps"], RANDOM_STEPS, 3).columns["T"]
+    np.testing.assert_allclose(stepped / 0.5, np.round(stepped / 0.5))
+    memory = simulate(by_name["noise with memory"], RANDOM_STEPS, 3).columns["T"] - nominal.columns["T"]
+    assert np.corrcoef(memory[1:], memory[:-1])[0, 1] > 0.7
+    warm = simulate(Kind("nominal"), RANDOM_STEPS, 3, warmer_from_min=20.0).columns["T"] - nominal.columns["T"]
+    assert np.abs(warm[nominal.time_min < 20.0]).max() == 0.0
+    assert warm[nominal.time_min > 25.0].mean() > 0.3
+
+
+def test_the_interval_of_a_count_is_that_of_garwood() -> None:
+    """Table of Garwood (1936), Fiducial limits for the Poisson distribution, Biometrika 28: 3 and 0 events."""
+    assert poisson_interval(3) == pytest.approx((0.619, 8.767), abs=1e-3)
+    assert poisson_interval(0) == pytest.approx((0.0, 3.689), abs=1e-3)
