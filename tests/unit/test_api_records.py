@@ -79,8 +79,8 @@ def test_a_monitor_that_is_fed_its_rows_raises_the_alarms_of_the_back_test(from_
     shifted = {name: values.copy() for name, values in from_arrays.signals.items()}
     shifted["y"][200:] += 1.0
     record = rw.Record(time_min=from_arrays.time_min, signals=shifted, process=RIG)
-    result, changes = rw.backtest(record, training_rows=100), []
-    monitor = rw.Monitor(RIG, training_rows=100)
+    result, changes = rw.backtest(record, training_rows=100, reference="black-box"), []
+    monitor = rw.Monitor(RIG, training_rows=100, reference="black-box")
     for row, minute in enumerate(record.time_min.tolist()):
         values = {name: float(values[row]) for name, values in record.signals.items()}
         changes += monitor.update(minute, values)
