@@ -1,5 +1,6 @@
 """Effects on the sensor of one output of any model: bias, gain, lag, delay, a stuck reading, noise."""
 
+from abc import abstractmethod
 from typing import ClassVar
 
 import casadi as ca
@@ -12,9 +13,9 @@ from reactorwatch.process.model import ProcessModel, variable
 class ReadingEffect(SensorEffect):
     """An effect of a sensor without states: its reading is a function of the true value."""
 
+    @abstractmethod
     def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
         """Reading of the sensor at a true value."""
-        raise NotImplementedError
 
     def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
         """See `SensorEffect`."""

@@ -62,4 +62,4 @@ CHECKS = {
     "own_data": "result.alarms and abs(model.b[0] / (1 - model.a[0]) + 25) < 2",
     "fleet": "[item.causes[0].cause[:4] for item in found.values()] == ['cool', 'heat', 'conc']",
 }
-"""What holds at the end of each: the numbers that its text states."""
+"""The end of each notebook: the numbers that its text states."""

@@ -130,7 +130,7 @@ class LiveRun:
         return _changes(item for item in recorded if isinstance(item, Alarm))
 
     def expected_alarms(self) -> list[Change]:
-        """What a monitor says that hears all of the plant, and nothing else, without a stop: not nothing.
+        """Publications of a monitor that hears all of the plant, and nothing else, without a stop.
 
         The plant is simulated once more, as a recorder, too, may miss samples.
         """

@@ -98,7 +98,7 @@ def test_bytes_that_are_no_message_are_passed_over() -> None:
 
 
 def test_an_alarm_of_a_priority_or_state_that_this_version_does_not_know_is_shown_by_its_number() -> None:
-    """Of a newer monitor: `status` and `alarm list` go on."""
+    """`status` and `alarm list` go on beside a newer monitor."""
     odd = Alarm(alarm="x/T", priority=99, state=AlarmState.ALARM_STATE_UNACKNOWLEDGED)  # type: ignore[arg-type]
     board = StatusBoard(START_NS)
     board.on_message(said("a/alarm/x/T", odd))

@@ -50,7 +50,7 @@ def stage_by_stage(config: MonitorConfig, plant: str = "x", *, points: bool = Fa
 
 
 def alone(plant: str, messages: Iterable[Encoded], config: MonitorConfig = QUICK) -> list[Publication]:
-    """What the plant's own monitor says, stage by stage."""
+    """Publications of the plant's own monitor, stage by stage."""
     monitor = stage_by_stage(config, plant)
     return [said for message in messages for said in monitor.on_message(message, 0)]
 

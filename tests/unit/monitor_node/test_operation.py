@@ -93,7 +93,7 @@ def test_a_move_in_steps_is_one_move_and_an_old_one_is_not_stated() -> None:
 
 @pytest.mark.parametrize("reference", ["arx", "equations"])
 def test_values_beyond_the_bounds_are_missing_to_the_models_and_raise_an_alarm(reference: str) -> None:
-    """Of inputs and outputs, in the training and after it, whichever model judges."""
+    """Values of inputs and outputs, in the training and after it, with any model."""
     signals = ("Q1", "Q2", "h1", "h2", "h3")
     generator = np.random.default_rng(3)
     values = np.array([21.37, 53.8, 41.0, 32.0, 36.6]) + generator.normal(size=(ROWS, 5)) * (0.2, 0.2, 0.1, 0.1, 0.1)

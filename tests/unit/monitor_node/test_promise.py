@@ -1,4 +1,4 @@
-"""What is promised of false alarms is what comes, with noise that has a memory; `make promise` has more runs."""
+"""False alarms are as many as promised, with noise that has a memory; `make promise` has more runs."""
 
 import pytest
 
