@@ -21,9 +21,10 @@ from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import encode
 from reactorwatch.identification.report_scheme import WIDTH, ReportChart, chart_output
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.library.cstr.operation import ONSET_MIN, OPERATION
+from reactorwatch.process.library.cstr.operation import NOISE_SD, ONSET_MIN, OPERATION
 from reactorwatch.process.operation import Preset
 from reactorwatch.records.record import Record, to_minutes
+from reactorwatch.spc.charts.shewhart import probability_out
 from recorder.tools.player import samples_of
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ _PLANT = "cstr"
 UNITS = cstr().units
 PRESET_OF = dict(zip(("17", "18", "19", "20"), OPERATION.presets, strict=True))
 _SEEDS = 5
-_EXPECTED = 0.27  # % of independent normal residuals are outside mean +- 3 sigma
+_EXPECTED = round(100 * probability_out(3.0), 2)  # % of independent normal residuals are outside mean +- 3 sigma
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,8 @@ def _draw(study: Study, drawing: Drawing, preset: Preset) -> Finding:
 def _sound_shares(study: Study) -> str:
     """Shares of the rows of sound records that are out by the report's scheme, with noise and without, as a table."""
     lines = []
-    for name, noise in (("noise of 0.002 mol/l and 0.3 K", None), ("no noise", {"C": 0.0, "T": 0.0})):
+    noisy = f"noise of {NOISE_SD['C']:g} mol/l and {NOISE_SD['T']:g} K"
+    for name, noise in ((noisy, None), ("no noise", {"C": 0.0, "T": 0.0})):
         for model in ("arx", "oe"):
             shares = []
             for seed in range(study.seed, study.seed + _SEEDS):

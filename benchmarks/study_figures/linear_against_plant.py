@@ -8,7 +8,9 @@ import numpy as np
 
 from benchmarks.study_figures.canvas import BLUE, ORANGE, label, legend_below, panels
 from benchmarks.study_figures.figure import Finding, Verdict, verdict
+from benchmarks.study_figures.steady_state_curve import REPORTED_T
 from benchmarks.study_figures.study import NAMES, Study
+from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW
 from reactorwatch.process.step_response import StepComparison, compare_step
 
 if TYPE_CHECKING:
@@ -88,15 +90,16 @@ def _unit_step(study: Study, drawing: Drawing, name: str) -> Finding:
     point = study.operating(FLOW)
     largest = 100 * np.abs(compared.linear - compared.plant)[:, index].max() / np.abs(compared.plant[:, index]).max()
     real, imaginary = point.eigenvalues[0].real, abs(point.eigenvalues[0].imag)
-    other = study.operating(103.41)
+    other = study.operating(OPERATING_COOLANT_FLOW)
     text = (
         f"From rest at {FLOW:g} l/min, where C = {point.outputs[0]:.4f} mol/l and T = {point.outputs[1]:.2f} K, a "
         f"step of {_UNIT:+g} l/min. The linear model has the poles {real:.3f} +- {imaginary:.3f}i 1/min. It is at most "
         f"{largest:.1f} % of the plant's largest deviation away from it, and {100 * compared.error[index]:.1f} % (root "
-        f"mean square) over {_SPAN_MIN:g} min.\n\nThe report's operating point, {FLOW:g} l/min with 438.54 K, is no "
+        f"mean square) over {_SPAN_MIN:g} min.\n\nThe report's operating point, {FLOW:g} l/min with {REPORTED_T:g} K, "
+        "is no "
         f"steady state of its equations: at {FLOW:g} l/min the reactor rests "
         f"{point.outputs[1] - other.outputs[1]:.2f} K "
-        "higher, and 438.54 K belongs to 103.41 l/min (figure 4)."
+        f"higher, and {REPORTED_T:g} K belongs to {OPERATING_COOLANT_FLOW:g} l/min (figure 4)."
     )
     return Finding(text, verdict(bool(largest < _ACCURATE)))
 

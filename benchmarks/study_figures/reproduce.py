@@ -7,6 +7,7 @@ from pathlib import Path
 from benchmarks.study_figures.canvas import paper, require_matplotlib
 from benchmarks.study_figures.catalogue import FIGURES
 from benchmarks.study_figures.figure import Figure, Finding
+from benchmarks.study_figures.measured_records import measured_figure
 from benchmarks.study_figures.page import FOLDER, page
 from benchmarks.study_figures.study import Study
 from reactorwatch.cli.batch import run_in_order
@@ -30,12 +31,14 @@ class Job:
         picture: file of the picture.
         seed: seed of every simulated record.
         measured: a record that models are identified from, or None.
+        data: folder of records of others, or None.
     """
 
     key: str
     picture: Path
     seed: int
     measured: Record | None
+    data: Path | None = None
 
 
 def reproduce(
@@ -44,6 +47,7 @@ def reproduce(
     only: str | None = None,
     measured: Record | None = None,
     *,
+    data: Path | None = None,
     processes: int | None = 1,
     scheduler: str | None = None,
 ) -> str:
@@ -54,6 +58,7 @@ def reproduce(
         seed: seed of every simulated record.
         only: keys of figures, such as `7,12`; all, if not given.
         measured: a record that figures 5, 6 and 11 to 16 identify their models from.
+        data: folder of records of others, for the entry of measured records; None: the page has no such entry.
         processes: number of processes; None: one a core.
         scheduler: address of a cluster that draws them, or None.
 
@@ -65,13 +70,13 @@ def reproduce(
             matplotlib is not installed.
         RuntimeError: a figure could not be drawn.
     """
-    figures = _select_figures(only)
+    figures = _select_figures(only, data)
     require_matplotlib()
     check_output_folder(check_output_folder(out) / FOLDER)
     found: list[tuple[Figure, Finding]] = []
     with fill_folder(out, "--out") as folder:
         pictures = make_folder(folder / FOLDER).absolute()
-        jobs = [Job(figure.key, pictures / figure.file_name, seed, measured) for figure in figures]
+        jobs = [Job(figure.key, pictures / figure.file_name, seed, measured, data) for figure in figures]
         for figure, finding in zip(figures, run_in_order(draw, jobs, "reproducing", processes, scheduler), strict=True):
             if isinstance(finding, Failed):
                 raise (RuntimeError if finding.is_internal else InputError)(f"{figure.heading}: {finding.reason}")
@@ -82,32 +87,38 @@ def reproduce(
     return _report(out, found)
 
 
-def check_out(out: Path, only: str | None, sources: Iterable[Path | None], *, force: bool) -> None:
+def check_out(
+    out: Path, only: str | None, sources: Iterable[Path | None], *, data: Path | None = None, force: bool
+) -> None:
     """Check that the page and its pictures may be written; arguments as for `reproduce` and `check_output_file`.
 
     Raises:
         InputError: as `check_output_folder`, or figures that there are not.
     """
-    pictures = [f"{FOLDER}/{figure.file_name}" for figure in _select_figures(only)]
+    pictures = [f"{FOLDER}/{figure.file_name}" for figure in _select_figures(only, data)]
     check_output_folder(out, (PAGE, *pictures), sources, force=force)
 
 
 def draw(job: Job) -> Finding:
     """Draw a figure."""
-    (figure,) = (item for item in FIGURES if item.key == job.key)
+    (figure,) = (item for item in _entries(job.data) if item.key == job.key)
     with paper(job.picture, figure.height_px) as drawing:
         return figure.draw(Study(job.seed, job.measured), drawing)
 
 
-def _select_figures(only: str | None) -> Sequence[Figure]:
+def _entries(data: Path | None) -> Sequence[Figure]:
+    return FIGURES if data is None else (*FIGURES, measured_figure(data))
+
+
+def _select_figures(only: str | None, data: Path | None = None) -> Sequence[Figure]:
     if only is None:
-        return FIGURES
-    keys = {figure.key: figure for figure in FIGURES}
+        return _entries(data)
+    keys = {figure.key: figure for figure in _entries(data)}
     wanted = [part.strip() for part in only.split(",")]
     for part in wanted:
         if part not in keys:
             raise InputError(f"--only: {describe_unknown('figure', part, keys)}")
-    return [figure for figure in FIGURES if figure.key in wanted]
+    return [keys[key] for key in keys if key in wanted]
 
 
 def _report(out: Path, found: Sequence[tuple[Figure, Finding]]) -> str:

@@ -132,6 +132,10 @@ def reproduce(
         Path | None,
         typer.Option("--record", help="A record that figures 5, 6, 11 to 16 learn from.", show_default=False),
     ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="A folder of records of others, for an entry on measured records.", show_default=False),
+    ] = None,
     plant: Plant = None,
     column: Columns = None,
     jobs: Processes = None,
@@ -152,8 +156,10 @@ def reproduce(
             "run `make setup` in a clone of the project and use its .venv/bin/reactorwatch"
         ) from error
 
-    check_out(out, only, (file,), force=force)
+    if data is not None and not data.is_dir():
+        raise InputError(f"--data {data}: must be a folder of records, and there is none of that name")
+    check_out(out, only, (file, data), data=data, force=force)
     measured = record(check_recording(file), plant, parse_columns(column)) if file else None
     if measured is not None and measured.runs is not None:
         raise InputError(f"--record {file}: must be one run, {measured.describe_runs()}; cut one run out of it")
-    print_text(reproduce_figures(out, seed, only, measured, processes=jobs, scheduler=scheduler))
+    print_text(reproduce_figures(out, seed, only, measured, data=data, processes=jobs, scheduler=scheduler))

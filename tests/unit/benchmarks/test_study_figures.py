@@ -15,6 +15,7 @@ from benchmarks.study_figures import canvas
 from benchmarks.study_figures.best_model import ThirdOrder
 from benchmarks.study_figures.catalogue import FIGURES
 from benchmarks.study_figures.figure import Figure, Finding, Verdict
+from benchmarks.study_figures.measured_records import TITLE, measured_figure
 from benchmarks.study_figures.reproduce import reproduce
 from benchmarks.study_figures.sampling_rate import report_choice
 from benchmarks.study_figures.study import Study, row_times
@@ -64,8 +65,25 @@ def test_each_figure_of_the_report_is_in_the_catalogue_once() -> None:
 def test_the_page_in_the_docs_has_every_entry_once_and_no_other() -> None:
     kept = (DOCS / "study.md").read_text(encoding="utf-8")
     headings = re.findall(r"^## (.*)$", kept, re.MULTILINE)
-    assert headings == [*(figure.heading for figure in FIGURES), "Methods of the literature review"]
-    assert {path.name for path in (DOCS / "study").iterdir()} == {figure.file_name for figure in FIGURES}
+    entries = [*FIGURES, *([measured_figure(DOCS)] if TITLE in headings else [])]  # it needs records of others
+    assert headings == [*(figure.heading for figure in entries), "Methods of the literature review"]
+    assert {path.name for path in (DOCS / "study").iterdir()} == {figure.file_name for figure in entries}
+
+
+def test_a_fault_is_added_to_a_measured_record_and_both_watch_it(tmp_path: Path, daisy_csv: Path) -> None:
+    """The reactor's record alone; the entry says which records are not in the folder by leaving them out."""
+    (tmp_path / "daisy_cstr.csv").symlink_to(daisy_csv)
+    with canvas.paper(tmp_path / "measured.png", 400) as drawing:
+        finding = measured_figure(tmp_path).draw(Study(1), drawing)
+    rows = re.findall(r"^\| (.*?) \| (none|step|drift) \|", finding.text, re.MULTILINE)
+    assert rows == [("DaISy reactor", fault) for fault in ("none", "step", "drift")]
+    assert "concentration_bias" in finding.text
+
+
+def test_a_folder_without_the_records_names_them(tmp_path: Path) -> None:
+    with canvas.paper(tmp_path / "measured.png", 400) as drawing:
+        finding = measured_figure(tmp_path).draw(Study(1), drawing)
+    assert finding.text.startswith("None of the records is in the folder: daisy_cstr.csv")
 
 
 def test_a_run_writes_a_page_and_pictures_that_hold_what_is_plotted(tmp_path: Path) -> None:

@@ -97,7 +97,12 @@ CASES = {
         ),
     ],
     "reproduce": [
-        Case("reproduce --only 7 --record run.csv", {"file": "run.csv"}, "folder", (PAGE, f"{FOLDER}/figure-07.png"))
+        Case(
+            "reproduce --only 7 --record run.csv",
+            {"file": "run.csv", "data": ""},
+            "folder",
+            (PAGE, f"{FOLDER}/figure-07.png"),
+        )
     ],
     "record": [
         Case(f"record {NO_ROUTER} --config settings.toml", {"config": ""}, "new.mcap", never_overwrites=True),
