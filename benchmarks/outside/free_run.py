@@ -70,7 +70,7 @@ def _equations(first: Path, second: Path, folder: Path) -> Row:
     said = json.loads(
         run("simulate", str(second), "--process", str(process), "--settle", str(SETTLE), "-o", str(out), "--json")
     )
-    error = said["outputs"]["x2"]["rmse"] if "outputs" in said else said["rmse"]["x2"]
+    error = said["rmse"]["x2"]["value"]
     return Row("reactorwatch diagnose, equations", f"{found['verdict']}: {named}", {"simulation, V": f"{error:.3f}"})
 
 

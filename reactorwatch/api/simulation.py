@@ -11,6 +11,7 @@ import numpy as np
 from plant_node.initial_state import complete_state
 from reactorwatch.api.records import ProcessLike, Record, measured_fields, model_of, process_of
 from reactorwatch.api.views.record import plot_record, record_html
+from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.impossible_values import check_values
 from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
@@ -70,13 +71,17 @@ class Simulation(Record):
         return plot_record(self.measured, self.inputs, self)
 
 
-def simulate(record: MeasuredRecord, process: ProcessLike | None = None, faults: Sequence[str] = ()) -> Simulation:
+def simulate(
+    record: MeasuredRecord, process: ProcessLike | None = None, faults: Sequence[str] = (), settle: int = 0
+) -> Simulation:
     """Simulate a process from the first row of a record (of each run), driven by the record's inputs.
 
     Args:
         record: with the inputs and outputs of the process.
         process: name, path of a file that describes it, description or model; None: the process of the record.
         faults: specifications such as `coolant_flow:step:-0.05@30min`, in the record's time.
+        settle: number of first rows of each run that set the state it starts from, and are left out of the differences;
+            0: the first row sets it.
 
     Returns:
         The inputs and the simulated outputs in the rows of the record.
@@ -85,38 +90,51 @@ def simulate(record: MeasuredRecord, process: ProcessLike | None = None, faults:
         InputError: the record cannot drive the model, or a specification is malformed.
     """
     model = model_of(record, process)
-    simulated = simulate_along(record, model, list(faults))
-    rmse = root_mean_squares(record, simulated, model)
+    simulated = simulate_along(record, model, list(faults), settle)
+    rmse = root_mean_squares(record, simulated, model, settle)
     return Simulation(rmse, record, **measured_fields(simulated), process=process_of(record, process))
 
 
-def root_mean_squares(measured: MeasuredRecord, simulated: MeasuredRecord, model: ProcessModel) -> dict[str, Rmse]:
-    """Root mean square difference between simulation and record, by output."""
+def root_mean_squares(
+    measured: MeasuredRecord, simulated: MeasuredRecord, model: ProcessModel, settle: int = 0
+) -> dict[str, Rmse]:
+    """Root mean square difference between simulation and record, by output; `settle` rows of each run are left out."""
+    kept = np.ones(measured.rows, dtype=bool)
+    for start in measured.run_starts:
+        kept[start : start + settle] = False
     return {
         name: Rmse(
-            float(np.sqrt(np.nanmean((simulated.columns[name] - measured.columns[name]) ** 2))), model.units[name]
+            float(np.sqrt(np.nanmean((simulated.columns[name] - measured.columns[name])[kept] ** 2))), model.units[name]
         )
         for name in model.output_names
     }
 
 
-def simulate_along(measured: MeasuredRecord, model: ProcessModel, faults: list[str]) -> MeasuredRecord:
+def simulate_along(measured: MeasuredRecord, model: ProcessModel, faults: list[str], settle: int = 0) -> MeasuredRecord:
     """Run the equations from the first row of each run of the record, driven by its input.
 
     Args:
         measured: record with the model's inputs and outputs as columns.
         model: the process; states without a column start at rest.
         faults: specifications of faults, with onsets in the record's time.
+        settle: number of first rows of each run that set the state it starts from; 0: the first row sets it.
 
     Raises:
-        InputError: the record cannot drive the model.
+        InputError: the record cannot drive the model, or a run has no more rows than those.
     """
     runs = measured.split_runs()
-    simulated = join_runs([_simulate_run(run, model, faults, alone=len(runs) == 1) for run in runs])
+    shortest = min(run.rows for run in runs)
+    if not 0 <= settle < shortest:
+        raise InputError(
+            f"{measured.name}: settle must be at least 0 rows and less than those of a run, {shortest}, got {settle}"
+        )
+    simulated = join_runs([_simulate_run(run, model, faults, settle, alone=len(runs) == 1) for run in runs])
     return replace(simulated, name=f"simulation of {measured.name}")
 
 
-def _simulate_run(measured: MeasuredRecord, model: ProcessModel, faults: list[str], *, alone: bool) -> MeasuredRecord:
+def _simulate_run(
+    measured: MeasuredRecord, model: ProcessModel, faults: list[str], settle: int, *, alone: bool
+) -> MeasuredRecord:
     """Simulate along one run of a record; a single row among other runs is returned unchanged."""
     for text in faults:
         model = parse_fault(text, named_effects(model)).extend(model, end_min=float(measured.time_min[-1]))
@@ -140,9 +158,11 @@ def _simulate_run(measured: MeasuredRecord, model: ProcessModel, faults: list[st
         )
     if measured.rows == 1 and not alone:
         return replace(measured, columns={name: measured.columns[name] for name in (*model.input_names, *first)})
-    start = complete_state(model, first, inputs[0], float(measured.time_min[0]))
+    start, simulator = complete_state(model, first, inputs[0], float(measured.time_min[0])), Simulator(model)
     try:
-        trajectory = Simulator(model).run(measured.time_min, inputs, start)
+        if settle:
+            start = _fit_start(simulator, measured, inputs, start, settle)
+        trajectory = simulator.run(measured.time_min, inputs, start)
     except ValueError as error:
         raise InputError(f"{measured.name}: {error}") from error
     columns = {name: inputs[:, index] for index, name in enumerate(model.input_names)}
@@ -150,8 +170,31 @@ def _simulate_run(measured: MeasuredRecord, model: ProcessModel, faults: list[st
     return replace(measured, columns=columns)
 
 
+def _fit_start(simulator: Simulator, measured: MeasuredRecord, inputs: Array, start: Array, rows: int) -> Array:
+    """Start state that fits the outputs of the first rows best, from a first guess."""
+    from scipy.optimize import least_squares  # only here: to import it is a tenth of a start
+
+    model = simulator.model
+    outputs = np.column_stack([measured.columns[name][:rows] for name in model.output_names])
+    spreads = np.array([np.nanstd(measured.columns[name]) or 1.0 for name in model.output_names])
+    scales = np.array([item.scale for item in model.states])
+    low, high = (np.array([getattr(item, side) for item in model.states]) for side in ("lower", "upper"))
+
+    def differences(state: Array) -> Array:
+        run = simulator.run(measured.time_min[:rows], inputs[:rows], state)
+        return np.asarray(np.nan_to_num((run.outputs - outputs) / spreads).ravel())
+
+    return np.asarray(least_squares(differences, np.clip(start, low, high), x_scale=scales, bounds=(low, high)).x)
+
+
 def report(
-    measured: MeasuredRecord, simulated: MeasuredRecord, model: ProcessModel, out: Path | None, *, as_json: bool
+    measured: MeasuredRecord,
+    simulated: MeasuredRecord,
+    model: ProcessModel,
+    out: Path | None,
+    *,
+    settle: int = 0,
+    as_json: bool,
 ) -> str:
     """Format the root mean square difference between simulation and record, by signal.
 
@@ -160,9 +203,10 @@ def report(
         simulated: the simulation, in the rows of the record.
         model: the process.
         out: file of the simulation; None: it could not be written.
+        settle: first rows of each run that are left out.
         as_json: format as a JSON object.
     """
-    rmse = root_mean_squares(measured, simulated, model)
+    rmse = root_mean_squares(measured, simulated, model, settle)
     remarks = [sentence for law in model.laws for sentence in law.outside(simulated.columns)]
     if as_json:
         result = {

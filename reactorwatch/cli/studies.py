@@ -53,6 +53,9 @@ def simulate(
         list[str] | None, typer.Option(help="A fault, as cause:profile:size@onset, onset in the file's time.")
     ] = None,
     process: Process = None,
+    settle: Annotated[
+        int, typer.Option(help="First rows that set the state it starts from, and are left out of errors.")
+    ] = 0,
     column: Columns = None,
     force: Force = False,
     as_json: Json = False,
@@ -74,13 +77,13 @@ def simulate(
     measured = record(file, plant, parse_columns(column), described, stated=stated)
     model = process_on_clock(choice, described, measured.zero_ns).require_model()
     with task(f"simulating {file.name}"):
-        simulated = simulate_along(measured, model, fault or [])
+        simulated = simulate_along(measured, model, fault or [], settle)
         try:
             write_table(out, simulated)
         except InputError:
-            print_report(report(measured, simulated, model, None, as_json=as_json), as_json=as_json)
+            print_report(report(measured, simulated, model, None, settle=settle, as_json=as_json), as_json=as_json)
             raise
-    print_report(report(measured, simulated, model, out, as_json=as_json), as_json=as_json)
+    print_report(report(measured, simulated, model, out, settle=settle, as_json=as_json), as_json=as_json)
 
 
 def backtest(
