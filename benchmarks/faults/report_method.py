@@ -24,11 +24,10 @@ from reactorwatch.arrays import Array
 from reactorwatch.identification.batch import fit_arx
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.output_error import fit_oe
+from reactorwatch.identification.report_scheme import ORDER
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record
 
-ORDER = 3
-WIDTH = 3.0
 TRAINING_ROWS = round(TRAINING_MIN / PERIOD_MIN)
 
 

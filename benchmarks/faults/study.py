@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from benchmarks.faults.bank import AFTER_MIN, PERIOD_MIN, Case
 from benchmarks.faults.oracle import log_likelihood_ratio, oracle_delay_min
 from benchmarks.faults.oracle_suspect import oracle_suspect
-from benchmarks.faults.report_method import METHODS, TRAINING_ROWS, WIDTH, alarms_of, count_alarms
+from benchmarks.faults.report_method import METHODS, TRAINING_ROWS, alarms_of, count_alarms
 from benchmarks.faults.runs import NOISE_SD, fault_free, measurements_of, record_of, truth_of
 from benchmarks.faults.score import Outcome, Rate, outcome_of, rows_to_false_alarm
 from benchmarks.faults.watch import Suspicion, incidents_of, intervals_of, suspicion, watch
+from reactorwatch.identification.report_scheme import WIDTH
 
 SOON_MIN = 10.0
 """Minutes from the first alarm to the first evaluation of the suspects."""

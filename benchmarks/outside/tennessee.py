@@ -8,7 +8,6 @@ Data: camaramm/tennessee-eastman-profBraatz; Russell, Chiang and Braatz (2000).
 
 import re
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -98,13 +97,8 @@ def _score(method: str, limits: str, names: list[str], out: list[Flags], seed: i
     )
     cells = {
         "mean detection": f"{np.mean([shares[name] for name in seen]):.3f}",
-        "95 % interval": _interval(blocks, rng, lambda value: f"{value:.3f}"),
+        "95 % interval": "{:.3f} to {:.3f}".format(*bootstrap_interval(blocks, rng)),
         "rows in alarm while sound": f"{100 * before.mean():.2f} %",
         **{f"fault {int(name)}": f"{share:.2f}" for name, share in shares.items()},
     }
     return Row(method, limits, cells)
-
-
-def _interval(values: Array, rng: np.random.Generator, show: Callable[[float], str]) -> str:
-    low, high = bootstrap_interval(values, rng)
-    return f"{show(low)} to {show(high)}"

@@ -35,7 +35,7 @@ _PLANT = "cstr"
 UNITS = cstr().units
 PRESET_OF = dict(zip(("17", "18", "19", "20"), OPERATION.presets, strict=True))
 _SEEDS = 5
-_EXPECTED = round(100 * probability_out(3.0), 2)  # % of independent normal residuals are outside mean +- 3 sigma
+_EXPECTED = round(100 * probability_out(WIDTH), 2)  # % of independent normal residuals are outside mean +- 3 sigma
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,11 @@ from monitor_node.replay.row_log import LoggedRow, RowLog
 from reactorwatch.contract.messages_pb2 import PRIORITY_HIGH, Alarm, Contribution
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import SINGULAR_CONDITION
-from reactorwatch.identification.report_scheme import ReportChart, chart_output
+from reactorwatch.identification.report_scheme import WIDTH, ReportChart, chart_output
 from reactorwatch.records.record import Record, to_time_ns
+from reactorwatch.spc.charts.shewhart import probability_out
 
-OUTSIDE = 0.0027
+OUTSIDE = probability_out(WIDTH)
 """Share of independent normal residuals that are outside mean +- 3 sigma."""
 
 

@@ -137,8 +137,7 @@ def diagnose(
                 "the residual is small, but not white: the course in time may be rougher than the fitted profile"
             )
     best.hypothesis.filter.noise, result.nominal.hypothesis.filter.noise = result.noise, result.nominal_noise
-    is_located = unknown is not None and verdict == UNKNOWN and unknown.location == location
-    law = unknown.law if unknown is not None and is_located else None
+    law = unknown.law if unknown is not None and verdict == UNKNOWN and unknown.location == location else None
     if law is None:
         best, covariances = refine_parameters(search, best)
     else:

@@ -23,7 +23,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import check_not_constant, check_row_count, least_squares
 from reactorwatch.identification.linear_model import plan_run, standard_deviations
 from reactorwatch.identification.regressor import rows_of
-from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
+from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 Array = NDArray[np.float64]
 
@@ -129,7 +129,6 @@ def fit_narx(
     inputs: ArrayLike,
     outputs: ArrayLike,
     time: ArrayLike | None = None,
-    choice: RowChoice = ALL_ROWS,
 ) -> PolynomialModel:
     """Fit a polynomial NARX model of one output.
 
@@ -138,7 +137,6 @@ def fit_narx(
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.
-        choice: rows that are fitted.
 
     Raises:
         InputError: an output that is constant, or fewer rows than candidates.
@@ -146,7 +144,7 @@ def fit_narx(
     u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
     check_not_constant(y)
     scaling = Scaling.of(u, y)
-    rows = rows_of(_lags(structure), scaling.inputs(u), scaling.outputs(y), time, choice)
+    rows = rows_of(_lags(structure), scaling.inputs(u), scaling.outputs(y), time)
     check_row_count(rows, len(y))
     candidates = candidate_products(structure)
     if rows.position.size < len(candidates):

@@ -40,7 +40,7 @@ from reactorwatch.identification.output_error import (
     pad_order,
 )
 from reactorwatch.identification.regressor import rows_of
-from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
+from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 Array = NDArray[np.float64]
 
@@ -114,7 +114,6 @@ class _Objective:
         inputs: shape (rows, inputs).
         outputs: shape (rows, 1).
         plan: rows that the prediction covers.
-        choice: rows of which the errors count.
     """
 
     def __init__(
@@ -124,15 +123,12 @@ class _Objective:
         inputs: Array,
         outputs: Array,
         plan: RunPlan,
-        choice: RowChoice = ALL_ROWS,
     ) -> None:
         self.structure = structure
         self._inputs = np.ascontiguousarray(inputs)
         self._outputs = np.ascontiguousarray(outputs[:, 0])
         self._plan = plan
-        row = np.arange(self._outputs.size)
-        chosen = (row >= choice.skip) & ((row - choice.skip) % choice.every == 0)
-        self.compared = plan.running & np.isfinite(self._outputs) & chosen
+        self.compared = plan.running & np.isfinite(self._outputs)
         lags = structure.output_lags
         order = np.arange(structure.parameters + lags)
         # Indices of f, b, offset, d and c among the parameters: an ARMAX model uses `a` for both f and d.
@@ -178,7 +174,6 @@ def fit_armax(
     inputs: ArrayLike,
     outputs: ArrayLike,
     time: ArrayLike | None = None,
-    choice: RowChoice = ALL_ROWS,
 ) -> PredictionErrorModel:
     """Fit an ARMAX model of one output; without inputs it is an ARMA model.
 
@@ -188,12 +183,11 @@ def fit_armax(
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.
-        choice: rows whose prediction errors count.
 
     Raises:
         InputError: too few rows, an output that is constant, or rows that don't determine the parameters.
     """
-    return _fit("armax", structure, inputs, outputs, time, choice)
+    return _fit("armax", structure, inputs, outputs, time)
 
 
 def fit_box_jenkins(
@@ -201,12 +195,11 @@ def fit_box_jenkins(
     inputs: ArrayLike,
     outputs: ArrayLike,
     time: ArrayLike | None = None,
-    choice: RowChoice = ALL_ROWS,
 ) -> PredictionErrorModel:
     """Fit a Box-Jenkins model of one output; arguments and errors as for `fit_armax`, and at least one input."""
     if structure.inputs == 0:
         raise InputError("a Box-Jenkins model needs an input, got none; without inputs it is an ARMAX model: use armax")
-    return _fit("bj", structure, inputs, outputs, time, choice)
+    return _fit("bj", structure, inputs, outputs, time)
 
 
 def _fit(
@@ -215,14 +208,13 @@ def _fit(
     inputs: ArrayLike,
     outputs: ArrayLike,
     time: ArrayLike | None,
-    choice: RowChoice,
 ) -> PredictionErrorModel:
     u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
     check_not_constant(y)
     scaling = Scaling.of(u, y)
     scaled_u, scaled_y = scaling.inputs(u), scaling.outputs(y)
-    check_row_count(rows_of(structure, scaled_u, scaled_y, time, choice), len(y))
-    theta, objective = _minimise(kind, structure, scaled_u, scaled_y, time, choice)
+    check_row_count(rows_of(structure, scaled_u, scaled_y, time), len(y))
+    theta, objective = _minimise(kind, structure, scaled_u, scaled_y, time)
     errors, gradient = objective(theta)
     # As for least squares: at the minimum the gradient takes the place of the regressors.
     inverse, variance = least_squares(gradient, errors).inverse, error_variance(errors, theta.size)[0]
@@ -239,11 +231,9 @@ def _fit(
     )
 
 
-def _minimise(
-    kind: Kind, structure: Structure, u: Array, y: Array, time: ArrayLike | None, choice: RowChoice
-) -> tuple[Array, _Objective]:
+def _minimise(kind: Kind, structure: Structure, u: Array, y: Array, time: ArrayLike | None) -> tuple[Array, _Objective]:
     """Best parameters for scaled signals, shape (parameters,), and the errors as a function of them."""
-    objective = _Objective(kind, structure, u, y, plan_run(structure, u, y, time), choice)
+    objective = _Objective(kind, structure, u, y, plan_run(structure, u, y, time))
     needed, usable = objective.size, int(objective.compared.sum())
     if usable < needed:
         raise InputError(f"{needed} parameters need at least {needed} rows of a prediction, got {usable} of {len(y)}")
@@ -257,7 +247,7 @@ def _minimise(
         best, _ = _best(armax, starts, ROUGH_ITERATIONS)
         v = np.full(y.shape, np.nan)
         v[simulation.compared, 0] = simulation(plant)[0]
-        noise, _ = _minimise("armax", Structure(lags, lags, inputs=0), np.empty((len(v), 0)), v, time, ALL_ROWS)
+        noise, _ = _minimise("armax", Structure(lags, lags, inputs=0), np.empty((len(v), 0)), v, time)
         starts = [
             np.concatenate([plant, np.zeros(2 * lags)]),
             np.concatenate([plant, noise[:lags], noise[-lags:]]),

@@ -196,7 +196,7 @@ def test_a_disturbance_of_the_training_changes_no_model_and_a_lasting_deviation_
 
 
 def recording(warm: Run, *, killed: bool = False) -> list[Encoded]:
-    """What a recorder gets of the run; killed: the monitor is killed before the finding, and resumes from its state."""
+    """Messages of the run; killed: the monitor is killed before the finding, and resumes from its state."""
     monitor, log = Monitor(CONFIG, START_NS), list[Encoded]()
 
     def publish_all(publications: list[Publication]) -> None:

@@ -353,7 +353,7 @@ def test_a_signal_has_the_role_and_meaning_that_its_process_gives_it_and_not_tho
 
 
 def test_the_phase_plane_is_that_of_the_equations_that_the_process_has(run: RunColumns) -> None:
-    """Of a process of the same signals without equations, and with equations of other constants."""
+    """A process of the same signals without equations, and one with equations of other constants."""
     reactor = find_process("cstr")
     hotter = Process("rig", reactor.signals, reactor.equations, parameters={"Tf": (360.0, 0.0, "K")})
     (nominal, _), (own, _) = phase_plane.draw(run), phase_plane.draw(replace(run, process=reactor.without_equations()))

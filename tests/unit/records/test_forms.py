@@ -40,7 +40,7 @@ UNITS = ("bar", "l/min", "K", "%", "", "degC")
 
 @dataclass(frozen=True)
 class Form:
-    """How a table is written; the time is the column number `position`, from 0."""
+    """Form of a written table; the time is the column number `position`, from 0."""
 
     separator: str
     decimal: str
