@@ -26,7 +26,7 @@ from monitor_node.baseline.references import (
 from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
-from monitor_node.chart_stage import ChartWatch, alarm_names
+from monitor_node.chart_stage import ChartWatch, count_chance_alarms
 from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
@@ -63,7 +63,7 @@ def check_promise(config: MonitorConfig, period_min: float) -> None:
     """
     outputs = len(config.outputs)
     of_drift = outputs if ParameterT2.name in config.charts else 0
-    alarms = len(alarm_names(config)) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
+    alarms = count_chance_alarms(config) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
     false_alarm_budget.promise_per_30_days(config.false_alarms_per_30_days, alarms, period_min)
 
 
@@ -504,7 +504,7 @@ class PlantPipeline:
             again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
         """
         self._leave_out(trained.left_out)
-        unmade = self._charts.choose(self._evaluated, trained.e)
+        unmade = self._charts.choose(self._evaluated, trained.e, trained.values)
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
         )
@@ -523,7 +523,7 @@ class PlantPipeline:
         self._whiteners = [
             Prewhitener(item, self._numbers["whiteners"][0, i : i + 1]) for i, item in enumerate(trained.learned)
         ]
-        self._charts.start(trained.learned, trained.e, self._arl0)
+        self._charts.start(trained.learned, trained.e, trained.values, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         if not again:
             self.operation.end_training()

@@ -77,6 +77,8 @@ class TrainingResult(NamedTuple):
         learned: prewhitening of its residuals, one an output.
         e: prewhitened residuals, shape (n, outputs); NaN if missing.
         measured: outputs in undisturbed rows, shape (n, outputs); NaN elsewhere.
+        values: all signals, the inputs first, shape (n, inputs + outputs); NaN where disturbed or left out. Unlike
+            `measured` it has rows that could not be predicted.
         checks: checks of the training.
         refused: reason to start again; empty if the training is usable.
         left_out: signals that cannot be monitored, with the reason.
@@ -86,6 +88,7 @@ class TrainingResult(NamedTuple):
     learned: list[Prewhitening]
     e: Array
     measured: Array
+    values: Array
     checks: list[Check]
     refused: str
     left_out: dict[str, str]
@@ -216,8 +219,9 @@ class Training:
             _refusal(outputs, screenings, evaluated) if any(evaluated) else "; ".join(dict.fromkeys(left_out.values()))
         )
         if refused and last_chance and any(evaluated):
-            refused, screenings = "", [Screening(np.isfinite(column), [], [], 0) for column in z.T]
+            refused, screenings = "", [Screening(known, [], [], 0, np.zeros_like(known)) for known in np.isfinite(z).T]
         usable = np.column_stack([item.usable for item in screenings]) & np.array(evaluated)
+        disturbed = np.column_stack([item.left_out for item in screenings]) | ~np.array(evaluated)
         z = np.where(usable, z, np.nan)
         if isinstance(reference, ProcessReference | BlackBoxReference):
             smallest = [sd / typical for sd, typical in zip(smallest, reference.typical_sd, strict=True)]
@@ -238,7 +242,10 @@ class Training:
         if isinstance(reference, ArxReference):
             checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
-        return TrainingResult(reference, learned, e, np.where(usable, measured, np.nan), checks, refused, left_out)
+        inputs = np.where([name not in left_out for name in self._config.inputs], inputs, np.nan)
+        values = np.hstack([inputs, np.where(disturbed, np.nan, measured)])
+        measured = np.where(usable, measured, np.nan)
+        return TrainingResult(reference, learned, e, measured, values, checks, refused, left_out)
 
     def _simplifications(self, evaluated: list[bool]) -> list[str]:
         """Terms that the identified models lack, each with the outputs."""
