@@ -10,13 +10,14 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("reactorwatch", "plant_node", "monitor_node", "recorder", "diagnosis_node", "benchmarks", "tests")
-FOLDERS = (*PACKAGES, "docs", "deploy")
+FOLDERS = (".github", *PACKAGES, "docs", "deploy")
 DOCUMENTS = sorted(
     [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "tests" / "README.md", *(ROOT / "docs").rglob("*.md")]
 )
 
 FILE = re.compile(r"(?<![\w./-])[\w./-]*\w\.(?:py|md|proto|service|yml)\b(?!\.)")
 """Endings of files of this repository; settings and recordings are the users'."""
+LEADING = re.compile(r"^(?:\.{0,2}/)+")
 QUOTED = re.compile(r"(?<!`)`([a-z_][a-z0-9_]*(?:\.[a-z_][a-z0-9_]*)*)`(?!`)")
 COMMENT = re.compile(r"(?:^|\s)#\s(.*)$", re.MULTILINE)
 WORD = re.compile(r"\w+")
@@ -73,7 +74,7 @@ def texts() -> Iterator[tuple[Path, str]]:
 
 def missing_files(text: str) -> list[str]:
     """Files that a text names and that do not exist."""
-    named = (name.lstrip("./") for name in FILE.findall(text) if "://" not in name)
+    named = (LEADING.sub("", name) for name in FILE.findall(text) if "://" not in name)
     return [name for name in named if name not in MADE and name not in files()]
 
 
