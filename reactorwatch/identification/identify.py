@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification import report_scheme
+from reactorwatch.identification.adaptation import GAINS, AdaptiveRegression
 from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, model_of
 from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.excitation import check_record
@@ -19,8 +20,8 @@ from reactorwatch.identification.free_run import free_run
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.output_error import fit_oe
 from reactorwatch.identification.polynomial_narx import PolynomialModel, fit_narx, name_product
-from reactorwatch.identification.prediction_error import PredictionErrorModel, fit_armax, fit_box_jenkins
-from reactorwatch.identification.recursive_output_error import RecursiveOutputError
+from reactorwatch.identification.prediction_error import Kind, PredictionErrorModel, fit_armax, fit_box_jenkins
+from reactorwatch.identification.recursive_prediction_error import RecursivePredictionError
 from reactorwatch.identification.regressor import consecutive_rows, rows_of
 from reactorwatch.identification.residual_tests import DEFAULT_LAGS, independence, whiteness
 from reactorwatch.identification.rls import RecursiveLeastSquares
@@ -45,7 +46,11 @@ SCHEMES: Mapping[str, Mapping[str, Callable[..., FittedModel]]] = {
 }
 """Fits by scheme and kind of model."""
 
-RECURSIVE_MODELS = ("arx", "oe")
+FORGETTING = "forgetting"
+
+RECURSIVE_MODELS: Mapping[str, Kind | None] = {"arx": None, "oe": None, "armax": "armax", "bj": "bj"}
+"""Models that can be learned row by row, with their model of the disturbance."""
+
 WORST_MINUS_LOG10_P = 6.0
 
 Coefficients = tuple[float, ...]
@@ -62,6 +67,8 @@ class ModelForm:
         delay: samples from a move of an input to its first effect, at least 1.
         recursive: whether it is learned row by row instead of from all rows at once.
         forgetting: forgetting factor of the recursive methods, in (0, 1].
+        adaptation: gain of a recursive ARX model: `forgetting` (least squares), or one of `adaptation.GAINS`.
+        gain: gain of an adaptation other than `forgetting`; None: its default.
         scheme: `least-squares`, or `report` for the scheme of the original report (see `report_scheme`).
 
     Raises:
@@ -73,13 +80,23 @@ class ModelForm:
     delay: int = 1
     recursive: bool = False
     forgetting: float = 1.0
+    adaptation: str = FORGETTING
+    gain: float | None = None
     scheme: str = "least-squares"
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise InputError(describe_unknown("model", self.model, MODELS))
         if self.recursive and self.model not in RECURSIVE_MODELS:
-            raise InputError(f"only {' and '.join(RECURSIVE_MODELS)} can be recursive, got {self.model}")
+            raise InputError(f"only {', '.join(RECURSIVE_MODELS)} can be recursive, got {self.model}")
+        if self.adaptation not in (FORGETTING, *GAINS):
+            raise InputError(describe_unknown("adaptation", self.adaptation, (FORGETTING, *GAINS)))
+        if not self.recursive and (self.adaptation, self.gain, self.forgetting) != (FORGETTING, None, 1.0):
+            raise InputError("adaptation, gain and forgetting are of recursive models: add --recursive")
+        if self.adaptation == FORGETTING and self.gain is not None:
+            raise InputError(f"a gain is of an adaptation, {', '.join(GAINS)}: of {FORGETTING} give the factor")
+        if self.adaptation != FORGETTING and (self.model != "arx" or self.forgetting != 1.0):
+            raise InputError(f"adaptation {self.adaptation} is for arx, without forgetting, got {self.model}")
         if self.scheme not in SCHEMES:
             raise InputError(describe_unknown("scheme", self.scheme, SCHEMES))
         if self.model not in SCHEMES[self.scheme] or (self.recursive and self.scheme == "report"):
@@ -300,8 +317,8 @@ def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
     if not form.recursive:
         return SCHEMES[form.scheme][form.model](structure, u, y, t)
     scaling = Scaling.of(u, y)
-    if form.model == "oe":
-        running = RecursiveOutputError(structure, scaling, form.forgetting)
+    if form.model != "arx":
+        running = RecursivePredictionError(structure, scaling, form.forgetting, RECURSIVE_MODELS[form.model])
         for k, unbroken_rows in enumerate(consecutive_rows(np.concatenate([u, y], axis=1), t)):
             if unbroken_rows <= 1:
                 running.restart()
@@ -309,6 +326,11 @@ def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
                 running.update(u[k], float(y[k, 0]))
         return running.model
     rows = rows_of(structure, scaling.inputs(u), scaling.outputs(y), t)
+    if form.adaptation != FORGETTING:
+        adaptive = AdaptiveRegression(structure.parameters, form.adaptation, form.gain)
+        for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
+            adaptive.update(regressor, float(value))
+        return model_of(structure, scaling, adaptive, simulates=False)
     estimator = RecursiveLeastSquares(structure.parameters, form.forgetting)
     for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
         estimator.update(regressor, value)
