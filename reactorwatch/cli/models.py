@@ -49,7 +49,7 @@ def identify(
             show_default=False,
         ),
     ] = None,
-    model: Annotated[str, typer.Option(help="arx, oe, armax, bj (Box-Jenkins) or narx (polynomial).")] = "arx",
+    model: Annotated[str, typer.Option(help="arx, oe, armax, bj (Box-Jenkins), narx or noe (polynomials).")] = "arx",
     order: Annotated[int, typer.Option(help="Lags of the output, each input and the disturbance.")] = 3,
     delay: Annotated[int, typer.Option(help="Samples from a move of an input to its first effect.")] = 1,
     validate: Annotated[

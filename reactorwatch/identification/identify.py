@@ -20,6 +20,7 @@ from reactorwatch.identification.free_run import free_run
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.output_error import fit_oe
 from reactorwatch.identification.polynomial_narx import PolynomialModel, fit_narx, name_product
+from reactorwatch.identification.polynomial_oe import fit_noe
 from reactorwatch.identification.prediction_error import Kind, PredictionErrorModel, fit_armax, fit_box_jenkins
 from reactorwatch.identification.recursive_prediction_error import RecursivePredictionError
 from reactorwatch.identification.regressor import consecutive_rows, rows_of
@@ -37,6 +38,7 @@ MODELS: dict[str, Callable[..., FittedModel]] = {
     "armax": fit_armax,
     "bj": fit_box_jenkins,
     "narx": fit_narx,
+    "noe": fit_noe,
 }
 """Fits by the kind of model."""
 
@@ -62,7 +64,8 @@ class ModelForm:
     """Choice of a model.
 
     Attributes:
-        model: `arx`, `oe`, `armax`, `bj` (Box-Jenkins) or `narx` (polynomial of degree 2).
+        model: `arx`, `oe`, `armax`, `bj` (Box-Jenkins), `narx` or `noe` (polynomials of degree 2, fitted by one-step
+            prediction, and of degree 3, fitted by simulation).
         order: number of lags of the output, of each input and of the disturbance.
         delay: samples from a move of an input to its first effect, at least 1.
         recursive: whether it is learned row by row instead of from all rows at once.
@@ -161,11 +164,11 @@ class Identification(msgspec.Struct, frozen=True):
     y[k] = a1 y[k-1] + ... + an y[k-n] + b1 u[k-d] + ... + bn u[k-d-n+1] + offset, d the delay, in the signals' own
     units; in an output-error model y stands for the model's own output. An ARMAX model adds e[k] + c1 e[k-1] + ... +
     cn e[k-n], with e its one-step error. A Box-Jenkins model is w + v, w[k] = f1 w[k-1] + ... + b1 u[k-d] + ... +
-    offset and v[k] = d1 v[k-1] + ... + e[k] + c1 e[k-1] + ...; it has no a. A polynomial NARX model is the sum of its
-    terms and the offset; it has neither a nor b.
+    offset and v[k] = d1 v[k-1] + ... + e[k] + c1 e[k-1] + ...; it has no a. A polynomial model, NARX or
+    output-error, is the sum of its terms and the offset; it has neither a nor b.
 
     Attributes:
-        model: `arx`, `oe`, `armax`, `bj` or `narx`.
+        model: `arx`, `oe`, `armax`, `bj`, `narx` or `noe`.
         order: n.
         delay: delay in samples.
         output: name of the output.
@@ -182,7 +185,7 @@ class Identification(msgspec.Struct, frozen=True):
         c: n coefficients of past errors, of an ARMAX or Box-Jenkins model.
         d: n coefficients of the past disturbance of a Box-Jenkins model.
         f: n coefficients of the plant's own past of a Box-Jenkins model.
-        terms: terms of a polynomial NARX model.
+        terms: terms of a polynomial model.
         rmse: errors on the held-out rows, where a record was given for validation or rows set the state.
     """
 
@@ -268,7 +271,7 @@ def identify_and_run(
             f"{model.condition:.0e}: these are the parameters of least norm"
         )
     residuals = model.residuals(*fitted.arrays)[:, 0]
-    of_own_past = {"arx": form.order, "narx": form.order, "oe": 0}.get(form.model, 2 * form.order)
+    of_own_past = {"arx": form.order, "narx": form.order, "oe": 0, "noe": 0}.get(form.model, 2 * form.order)
     lags, white = max(DEFAULT_LAGS, of_own_past + 10), math.nan
     if np.isfinite(residuals).sum() >= 5 * lags:
         white = whiteness(residuals, lags, of_own_past).minus_log10_p
