@@ -71,12 +71,12 @@ def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
             names += [(name, signal) for signal in config.outputs]
         elif issubclass(kind, ValueChart) or (issubclass(kind, JointChart) and len(config.outputs) > 1):
             names.append((name, ALL))
-    if _has_values_only(config):
+    if has_values_only(config):
         names += [(name, signal) for name in SUBSTITUTES for signal in config.outputs]
     return names
 
 
-def _has_values_only(config: MonitorConfig) -> bool:
+def has_values_only(config: MonitorConfig) -> bool:
     """True if all charts of the settings are of values, so that there may be none after a training."""
     return all(issubclass(chart(name), ValueChart) for name in config.charts)
 
@@ -421,7 +421,7 @@ class ChartWatch:
         self._evaluated, self._chosen = evaluated, [name for name in self._names if name in state.charts]
         outputs = len(self._config.outputs)
         each = {name for name in self._names if issubclass(chart(name), SignalChart)}
-        if _has_values_only(self._config) and not each & set(state.charts):
+        if has_values_only(self._config) and not each & set(state.charts):
             each = set()
         if not each <= set(state.charts) <= set(self._names) or not len(self.widths) == len(self._passed) == outputs:
             raise ValueError(f"there must be the charts {', '.join(self._names)}, got {', '.join(state.charts)}")

@@ -13,6 +13,7 @@ from math import isfinite, nan
 import numpy as np
 
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.baseline.arx_bank import ArxBank
 from monitor_node.baseline.black_box_reference import BlackBoxReference, BlackBoxReferenceState
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.predictor import ArxPredictor, arx_structure
@@ -26,7 +27,7 @@ from monitor_node.baseline.references import (
 from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
-from monitor_node.chart_stage import ChartWatch, count_chance_alarms
+from monitor_node.chart_stage import ChartWatch, count_chance_alarms, has_values_only
 from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
@@ -48,7 +49,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
+from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening, innovations
 
 
 def check_promise(config: MonitorConfig, period_min: float) -> None:
@@ -136,6 +137,7 @@ class PlantPipeline:
         self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
+        self._bank: ArxBank | None = None
         self._quarantined = (False,) * len(config.outputs)
         self._evaluated = [True] * len(config.outputs)
         self._start_training(None)
@@ -179,6 +181,7 @@ class PlantPipeline:
             self.rows_watched,
             self._drift.until_next,
             b"" if self.baseline is None else self.baseline.SerializeToString(),
+            None if self._bank is None else self._bank.state,
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -218,6 +221,10 @@ class PlantPipeline:
             for i, item in enumerate(watched.whiteners)
         ]
         self._charts.restore(watched.charts, self._evaluated)
+        if self._bank is not None:
+            if watched.bank is None:
+                raise ValueError("the state of a plant of many signals must have that of its models")
+            self._bank.restore(watched.bank)
         if (watched.suspicion is None) != (self._suspicion is None):
             raise ValueError("the state must tell of the search for causes as it is set")
         if self._suspicion is not None and watched.suspicion is not None:
@@ -453,6 +460,13 @@ class PlantPipeline:
             for predictor, value in zip(self._predictors, row.values, strict=True)
         ]
 
+    def _predict_by_bank(self, row: MeasuredRow) -> list[float]:
+        """Predict each output by its fitted model, for plants of many signals."""
+        assert self._bank is not None
+        if self._drift.wanted:
+            self._buffer(row)
+        return self._bank.predict(row.inputs, row.values, follows=row.follows)
+
     def _buffer(self, row: MeasuredRow) -> None:
         """Buffer a row for the identified models, whose predictions nothing needs now."""
         for predictor, value in zip(self._predictors, row.values, strict=True):
@@ -538,6 +552,9 @@ class PlantPipeline:
         self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
+        self._bank = None
+        if isinstance(reference, ArxReference) and has_values_only(self._config):
+            self._bank = ArxBank(self._predictors, self._inputs)
         self._kalman = None
         if isinstance(reference, BlackBoxReference):
             self._step = RowStep.of_black_box(self._config, reference, self._ranges)
@@ -652,7 +669,7 @@ class PlantPipeline:
             row.values = [nan if still else value for value, still in zip(row.values, stuck, strict=True)]
         values = row.values
         if isinstance(reference, ArxReference):
-            reference.predictions = self._predict(row)
+            reference.predictions = self._predict_by_bank(row) if self._bank is not None else self._predict(row)
         elif self._drift.wanted:
             self._buffer(row)
         if row.interval.is_gap:  # the input in it is unknown
@@ -667,10 +684,8 @@ class PlantPipeline:
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
             publications.extend(self._estimates(row, predictions, sds, scales, expected))
-        e = [
-            whitener.update((value - prediction) / sd)
-            for whitener, value, prediction, sd in zip(self._whiteners, values, predictions, sds, strict=True)
-        ]
+        z = [(value - prediction) / sd for value, prediction, sd in zip(values, predictions, sds, strict=True)]
+        e = innovations(self._numbers["whiteners"][0], z)
         self.rows_watched += 1
         self._quarantined = quarantined = self.signals.check_residuals(time_ns, e, scales, units, publications)
         if True in quarantined:

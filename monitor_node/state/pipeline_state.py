@@ -2,6 +2,7 @@
 
 import msgspec
 
+from monitor_node.baseline.arx_bank import ArxBankState
 from monitor_node.baseline.black_box_reference import BlackBoxReferenceState
 from monitor_node.baseline.predictor import PredictorState
 from monitor_node.baseline.references import ArxReferenceState, ProcessReferenceState
@@ -30,6 +31,7 @@ class TrainedState(StoredState, frozen=True):
         rows_watched: number of evaluated rows.
         until_drift: number of rows until the next drift point.
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
+        bank: state of the fitted models' bank; None if there is none.
     """
 
     reference: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
@@ -43,6 +45,7 @@ class TrainedState(StoredState, frozen=True):
     rows_watched: int
     until_drift: int
     baseline: bytes = b""
+    bank: ArxBankState | None = None
 
 
 class PipelineState(StoredState, frozen=True):
