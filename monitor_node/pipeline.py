@@ -120,7 +120,8 @@ class PlantPipeline:
         self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         units = {**config.units, **(self.model.units if self.model is not None else {})}
         self.operation = Operation(config, input_bounds(config, self.model), units)
-        board.describe_operation = self.operation.describe
+        if self.operation.is_known:
+            board.describe_operation = self.operation.describe
         self._drift = DriftWatch(config, board, publish=points)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
