@@ -27,7 +27,7 @@ from monitor_node.baseline.signal_range import input_bounds, possible_ranges, st
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
 from monitor_node.chart_stage import ChartWatch, alarm_names
-from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig
+from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.health import NODE
@@ -43,7 +43,6 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Baseline, Check, Estimate, ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
@@ -741,7 +740,7 @@ def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | 
     """Process model for the plant, as the settings ask for it."""
     if config.reference in ("black-box", "arx") or (model is None and config.process == WITHOUT_EQUATIONS):
         return None
-    given, model = model is not None, model or cstr()
+    given, model = model is not None, model or DEFAULT.require_model()
     fits = config.inputs == model.input_names and set(config.outputs) <= set(model.output_names)
     if fits:
         return model
