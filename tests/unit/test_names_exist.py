@@ -27,7 +27,7 @@ MADE = {"summary.md"}.union(*(WRITTEN.findall(path.read_text(encoding="utf-8")) 
 """Files that the commands write, and those that a page shows for the reader to write."""
 PREFIXES = ("reactorwatch_", "process_", "keep_", "_total")
 """Parts of names that the code puts together: metrics (tests/end_to_end/test_metrics.py has them all) and settings."""
-ELSEWHERE = ("xdist_group", "nohup", "openssl", "trustme", "uv", "zenohd")
+ELSEWHERE = ("nohup", "openssl", "trustme", "uv", "zenohd")
 """Names of other programs, that no code of this repository has."""
 
 
