@@ -36,6 +36,7 @@ from monitor_node.ingest.sampling import SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.operation import Operation
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
+from monitor_node.shift_stage import ShiftWatch
 from monitor_node.signal_checks.stage import SignalChecks
 from monitor_node.state.monitor_state import equations_text
 from monitor_node.state.pipeline_state import PipelineState, TrainedState
@@ -122,6 +123,7 @@ class PlantPipeline:
         if self.operation.is_known:
             board.describe_operation = self.operation.describe
         self._drift = DriftWatch(config, board, publish=points)
+        self._shift = ShiftWatch(config, board)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
@@ -179,6 +181,7 @@ class PlantPipeline:
             self.rows_watched,
             self._drift.until_next,
             b"" if self.baseline is None else self.baseline.SerializeToString(),
+            self._shift.state,
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -218,6 +221,7 @@ class PlantPipeline:
             for i, item in enumerate(watched.whiteners)
         ]
         self._charts.restore(watched.charts, self._evaluated)
+        self._shift.restore(watched.shift)
         if (watched.suspicion is None) != (self._suspicion is None):
             raise ValueError("the state must tell of the search for causes as it is set")
         if self._suspicion is not None and watched.suspicion is not None:
@@ -401,6 +405,7 @@ class PlantPipeline:
         self._quarantined = (False,) * len(self._config.outputs)
         for whitener in self._whiteners:
             whitener.restart()
+        self._shift.restart()
         self.signals.restart()
         self.signals.reset()
 
@@ -467,7 +472,8 @@ class PlantPipeline:
     def _chance_alarms(self) -> int:
         """Number of alarms that can be false alarms."""
         of_signals = SignalChecks.CHANCE_ALARMS * sum(self._evaluated)
-        return self._charts.chance_alarms + of_signals + self._drift.chance_alarms(self._evaluated)
+        of_steps = sum(self._evaluated) if self._shift.is_active else 0
+        return self._charts.chance_alarms + of_signals + of_steps + self._drift.chance_alarms(self._evaluated)
 
     def _start_diagnosis(self, rows: TrainingState) -> None:
         if self._config.diagnose_training and equations_text(self.model):
@@ -505,6 +511,7 @@ class PlantPipeline:
         """
         self._leave_out(trained.left_out)
         unmade = self._charts.choose(self._evaluated, trained.e)
+        self._shift.is_active = trained.responses is not None
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
         )
@@ -524,6 +531,7 @@ class PlantPipeline:
             Prewhitener(item, self._numbers["whiteners"][0, i : i + 1]) for i, item in enumerate(trained.learned)
         ]
         self._charts.start(trained.learned, trained.e, self._arl0)
+        self._shift.start(trained.responses, trained.z, trained.learned, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         if not again:
             self.operation.end_training()
@@ -615,9 +623,15 @@ class PlantPipeline:
         self.rows_watched += 1
         if self._points:
             self._publish_step(row)
+        if self._shift.is_active:
+            count = len(row.values)
+            self._shift.update(row, self._step.work[0]["outputs"][3 * count : 4 * count].tolist(), points=self._points)
         if self._drift.wanted:
             self._buffer(row)
             row.publications.extend(self._drift.update(time_ns, self._predictors))
+        if self._board.has_unexplained:  # a lasting step
+            self._leave_normal()
+            self._set_learning()
         if self._suspicion is not None:
             self._suspicion.add(time_min, row.inputs, row.values)
         return True
@@ -653,24 +667,29 @@ class PlantPipeline:
         values = row.values
         if isinstance(reference, ArxReference):
             reference.predictions = self._predict(row)
+            reference.extrapolation_sds = [predictor.extrapolation_sd for predictor in self._predictors]
         elif self._drift.wanted:
             self._buffer(row)
         if row.interval.is_gap:  # the input in it is unknown
             reference.restart()
             self.signals.restart()
+            self._shift.restart()
             for whitener in self._whiteners:
                 whitener.restart()
-        predictions, sds = reference.update(time_ns, row.inputs, values, self._quarantined, row.interval.missing)
+        predictions, sds, extrapolation = reference.update(
+            time_ns, row.inputs, values, self._quarantined, row.interval.missing
+        )
+        z = [(value - prediction) / sd for value, prediction, sd in zip(values, predictions, sds, strict=True)]
+        tested = z
+        if extrapolation is not None:
+            tested = [(value - known) / sd for value, known, sd in zip(values, *extrapolation, strict=True)]
         if isinstance(reference, ArxReference) and reference.beyond:
             self._note_inputs_beyond(reference.beyond)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
             publications.extend(self._estimates(row, predictions, sds, scales, expected))
-        e = [
-            whitener.update((value - prediction) / sd)
-            for whitener, value, prediction, sd in zip(self._whiteners, values, predictions, sds, strict=True)
-        ]
+        e = [whitener.update(residual) for whitener, residual in zip(self._whiteners, z, strict=True)]
         self.rows_watched += 1
         self._quarantined = quarantined = self.signals.check_residuals(time_ns, e, scales, units, publications)
         if True in quarantined:
@@ -678,17 +697,22 @@ class PlantPipeline:
                 if outlier:
                     whitener.reject_last()
         self._charts.update(row, e, quarantined, scales, points=self._points)
+        self._shift.update(row, tested, points=self._points)
         if self._drift.wanted:
             publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
             publications.extend(self._search_causes(row, stuck))
-        if isinstance(reference, BlackBoxReference):
-            reference.set_learning(not self._board.has_unexplained)
-            if reference.unjudged and reference.kind not in self._noted:
-                self._noted.add(reference.kind)
-                self.notes.append(
-                    "rows are not judged while inputs have values that the black box has not learned, and teach it"
-                )
+        self._set_learning()
+        if isinstance(reference, BlackBoxReference) and reference.unjudged and reference.kind not in self._noted:
+            self._noted.add(reference.kind)
+            self.notes.append(
+                "rows are not judged while inputs have values that the black box has not learned, and teach it"
+            )
+
+    def _set_learning(self) -> None:
+        """Let a black box learn while no alarm without a known cause is active."""
+        if isinstance(self._reference, BlackBoxReference):
+            self._reference.set_learning(not self._board.has_unexplained)
 
     def _note_inputs_beyond(self, indices: list[int]) -> None:
         """Note once each input that leaves its range in the training, as rows are not judged then."""

@@ -12,6 +12,7 @@ from monitor_node.isolation.stage import SuspicionState
 from monitor_node.operation import CarriedState
 from monitor_node.signal_checks.stage import SignalChecksState
 from reactorwatch.spc.prewhitening import PrewhitenerState
+from reactorwatch.spc.step_test import StepTestState
 from reactorwatch.stored_state import StoredState
 
 
@@ -30,6 +31,7 @@ class TrainedState(StoredState, frozen=True):
         rows_watched: number of evaluated rows.
         until_drift: number of rows until the next drift point.
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
+        shift: tests for lasting steps, one an output; empty without them, and in states of earlier versions.
     """
 
     reference: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
@@ -43,6 +45,7 @@ class TrainedState(StoredState, frozen=True):
     rows_watched: int
     until_drift: int
     baseline: bytes = b""
+    shift: list[StepTestState] = msgspec.field(default_factory=list)
 
 
 class PipelineState(StoredState, frozen=True):
