@@ -4,6 +4,7 @@ import msgspec
 
 from monitor_node.baseline.black_box_reference import BlackBoxReferenceState
 from monitor_node.baseline.predictor import PredictorState
+from monitor_node.baseline.promise import PromiseState
 from monitor_node.baseline.references import ArxReferenceState, ProcessReferenceState
 from monitor_node.baseline.training import TrainingState
 from monitor_node.chart_stage import ChartsState
@@ -30,6 +31,7 @@ class TrainedState(StoredState, frozen=True):
         rows_watched: number of evaluated rows.
         until_drift: number of rows until the next drift point.
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
+        promise: state of the promise of false alarms; None: it was stored by a version without one.
     """
 
     reference: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
@@ -43,6 +45,7 @@ class TrainedState(StoredState, frozen=True):
     rows_watched: int
     until_drift: int
     baseline: bytes = b""
+    promise: PromiseState | None = None
 
 
 class PipelineState(StoredState, frozen=True):
