@@ -27,13 +27,6 @@ def pytest_xdist_auto_num_workers() -> int:
     return len(os.sched_getaffinity(0)) + 1
 
 
-def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
-    """Some files whole, all other tests one by one; see there."""
-    from tests.together import scheduling
-
-    return scheduling(config, log) if config.getvalue("dist") == "loadgroup" else None
-
-
 @pytest.fixture(scope="session")
 def daisy_csv() -> Path:
     """The measured record "CSTR" of the DaISy database, which is not part of this repository."""

@@ -24,6 +24,7 @@ NAMES = {
     "armax": "ARMAX",
     "bj": "Box-Jenkins model",
     "narx": "polynomial NARX",
+    "noe": "polynomial output-error",
 }
 
 
