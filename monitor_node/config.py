@@ -41,6 +41,9 @@ DEFAULT = find_process()
 DEFAULT_TRAINING_ROWS = 1000
 """Training where nothing is stated, of a process that has no duration of its own."""
 
+LARGEST_FALSE_ALARMS = 1e6
+"""Most false alarms in 30 days that can be asked for."""
+
 WITHOUT_EQUATIONS = ""
 """Setting `process` of a plant that no equations judge."""
 
@@ -140,7 +143,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     reference: ReferenceName | Literal["process"] = "auto"
     process: str | None = None
     charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
-    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None
+    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=LARGEST_FALSE_ALARMS)] | None = None
     smallest_sd: dict[str, float] = msgspec.field(default_factory=lambda: dict(DEFAULT.watch.smallest_sd))
     isolation: bool = True
     isolation_rows: Annotated[int, msgspec.Meta(ge=50, le=10_000)] = 600

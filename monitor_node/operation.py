@@ -60,11 +60,6 @@ class Operation:
         self._carried = {name: CarriedState() for name in config.carried_signals}
 
     @property
-    def is_known(self) -> bool:
-        """True if there are bounds of inputs, modes or set points to describe."""
-        return bool(self._bounds or self._carried)
-
-    @property
     def state(self) -> dict[str, CarriedState]:
         """A copy of the state, by signal."""
         return {name: msgspec.structs.replace(state) for name, state in self._carried.items()}
