@@ -30,7 +30,7 @@ from monitor_node.baseline.references import (
 from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
-from monitor_node.chart_stage import ChartWatch, alarm_names
+from monitor_node.chart_stage import ChartWatch, alarm_names, count_chance_alarms
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
@@ -74,7 +74,7 @@ def check_promise(config: MonitorConfig, period_min: float) -> None:
     """
     outputs = len(config.outputs)
     of_drift = outputs if ParameterT2.name in config.charts else 0
-    alarms = len(alarm_names(config)) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
+    alarms = count_chance_alarms(config) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
     false_alarm_budget.promise_per_30_days(config.false_alarms_per_30_days, alarms, period_min)
 
 
@@ -124,7 +124,7 @@ class PlantPipeline:
         self.promise: PlantPromise | None = None
         self._promised: Promise | None = None
         self.alarm_rates = np.zeros(0)
-        self._chance_names = {*config.charts, SHIFT, *SignalChecks.CHANCE_NAMES}
+        self._chance_names = {*(name for name, _ in alarm_names(config)), SHIFT, *SignalChecks.CHANCE_NAMES}
         self._promise_key = keys.key(config.plant, keys.PROMISE, NODE)
         self._update = ModelUpdate(config, deque() if changes is None else changes)
         self._diagnose = diagnose
@@ -612,7 +612,7 @@ class PlantPipeline:
             again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
         """
         self._leave_out(trained.left_out)
-        unmade = self._charts.choose(self._evaluated, trained.e)
+        unmade = self._charts.choose(self._evaluated, trained.e, trained.values)
         self._shift.is_active = trained.responses is not None
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
@@ -632,7 +632,7 @@ class PlantPipeline:
         self._whiteners = [
             Prewhitener(item, self._numbers["whiteners"][0, i : i + 1]) for i, item in enumerate(trained.learned)
         ]
-        self._charts.start(trained.learned, trained.e, self._arl0)
+        self._charts.start(trained.learned, trained.e, trained.values, self._arl0)
         self._shift.start(trained.responses, trained.z, trained.learned, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         self._start_promise(trained, period_min)

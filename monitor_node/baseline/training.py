@@ -79,6 +79,8 @@ class TrainingResult(NamedTuple):
         z: residuals as the reference normalises them, shape (n, outputs); NaN if missing.
         e: the same, prewhitened.
         measured: outputs in undisturbed rows, shape (n, outputs); NaN elsewhere.
+        values: all signals, the inputs first, shape (n, inputs + outputs); NaN where disturbed or left out. Unlike
+            `measured` it has rows that could not be predicted.
         checks: checks of the training.
         refused: reason to start again; empty if the training is usable.
         left_out: signals that cannot be monitored, with the reason.
@@ -91,6 +93,7 @@ class TrainingResult(NamedTuple):
     z: Array
     e: Array
     measured: Array
+    values: Array
     checks: list[Check]
     refused: str
     left_out: dict[str, str]
@@ -222,8 +225,9 @@ class Training:
             _refusal(outputs, screenings, evaluated) if any(evaluated) else "; ".join(dict.fromkeys(left_out.values()))
         )
         if refused and last_chance and any(evaluated):
-            refused, screenings = "", [Screening(np.isfinite(column), [], [], 0) for column in z.T]
+            refused, screenings = "", [Screening(known, [], [], 0, np.zeros_like(known)) for known in np.isfinite(z).T]
         usable = np.column_stack([item.usable for item in screenings]) & np.array(evaluated)
+        disturbed = np.column_stack([item.left_out for item in screenings]) | ~np.array(evaluated)
         z = np.where(usable, z, np.nan)
         if isinstance(reference, ProcessReference | BlackBoxReference):
             smallest = [sd / typical for sd, typical in zip(smallest, reference.typical_sd, strict=True)]
@@ -244,9 +248,11 @@ class Training:
         if isinstance(reference, ArxReference):
             checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
+        inputs = np.where([name not in left_out for name in self._config.inputs], inputs, np.nan)
+        values = np.hstack([inputs, np.where(disturbed, np.nan, measured)])
         measured = np.where(usable, measured, np.nan)
         responses = self._step_responses(reference)
-        return TrainingResult(reference, learned, z, e, measured, checks, refused, left_out, responses)
+        return TrainingResult(reference, learned, z, e, measured, values, checks, refused, left_out, responses)
 
     def _step_responses(self, reference: Reference) -> Array | None:
         if isinstance(reference, BlackBoxReference):
