@@ -25,6 +25,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.process.places import Place
 
 if TYPE_CHECKING:
+    from reactorwatch.process.effect import Effect
     from reactorwatch.process.law import ExtendedLaw
 
 
@@ -133,6 +134,7 @@ class ProcessModel:
             shorter.
         places: where something unknown may act; empty: they follow from the equations (`process.places`).
         laws: laws of what was unknown, which are part of the equations already.
+        effects: effects of its own; None: those of the catalogue under its name.
     """
 
     name: str
@@ -149,6 +151,7 @@ class ProcessModel:
     time_offset: ca.SX = field(default_factory=lambda: ca.SX(0))
     places: tuple[Place, ...] = ()
     laws: tuple["ExtendedLaw", ...] = ()
+    effects: tuple["Effect", ...] | None = None
 
     def __post_init__(self) -> None:
         if len(self.rhs) != len(self.states):
