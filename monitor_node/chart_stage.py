@@ -29,7 +29,9 @@ from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.shewhart import designed_width
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalState
 from reactorwatch.spc.joint_chart import JointChart
+from reactorwatch.spc.m_of_n import false_alarm_rate
 from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.training_errors import TrainingErrors
 from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
 from reactorwatch.stored_state import StoredState
 
@@ -384,22 +386,61 @@ class ChartWatch:
             values: measured values of the training, see `choose`.
             arl0: run length of each alarm without a fault, in rows.
         """
-        config = self._config
-        p = false_alarm_budget.point_probability(arl0, config.raise_count, config.window)
-        sds = memory_sds(e, config.chart_settings["ewma_weight"])
-        baseline = Baseline(tuple(learned), e, sds, arl0, p, config.chart_settings)
+        config, baseline = self._config, self._baseline(learned, e, arl0)
+        p = baseline.point_probability
         self.widths, self._passed = [designed_width(p, item) for item in learned], [item.shift_gain for item in learned]
 
         def design_charts(kind: type[Chart]) -> _Charts:
             if issubclass(kind, SignalChart):
                 return _of_each(kind, [kind.design(baseline.of([index])) for index in range(len(config.outputs))])
             if issubclass(kind, ValueChart):
-                of_values = ValueBaseline(*self._complete_values(values), arl0, config.chart_settings)
-                return _OfValues(kind.design(of_values), config.signals)
+                return _OfValues(kind.design(self._value_baseline(values, arl0)), config.signals)
             assert issubclass(kind, JointChart)
             return _OfAll(kind.design(baseline.of(np.flatnonzero(self._evaluated).tolist())), self._evaluated)
 
         self._watch(design_charts)
+
+    def _value_baseline(self, values: Array, arl0: float) -> ValueBaseline:
+        return ValueBaseline(*self._complete_values(values), arl0, self._config.chart_settings)
+
+    def _baseline(self, learned: list[Prewhitening], e: Array, arl0: float) -> Baseline:
+        config = self._config
+        p = false_alarm_budget.point_probability(arl0, config.raise_count, config.window)
+        sds = memory_sds(e, config.chart_settings["ewma_weight"])
+        return Baseline(tuple(learned), e, sds, arl0, p, config.chart_settings)
+
+    def relative_rates(
+        self, learned: list[Prewhitening], e: Array, values: Array, arl0: float, errors: TrainingErrors
+    ) -> Array:
+        """Rate of false alarms of all charts by the errors of the training, in shares of one alarm, shape (draws,).
+
+        Args:
+            learned: prewhitening of each output.
+            e: prewhitened residuals of the training, shape (n, outputs); NaN where there is none.
+            values: measured values of the training, see `choose`.
+            arl0: run length of each alarm without a fault, in rows.
+            errors: errors of all outputs.
+        """
+        baseline, evaluated = self._baseline(learned, e, arl0), np.flatnonzero(self._evaluated).tolist()
+        total = np.zeros(len(errors.mean))
+        for name in self._chosen:
+            kind = chart(name)
+            if issubclass(kind, ValueChart):
+                total += kind.relative_rates(self._value_baseline(values, arl0))
+                continue
+            groups = [[index] for index in evaluated] if issubclass(kind, SignalChart) else [evaluated]
+            assert issubclass(kind, SignalChart | JointChart)
+            for group in groups:
+                rates = kind.relative_rates(baseline.of(group), errors.of(group))
+                total += rates if kind.has_memory else self._rule_rates(baseline, rates)
+        return total
+
+    def _rule_rates(self, baseline: Baseline, rates: Array) -> Array:
+        """Relative rate of an alarm that takes several points, from that of single points."""
+        count, window, p = self._config.raise_count, self._config.window, baseline.point_probability
+        nodes = np.geomspace(1e-3 * p, 1.0, 40)
+        of_rule = [false_alarm_rate(count, window, float(node)) * baseline.arl0 for node in nodes]
+        return np.asarray(np.exp(np.interp(np.log(np.maximum(rates * p, nodes[0])), np.log(nodes), np.log(of_rule))))
 
     @property
     def state(self) -> ChartsState:

@@ -5,6 +5,7 @@ import msgspec
 from monitor_node.baseline.arx_bank import ArxBankState
 from monitor_node.baseline.black_box_reference import BlackBoxReferenceState
 from monitor_node.baseline.predictor import PredictorState
+from monitor_node.baseline.promise import PromiseState
 from monitor_node.baseline.references import ArxReferenceState, ProcessReferenceState
 from monitor_node.baseline.training import TrainingState
 from monitor_node.chart_stage import ChartsState
@@ -13,6 +14,7 @@ from monitor_node.isolation.stage import SuspicionState
 from monitor_node.operation import CarriedState
 from monitor_node.signal_checks.stage import SignalChecksState
 from reactorwatch.spc.prewhitening import PrewhitenerState
+from reactorwatch.spc.step_test import StepTestState
 from reactorwatch.stored_state import StoredState
 
 
@@ -31,6 +33,8 @@ class TrainedState(StoredState, frozen=True):
         rows_watched: number of evaluated rows.
         until_drift: number of rows until the next drift point.
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
+        shift: tests for lasting steps, one an output; empty without them, and in states of earlier versions.
+        promise: state of the promise of false alarms; None: it was stored by a version without one.
         bank: state of the fitted models' bank; None if there is none.
     """
 
@@ -45,6 +49,8 @@ class TrainedState(StoredState, frozen=True):
     rows_watched: int
     until_drift: int
     baseline: bytes = b""
+    shift: list[StepTestState] = msgspec.field(default_factory=list)
+    promise: PromiseState | None = None
     bank: ArxBankState | None = None
 
 

@@ -37,6 +37,7 @@ EVERYTHING = frozenset(
         keys.ALARM_KPIS,
         keys.RECONSTRUCTION,
         keys.BASELINE,
+        keys.PROMISE,
         keys.FAULT,
     }
 )
