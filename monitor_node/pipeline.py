@@ -525,6 +525,7 @@ class PlantPipeline:
         ]
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
+        self.signals.learn_spike_rates(trained.outliers, len(trained.e), self._sampling.period_ns, self._arl0)
         if not again:
             self.operation.end_training()
             self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
@@ -552,7 +553,7 @@ class PlantPipeline:
         return self._reference.model if isinstance(self._reference, ProcessReference) else None
 
     def _new_suspicion(self, reference: Reference) -> Suspicion | None:
-        if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.model)):
+        if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.equations)):
             return None
         return Suspicion(self._config, self._board, reference)
 

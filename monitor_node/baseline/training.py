@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
 from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_structure, fewest_rows
-from monitor_node.baseline.references import ArxReference, ProcessReference, Reference, estimate_training_noise
+from monitor_node.baseline.references import ArxReference, ProcessReference, Reference
 from monitor_node.baseline.resolution import resolution_sd
 from monitor_node.baseline.signal_range import possible_ranges
 from monitor_node.config import MonitorConfig
@@ -80,6 +80,7 @@ class TrainingResult(NamedTuple):
         checks: checks of the training.
         refused: reason to start again; empty if the training is usable.
         left_out: signals that cannot be monitored, with the reason.
+        outliers: number of single values of each output that were left out.
     """
 
     reference: Reference
@@ -89,6 +90,7 @@ class TrainingResult(NamedTuple):
     checks: list[Check]
     refused: str
     left_out: dict[str, str]
+    outliers: list[int]
 
 
 MOST_OUT_OF_RANGE = 1.0 / 3.0
@@ -238,7 +240,8 @@ class Training:
         if isinstance(reference, ArxReference):
             checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
-        return TrainingResult(reference, learned, e, np.where(usable, measured, np.nan), checks, refused, left_out)
+        counts, usual = [item.outliers for item in screenings], np.where(usable, measured, np.nan)
+        return TrainingResult(reference, learned, e, usual, checks, refused, left_out, counts)
 
     def _simplifications(self, evaluated: list[bool]) -> list[str]:
         """Terms that the identified models lack, each with the outputs."""
@@ -346,8 +349,7 @@ class Training:
     ) -> ProcessReference:
         outputs = self._config.outputs
         assert self._model is not None
-        noise = estimate_training_noise(self._model, outputs, time_min, inputs, measured, smallest)
-        return ProcessReference(self._model, outputs, noise)
+        return ProcessReference.fit(self._model, outputs, time_min, inputs, measured, smallest)
 
 
 def _refit_without_outliers(residuals: Callable[[Array], Residuals], measured: Array) -> tuple[Array, list[Screening]]:

@@ -119,6 +119,12 @@ class SignalChecks:
         for check in self._checks:
             check.start(values, e, arl0)
 
+    def learn_spike_rates(self, counts: Sequence[int], rows: int, period_ns: float, arl0: float) -> None:
+        """Learn how often spikes are usual; arguments as for `SpikeCheck.learn_rates`."""
+        for check in self._checks:
+            if isinstance(check, SpikeCheck):
+                check.learn_rates(counts, rows, period_ns, arl0)
+
     # --- state -----------------------------------------------------------------------------------------------
 
     @property

@@ -10,7 +10,8 @@
 
 An effect is stored as the text that injects it into the plant as a fault (`fault`), to full precision, so a model that
 is read equals the one that was written. `parameters` are those of the model that differ from its nominal values, in its
-units. Laws of what was unknown (`law`) are items of a list `laws`, which is left out where it is empty. Times are
+units. Laws of what was unknown (`law`) are items of a list `laws`, and what a filter of the model estimates beside its
+states (`kalman.uncertain_model`) of a list `uncertain`; both are left out where they are empty. Times are
 minutes of the record in which the deviations were found, counted from `zero_ns`, nanoseconds since 1970-01-01 UTC; 0
 where that is unknown, as for a .csv.
 """
@@ -60,6 +61,7 @@ class _ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     parameters: dict[str, float] = {}  # msgspec copies the default
     zero_ns: int = 0
     laws: tuple[_LawFile, ...] = ()
+    uncertain: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,7 @@ class ExtendedModel:
         parameters: values that differ from the model's nominal ones, by name, in their units.
         zero_ns: time from which the minutes are counted; 0: unknown.
         laws: laws of what was unknown, which act all the time.
+        uncertain: see `ProcessModel`.
     """
 
     name: str
@@ -79,6 +82,7 @@ class ExtendedModel:
     parameters: Mapping[str, float] = field(default_factory=dict)
     zero_ns: int = 0
     laws: tuple[ExtendedLaw, ...] = ()
+    uncertain: tuple[str, ...] = ()
 
     def build(self, models: Sequence[Callable[[], ProcessModel]] = MODELS) -> ProcessModel:
         """Build the model; its clock is that of the record.
@@ -101,7 +105,7 @@ class ExtendedModel:
                 model = item.extend(model)
         except ValueError as error:
             raise InputError(str(error)) from error
-        return model
+        return replace(model, uncertain=self.uncertain) if self.uncertain else model
 
     def rebase(self, zero_ns: int) -> "ExtendedModel":
         """Copy with minutes counted from another time; unchanged where its own zero is unknown."""
@@ -119,6 +123,7 @@ class ExtendedModel:
             "effects": [str(item) for item in self.effects],
             "zero_ns": self.zero_ns,
             **({"laws": [_law_object(item) for item in self.laws]} if self.laws else {}),
+            **({"uncertain": list(self.uncertain)} if self.uncertain else {}),
         }
 
 
@@ -164,6 +169,7 @@ def parse_extended_model(
         file.parameters,
         file.zero_ns,
         tuple(item.law() for item in file.laws),
+        file.uncertain,
     )
     extended.build(models)  # reports invalid combinations now
     return extended
@@ -197,7 +203,7 @@ def extended_model_of(
         for item in (nominal.parameters if nominal else ())
         if values[item.name] != item.value
     }
-    return ExtendedModel(model.name, tuple(found), differing, zero_ns, model.laws)
+    return ExtendedModel(model.name, tuple(found), differing, zero_ns, model.laws, model.uncertain)
 
 
 def _specification(effect: Effect, values: Mapping[str, float], prefix: str) -> FaultSpecification:

@@ -133,6 +133,8 @@ class ProcessModel:
             shorter.
         places: where something unknown may act; empty: they follow from the equations (`process.places`).
         laws: laws of what was unknown, which are part of the equations already.
+        uncertain: what a filter of this model estimates beside the states, see `kalman.uncertain_model`; no part of
+            the equations.
     """
 
     name: str
@@ -149,6 +151,7 @@ class ProcessModel:
     time_offset: ca.SX = field(default_factory=lambda: ca.SX(0))
     places: tuple[Place, ...] = ()
     laws: tuple["ExtendedLaw", ...] = ()
+    uncertain: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.rhs) != len(self.states):
