@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.alarms.states import Event
+from monitor_node.baseline.arx_bank import ArxBank
 from monitor_node.baseline.black_box_reference import BlackBoxReference, BlackBoxReferenceState
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.predictor import ArxPredictor, arx_structure
@@ -30,7 +31,7 @@ from monitor_node.baseline.references import (
 from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
-from monitor_node.chart_stage import ChartWatch, alarm_names, count_chance_alarms
+from monitor_node.chart_stage import ChartWatch, alarm_names, count_chance_alarms, has_values_only
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
@@ -53,7 +54,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
+from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening, innovations
 from reactorwatch.spc.training_errors import CONFIDENCE, TrainingErrors
 
 RAISED = Event.RAISED.value
@@ -158,6 +159,7 @@ class PlantPipeline:
         self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
+        self._bank: ArxBank | None = None
         self._quarantined = (False,) * len(config.outputs)
         self._evaluated = [True] * len(config.outputs)
         self._start_training(None)
@@ -203,6 +205,7 @@ class PlantPipeline:
             b"" if self.baseline is None else self.baseline.SerializeToString(),
             self._shift.state,
             None if self.promise is None else self.promise.state,
+            None if self._bank is None else self._bank.state,
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -243,6 +246,10 @@ class PlantPipeline:
             for i, item in enumerate(watched.whiteners)
         ]
         self._charts.restore(watched.charts, self._evaluated)
+        if self._bank is not None:
+            if watched.bank is None:
+                raise ValueError("the state of a plant of many signals must have that of its models")
+            self._bank.restore(watched.bank)
         self._shift.restore(watched.shift)
         if (watched.suspicion is None) != (self._suspicion is None):
             raise ValueError("the state must tell of the search for causes as it is set")
@@ -514,6 +521,13 @@ class PlantPipeline:
             for predictor, value in zip(self._predictors, row.values, strict=True)
         ]
 
+    def _predict_by_bank(self, row: MeasuredRow) -> list[float]:
+        """Predict each output by its fitted model, for plants of many signals."""
+        assert self._bank is not None
+        if self._drift.wanted:
+            self._buffer(row)
+        return self._bank.predict(row.inputs, row.values, follows=row.follows)
+
     def _buffer(self, row: MeasuredRow) -> None:
         """Buffer a row for the identified models, whose predictions nothing needs now."""
         for predictor, value in zip(self._predictors, row.values, strict=True):
@@ -613,7 +627,7 @@ class PlantPipeline:
         """
         self._leave_out(trained.left_out)
         unmade = self._charts.choose(self._evaluated, trained.e, trained.values)
-        self._shift.is_active = trained.responses is not None
+        self._shift.is_active = trained.responses is not None and not has_values_only(self._config)
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
         )
@@ -633,7 +647,8 @@ class PlantPipeline:
             Prewhitener(item, self._numbers["whiteners"][0, i : i + 1]) for i, item in enumerate(trained.learned)
         ]
         self._charts.start(trained.learned, trained.e, trained.values, self._arl0)
-        self._shift.start(trained.responses, trained.z, trained.learned, self._arl0)
+        responses = trained.responses if self._shift.is_active else None
+        self._shift.start(responses, trained.z, trained.learned, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         self.signals.learn_spike_rates(trained.outliers, len(trained.e), self._sampling.period_ns, self._arl0)
         self._start_promise(trained, period_min)
@@ -646,7 +661,7 @@ class PlantPipeline:
     def _start_promise(self, trained: TrainingResult, period_min: float) -> None:
         """State the promise of false alarms; alarms so far go on to count."""
         errors, arl0 = TrainingErrors.draw(len(trained.learned)), self._arl0
-        rates = self._charts.relative_rates(trained.learned, trained.e, arl0, errors)
+        rates = self._charts.relative_rates(trained.learned, trained.e, trained.values, arl0, errors)
         rates += self.signals.relative_rates(trained.learned, self._evaluated, arl0, errors)
         rates += self._drift.chance_alarms(self._evaluated)
         self.alarm_rates = rates / arl0
@@ -663,6 +678,9 @@ class PlantPipeline:
         self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
+        self._bank = None
+        if isinstance(reference, ArxReference) and has_values_only(self._config):
+            self._bank = ArxBank(self._predictors, self._inputs)
         self._kalman = None
         if isinstance(reference, BlackBoxReference):
             self._step = RowStep.of_black_box(self._config, reference, self._ranges)
@@ -785,7 +803,7 @@ class PlantPipeline:
             row.values = [nan if still else value for value, still in zip(row.values, stuck, strict=True)]
         values = row.values
         if isinstance(reference, ArxReference):
-            reference.predictions = self._predict(row)
+            reference.predictions = self._predict(row) if self._bank is None else self._predict_by_bank(row)
             reference.extrapolation_sds = [predictor.extrapolation_sd for predictor in self._predictors]
         elif self._drift.wanted:
             self._buffer(row)
@@ -808,7 +826,7 @@ class PlantPipeline:
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
             publications.extend(self._estimates(row, predictions, sds, scales, expected))
-        e = [whitener.update(residual) for whitener, residual in zip(self._whiteners, z, strict=True)]
+        e = innovations(self._numbers["whiteners"][0], z)
         self.rows_watched += 1
         self._quarantined = quarantined = self.signals.check_residuals(time_ns, e, scales, units, publications)
         if True in quarantined:
