@@ -11,6 +11,7 @@ from reactorwatch.description.find import find_process
 from reactorwatch.runtime.setting_rules import check_bounds
 from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.m_of_n import check_rule
+from reactorwatch.spc.value_chart import FEWEST_SIGNALS
 
 CHART_SETTINGS = [setting for chart in CHARTS for setting in chart.settings]
 
@@ -40,6 +41,15 @@ DEFAULT = find_process()
 
 DEFAULT_TRAINING_ROWS = 1000
 """Training where nothing is stated, of a process that has no duration of its own."""
+
+LARGEST_FALSE_ALARMS = 1e6
+"""Most false alarms in 30 days that can be asked for."""
+
+USUAL_CHARTS = ("shewhart", "ewma", "mewma")
+"""Charts where the settings name none."""
+
+CHARTS_OF_MANY = ("residual_space",)
+"""Charts where the settings name none, of many signals that no equations judge."""
 
 WITHOUT_EQUATIONS = ""
 """Setting `process` of a plant that no equations judge."""
@@ -100,7 +110,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             inputs no black box).
         process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
             nominal reactor where its signals are watched; empty: no equations judge.
-        charts: charts of the residuals.
+        charts: charts of the residuals and of the values; where none are named, `residual_space` for 8 signals or more
+            that no equations judge, else `shewhart`, `ewma` and `mewma`.
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
             nearest number that the charts can keep for the number of alarms and the sampling period.
         smallest_sd: least standard deviation of the residual by output, in its unit; smaller deviations do not matter.
@@ -139,8 +150,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     diagnose_training: bool = True
     reference: ReferenceName | Literal["process"] = "auto"
     process: str | None = None
-    charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
-    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None
+    charts: tuple[ChartName, ...] = USUAL_CHARTS
+    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=LARGEST_FALSE_ALARMS)] | None = None
     smallest_sd: dict[str, float] = msgspec.field(default_factory=lambda: dict(DEFAULT.watch.smallest_sd))
     isolation: bool = True
     isolation_rows: Annotated[int, msgspec.Meta(ge=50, le=10_000)] = 600
@@ -183,6 +194,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
                 f"training_min and training_rows both state the training, got {self.training_min:g} and "
                 f"{self.training_rows}; leave one out"
             )
+        if self.charts is USUAL_CHARTS or self.charts is CHARTS_OF_MANY:  # no others are named
+            are_many = len(self.signals) >= FEWEST_SIGNALS and not self._may_have_equations
+            msgspec.structs.force_setattr(self, "charts", CHARTS_OF_MANY if are_many else USUAL_CHARTS)
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
         if self.process is not None and self.outputs == DEFAULT_SIGNALS["outputs"]:
@@ -218,6 +232,12 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         if self.training_min is None and minutes is None:
             return TrainingLength(None, DEFAULT_TRAINING_ROWS)
         return TrainingLength(minutes if self.training_min is None else self.training_min)
+
+    @property
+    def _may_have_equations(self) -> bool:
+        if self.reference in ("black-box", "arx") or self.process == WITHOUT_EQUATIONS:
+            return False
+        return self.process is not None or self.is_default_process
 
     @property
     def is_default_process(self) -> bool:

@@ -21,6 +21,7 @@ NAMES = {
     "armax": "ARMAX",
     "bj": "Box-Jenkins model",
     "narx": "polynomial NARX",
+    "noe": "polynomial output-error",
 }
 
 

@@ -232,7 +232,8 @@ def replay(
 ) -> None:
     """Publish a recording or a record as the plant did, or verify a recording.
 
-    While it runs, `playback` pauses, resumes or steps it, or changes its rate.
+    While it runs, `playback` pauses, resumes or steps it, or changes its rate; in a terminal, so do the keys space,
+    right, up and down.
     """
     if verify:
         from reactorwatch.cli.verification import run
