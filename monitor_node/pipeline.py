@@ -637,6 +637,7 @@ class PlantPipeline:
         self._charts.start(trained.learned, trained.e, trained.values, self._arl0)
         self._shift.start(trained.responses, trained.z, trained.learned, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
+        self.signals.learn_spike_rates(trained.outliers, len(trained.e), self._sampling.period_ns, self._arl0)
         self._start_promise(trained, period_min)
         if not again:
             self.operation.end_training()
@@ -678,7 +679,7 @@ class PlantPipeline:
         return self._reference.model if isinstance(self._reference, ProcessReference) else None
 
     def _new_suspicion(self, reference: Reference) -> Suspicion | None:
-        if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.model)):
+        if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.equations)):
             return None
         return Suspicion(self._config, self._board, reference)
 
