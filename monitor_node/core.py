@@ -92,7 +92,8 @@ class Monitor:
         self.alarms = Annunciator(config)
         self.pipeline = self._new_pipeline(self.alarms)
         judged_by = self.pipeline.model
-        self._sample_units = make_sample_units(config.units, None if judged_by is None else judged_by.units)
+        self._sample_units = make_sample_units(config.units, {} if judged_by is None else judged_by.units)
+        self._plain_units: dict[str, str] = {}  # newest unit by signal that needs no conversion
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -115,10 +116,9 @@ class Monitor:
         if message.received_ns and now_ns - message.received_ns > self.stats.lag_ns:
             self.stats.lag_ns = now_ns - message.received_ns
         signal = self._signal_by_key.get(message.key)
-        if signal is None and message.key in self._label_keys:
-            return []
         if signal is None:
-            self.rejects.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
+            if message.key not in self._label_keys:
+                self.rejects.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
             return []
         if len(message.payload) > LARGEST_SAMPLE:
             self.rejects.add("too_large", f"{message.key}: {len(message.payload)} bytes are no Sample")
@@ -139,12 +139,15 @@ class Monitor:
         if quality not in USABLE or not abs(value) < LARGEST_VALUE:
             self.rejects.add(*reject_reason(signal, sample))
             return []
-        if self._sample_units is not None:
+        if unit != self._plain_units.get(signal):
             try:
-                value, unit = self._sample_units.convert(signal, unit, value)
+                value, converted = self._sample_units.convert(signal, unit, value)
             except InputError as error:
                 self.rejects.add("unit", str(error))
                 return []
+            if converted == unit:
+                self._plain_units[signal] = unit
+            unit = converted
         index = self._indices.get(signal)
         if index is None:
             self.pipeline.operation.on_sample(signal, sample.time_ns, value)

@@ -37,7 +37,7 @@ from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.health import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
-from monitor_node.ingest.sampling import SamplingPeriod, SamplingState
+from monitor_node.ingest.sampling import Interval, SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.operation import Operation
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
@@ -77,6 +77,10 @@ def check_promise(config: MonitorConfig, period_min: float) -> None:
     of_drift = outputs if ParameterT2.name in config.charts else 0
     alarms = count_chance_alarms(config) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
     false_alarm_budget.promise_per_30_days(config.false_alarms_per_30_days, alarms, period_min)
+
+
+STEPPED = (ProcessReference, BlackBoxReference)
+"""References whose rows the compiled step takes."""
 
 
 class PlantPipeline:
@@ -354,15 +358,13 @@ class PlantPipeline:
         if self._update.changes:
             self._change_model(time_ns, publications)
         interval = self._sampling.update(time_ns)
-        inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
-        follows = interval.follows and not row.restarted
-        measured = MeasuredRow(time_ns, inputs, values, units, interval, follows, publications)
-        if self.is_normal and not row.restarted and self._step_row(measured, row.values):
+        if self.is_normal and not row.restarted and self._step_row(row, units, interval, publications):
             return
         self._leave_normal()
         if row.restarted:
             self.operation.on_restart()
-        self.operation.inputs = inputs
+        measured = self._split_row(row, units, interval, publications)
+        self.operation.inputs = measured.inputs
         publications.extend(self.signals.check_row(time_ns, row.values))
         if self._is_process or self._config.bounds:
             usable = self.signals.mask_values(time_ns, row.values, publications)
@@ -742,20 +744,37 @@ class PlantPipeline:
             self._charts.store(self._numbers[0])
             self.is_normal = False
 
-    def _step_row(self, row: MeasuredRow, values: tuple[float, ...]) -> bool:
+    def _split_row(
+        self, row: Row, units: list[str], interval: Interval, publications: list[Publication]
+    ) -> MeasuredRow:
+        inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
+        follows = interval.follows and not row.restarted
+        return MeasuredRow(row.time_ns, inputs, values, units, interval, follows, publications)
+
+    def _step_row(self, row: Row, units: list[str], interval: Interval, publications: list[Publication]) -> bool:
         """Process a row by the compiled step; returns False if it is an event, for which nothing has changed."""
         assert self._step is not None
         assert self._kalman is not None
-        assert isinstance(self._reference, ProcessReference | BlackBoxReference)
+        reference = self._reference
+        assert isinstance(reference, STEPPED)
         time_ns, time_min = row.time_ns, row.time_ns / MINUTE_NS
-        self._row[:] = values
+        self._row[:] = values = row.values
         verdict = self._step.update(self._numbers, self._kalman, time_ns, time_min, self._row)
         if verdict == EVENT:
             return False
         if verdict == VIOLATING:
             self._charts.store_delays(self._numbers[0])
-        self._reference.accept_row(time_min, row.inputs)
+        reference.accept_row(time_min, values[: self._inputs])
         self.rows_watched += 1
+        if self._points or self._drift.wanted or self._shift.is_active:
+            self._publish_stages(self._split_row(row, units, interval, publications))
+        if self._suspicion is not None:
+            self._suspicion.add(time_min, values[: self._inputs], values[self._inputs :])
+        return True
+
+    def _publish_stages(self, row: MeasuredRow) -> None:
+        """Publish a row that the compiled step has taken, and pass it to the stages that the step does not have."""
+        assert self._step is not None
         if self._points:
             self._publish_step(row)
         before = len(row.publications)
@@ -764,14 +783,11 @@ class PlantPipeline:
             self._shift.update(row, self._step.work[0]["outputs"][3 * count : 4 * count].tolist(), points=self._points)
         if self._drift.wanted:
             self._buffer(row)
-            row.publications.extend(self._drift.update(time_ns, self._predictors))
-        self._count_alarms(time_ns, row.publications, before)
+            row.publications.extend(self._drift.update(row.time_ns, self._predictors))
+        self._count_alarms(row.time_ns, row.publications, before)
         if self._board.has_unexplained:  # a lasting step
             self._leave_normal()
             self._set_learning()
-        if self._suspicion is not None:
-            self._suspicion.add(time_min, row.inputs, row.values)
-        return True
 
     def _publish_step(self, row: MeasuredRow) -> None:
         assert self._step is not None
