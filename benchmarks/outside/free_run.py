@@ -18,7 +18,7 @@ from benchmarks.outside.command import run
 from benchmarks.outside.table import Row
 from reactorwatch.errors import InputError
 
-MODELS = ("arx", "oe", "armax", "bj", "narx")
+MODELS = ("arx", "oe", "armax", "bj", "narx", "noe")
 ORDERS = (1, 2, 3, 4)
 SETTLE = 50
 _UNCERTAIN = "[parameters]\n" + "".join(f"k{i} = {{ value = 3.0, sd = 1.5 }}\n" for i in (1, 2, 3, 4))

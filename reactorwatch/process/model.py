@@ -25,6 +25,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.process.places import Place
 
 if TYPE_CHECKING:
+    from reactorwatch.process.effect import Effect
     from reactorwatch.process.law import ExtendedLaw
 
 
@@ -142,6 +143,9 @@ class ProcessModel:
             shorter.
         places: where something unknown may act; empty: they follow from the equations (`process.places`).
         laws: laws of what was unknown, which are part of the equations already.
+        effects: effects of its own; None: those of the catalogue under its name.
+        uncertain: what a filter of this model estimates beside the states, see `kalman.uncertain_model`; no part of
+            the equations.
     """
 
     name: str
@@ -158,6 +162,8 @@ class ProcessModel:
     time_offset: ca.SX = field(default_factory=lambda: ca.SX(0))
     places: tuple[Place, ...] = ()
     laws: tuple["ExtendedLaw", ...] = ()
+    effects: tuple["Effect", ...] | None = None
+    uncertain: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.rhs) != len(self.states):
