@@ -45,10 +45,13 @@ class RowPrediction(NamedTuple):
     Attributes:
         prediction: predicted outputs in their units; NaN where there is none.
         sd: standard deviations of the residuals in the same units; 1 if unknown.
+        extrapolation: for tests that need every row, predictions with their standard deviations that include those
+            where the reference knows too little of the point of operation for charts; None: they are the same.
     """
 
     prediction: Sequence[float]
     sd: Sequence[float]
+    extrapolation: tuple[Sequence[float], Sequence[float]] | None = None
 
 
 class ProcessReferenceState(StoredState, frozen=True, tag="process"):
@@ -371,6 +374,8 @@ class ArxReference:
         self._sds = [1.0] * len(state.uses_inputs)
         self.predictions: list[float] = []
         """Predictions of the next row, one an output."""
+        self.extrapolation_sds: list[float] = []
+        """See `ArxPredictor.extrapolation_sd`, one an output."""
         self.beyond: list[int] = []
         """Indices of the inputs of the newest row that are beyond the training, for models that have them."""
         self._ranges = list(enumerate(zip(state.low, state.high, strict=True))) if True in state.uses_inputs else []
@@ -399,12 +404,14 @@ class ArxReference:
     def update(
         self, time_ns: int, inputs: Sequence[float], values: list[float], accept: tuple[bool, ...], missing: int = 0
     ) -> RowPrediction:
-        """See `Reference`. There is no prediction with an input beyond the training, nor after a missing row."""
+        """See `Reference`. Predictions with an input beyond the training are extrapolations."""
         self.beyond = [i for i, (low, high) in self._ranges if inputs[i] < low or inputs[i] > high]
+        extrapolation = self.predictions, self.extrapolation_sds
         if not self.beyond:
-            return RowPrediction(self.predictions, self._sds)
+            return RowPrediction(self.predictions, self._sds, extrapolation)
         pairs = zip(self.predictions, self.state.uses_inputs, strict=True)
-        return RowPrediction([nan if uses_inputs else prediction for prediction, uses_inputs in pairs], self._sds)
+        judged = [nan if uses_inputs else prediction for prediction, uses_inputs in pairs]
+        return RowPrediction(judged, self._sds, extrapolation)
 
     def restart(self) -> None:
         """Do nothing: the models restart by themselves."""

@@ -45,10 +45,13 @@ from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import Flags, SignalCheck
+from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, format_quantity, positive
+from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.spike_rate import SpikeRate, UsualSpikes, of_trainings
+from reactorwatch.spc.training_errors import TrainingErrors, two_sided_tail
 from reactorwatch.stored_state import StoredState
 
 NORMAL = 0.5
@@ -302,6 +305,14 @@ class SpikeCheck(SignalCheck):
         known = [[size for size in residuals if isfinite(size)] for residuals in e]
         self._spikes = [Spike(spike_limit(z, arl0)) if len(z) >= FEWEST_ROWS else None for z in known]
         self._set_limits()
+
+    def relative_rates(self, learned: Sequence[Prewhitening], arl0: float, errors: TrainingErrors) -> Array:
+        """See `SignalCheck`."""
+        scales = np.column_stack([errors.true_scale(i, item, 1.0) for i, item in enumerate(learned)])
+        shifts = scales * errors.mean / np.sqrt([float(item.rows) for item in learned])
+        return np.column_stack(
+            [arl0 * two_sided_tail(limit, shifts[:, i], scales[:, i]) for i, limit in enumerate(self.limits.tolist())]
+        )
 
     def _set_limits(self) -> None:
         for index, spike in enumerate(self._spikes):

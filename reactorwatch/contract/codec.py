@@ -27,6 +27,7 @@ MESSAGES: tuple[type[Message], ...] = (
     messages.AlarmKpis,
     messages.Reconstruction,
     messages.Baseline,
+    messages.Promise,
     messages.Health,
     messages.Fault,
     messages.Audit,
@@ -49,6 +50,7 @@ Body: TypeAlias = (
     | messages.AlarmKpis
     | messages.Reconstruction
     | messages.Baseline
+    | messages.Promise
     | messages.Health
     | messages.Fault
     | messages.Audit

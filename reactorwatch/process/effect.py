@@ -62,6 +62,7 @@ class Effect(ABC):
         labels: usual name with a given profile, by name of the profile, where it differs from `label`.
         is_discontinuous: whether the response jumps as the size changes, so that it has no derivative.
         delays_output: the output that the effect delays by m, if it does nothing else; None: no such effect.
+        is_traced: whether the monitor compares it with others after an alarm; if not, it is left to a diagnosis.
         is_source: whether it adds an unmodelled rate to a balance, which has a location but no physical meaning.
         constants: constants of its own; `add_constants` adds them to a model.
     """
@@ -80,6 +81,7 @@ class Effect(ABC):
     labels: ClassVar[dict[str, str]] = {}
     is_discontinuous: ClassVar[bool] = False
     delays_output: ClassVar[str | None] = None
+    is_traced: ClassVar[bool] = True
     is_source: ClassVar[bool] = False
     constants: ClassVar[tuple[EffectConstant, ...]] = ()
 

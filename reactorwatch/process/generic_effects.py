@@ -123,6 +123,11 @@ def generic_effects(model: ProcessModel) -> tuple[Effect, ...]:
     return (*effects, *(_of_state(item) for item in model.states if item.name not in model.at_rest))
 
 
+def is_generic(effect: Effect) -> bool:
+    """True if an effect was made from a model."""
+    return type(effect).__module__ == __name__
+
+
 def reference_point(model: ProcessModel) -> tuple[Array, Array]:
     """States and inputs inside their bounds, no two at the same share of their ranges."""
     count = len(model.states) + len(model.inputs)

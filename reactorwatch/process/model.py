@@ -25,6 +25,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.process.places import Place
 
 if TYPE_CHECKING:
+    from reactorwatch.process.effect import Effect
     from reactorwatch.process.law import ExtendedLaw
 
 
@@ -135,6 +136,7 @@ class ProcessModel:
         laws: laws of what was unknown, which are part of the equations already.
         uncertain: what a filter of this model estimates beside the states, see `kalman.uncertain_model`; no part of
             the equations.
+        effects: effects of its own; None: those of the catalogue under its name.
     """
 
     name: str
@@ -152,6 +154,7 @@ class ProcessModel:
     places: tuple[Place, ...] = ()
     laws: tuple["ExtendedLaw", ...] = ()
     uncertain: tuple[str, ...] = ()
+    effects: tuple["Effect", ...] | None = None
 
     def __post_init__(self) -> None:
         if len(self.rhs) != len(self.states):
