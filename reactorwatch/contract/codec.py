@@ -36,6 +36,7 @@ MESSAGES: tuple[type[Message], ...] = (
     messages.AlarmCommand,
     messages.ShelveAlarm,
     messages.ListAlarms,
+    messages.BaselineCommand,
     messages.ReplayCommand,
     messages.CommandReply,
 )
