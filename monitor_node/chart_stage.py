@@ -485,6 +485,12 @@ class ChartWatch:
 
         self._watch(restore_charts)
 
+    def restart(self) -> None:
+        """Forget the rows seen, in all charts."""
+        for watched in self._watched.values():
+            for index in range(len(watched.alarms)):
+                watched.charts.restart(index)
+
     def _watch(self, made: Callable[[type[Chart]], _Charts]) -> None:
         """Give the charts of each name their alarms and keys."""
         self._watched = {}

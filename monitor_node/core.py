@@ -7,11 +7,15 @@ follow from its samples and from operators' actions. So a replay reproduces them
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from google.protobuf.message import Message
+
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.alarms.commands import COMMANDS as ALARM_COMMANDS
 from monitor_node.alarms.commands import execute_command
+from monitor_node.baseline.commands import BASELINE, LIST
 from monitor_node.baseline.model_update import ScheduledChange
 from monitor_node.baseline.training import NO_VALUE
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
@@ -32,10 +36,14 @@ from monitor_node.state.monitor_state import MonitorState, learning_settings, op
 from monitor_node.training_check import check_training
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.messages_pb2 import Alarm, Baseline, CommandReply, Promise, Sample
+from reactorwatch.contract.commands import decode_command
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, BaselineCommand, CommandReply, Promise, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+
+COMMANDS: Mapping[str, type[Message]] = {**ALARM_COMMANDS, BASELINE: BaselineCommand}
+"""Message type by command."""
 
 
 class Monitor:
@@ -200,13 +208,25 @@ class Monitor:
         """Execute an operator's command at the time of the newest row, or refuse it."""
         self.received += 1
         try:
-            reply, publications = execute_command(self.alarms, question)
+            reply, publications = self._execute(question)
         except (InputError, DecodeError) as error:
             reason = error.reason if isinstance(error, DecodeError) else "command"
             self.rejects.add(reason, f"{question.key}: {error}")
             return CommandReply(accepted=False, text=str(error)), []
         self._published += len(publications)
         return reply, publications
+
+    def _execute(self, question: Encoded) -> tuple[CommandReply, list[Publication]]:
+        if question.key != keys.key(self.config.plant, keys.COMMAND, BASELINE):
+            return execute_command(self.alarms, question)
+        _, command = decode_command(question, COMMANDS)
+        assert isinstance(command, BaselineCommand), "the catalogue says so"
+        if command.what == LIST:
+            baselines = self.pipeline.baselines
+            return CommandReply(accepted=True, text=f"{len(baselines)} baselines", baselines=baselines), []
+        change = self.pipeline.schedule_command(command)
+        text = f"{change.what} by {change.by}, from the next row on"
+        return CommandReply(accepted=True, text=text), []
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Publish health if it is due; raise the alarm of a plant without data."""
@@ -380,7 +400,7 @@ class Monitor:
         """`waiting` for the first row, `training` or `watching`."""
         if self.first_ns is None:
             return "waiting"
-        return "training" if self._watching_since_ns is None else "watching"
+        return "watching" if self.pipeline.watching else "training"
 
     @property
     def model(self) -> ProcessModel | None:
