@@ -51,8 +51,8 @@ SMALLEST_SD = {"C": 2e-4, "T": 0.05}
 """Defaults for the reactor's outputs; other outputs have none."""
 
 
-LARGEST_FALSE_ALARMS = 1e6
-"""Most false alarms in 30 days that can be asked for."""
+LEAST_FALSE_ALARMS, LARGEST_FALSE_ALARMS = 1e-3, 1e6
+"""Fewest and most false alarms in 30 days that can be asked for."""
 
 WITHOUT_EQUATIONS = ""
 """Setting `process` of a plant that no equations judge."""
@@ -150,7 +150,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     reference: ReferenceName | Literal["process"] = "auto"
     process: str | None = None
     charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
-    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=LARGEST_FALSE_ALARMS)] | None = None
+    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=LEAST_FALSE_ALARMS, le=LARGEST_FALSE_ALARMS)] | None = (
+        None
+    )
     smallest_sd: dict[str, float] = msgspec.field(default_factory=SMALLEST_SD.copy)
     isolation: bool = True
     isolation_rows: Annotated[int, msgspec.Meta(ge=50, le=10_000)] = 600

@@ -225,6 +225,14 @@ class ArxPredictor:
             self._reference_model.checks.extend(checks)
         return residual
 
+    def bias_response(self, rows: int) -> Array:
+        """Residuals of the reference after a step of 1 in its output's measurement, shape (rows,)."""
+        response = np.ones(rows)
+        if self._reference is not None:
+            lags = min(self._structure.output_lags, rows - 1)
+            response[1:] -= np.cumsum(np.r_[self._reference[:lags], np.zeros(rows - 1 - lags)])
+        return response
+
     def _simplify(self, time_min: Array, inputs: Array, outputs: Array) -> None:
         """Change to the largest structure for which the rows of the training suffice; the present one if none is."""
         if _count_rows(self._structure, time_min, inputs, outputs) >= ROWS_A_PARAMETER * self._structure.parameters:

@@ -32,6 +32,7 @@ class TrainedState(StoredState, frozen=True):
         until_drift: number of rows until the next drift point.
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
         promise: state of the promise of false alarms; None: it was stored by a version without one.
+        power: deviations that would be seen, a serialized `Promise`; empty: not stated.
     """
 
     reference: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
@@ -46,6 +47,7 @@ class TrainedState(StoredState, frozen=True):
     until_drift: int
     baseline: bytes = b""
     promise: PromiseState | None = None
+    power: bytes = b""
 
 
 class PipelineState(StoredState, frozen=True):
