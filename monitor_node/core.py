@@ -56,6 +56,7 @@ class Monitor:
         model: process model, in minutes since 1970-01-01 UTC; None: the nominal reactor.
         diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`, and
             hands the result to `on_finding`.
+        power: True to state the deviations that would be seen; None: with points.
 
     Raises:
         InputError: the settings are inconsistent.
@@ -81,7 +82,9 @@ class Monitor:
         points: bool = True,
         model: ProcessModel | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
+        power: bool | None = None,
     ) -> None:
+        self._power = points if power is None else power
         self.config = config = order_inputs(config, model)
         self._points, self._model, self._diagnose = points, model, diagnose
         self._changes: deque[ScheduledChange] = deque()
@@ -568,6 +571,7 @@ class Monitor:
             changes=self._changes,
             diagnose=self._diagnose,
             check=check_training,
+            power=self._power,
         )
 
     def _contain(self, stage: str, error: Exception) -> None:

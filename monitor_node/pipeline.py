@@ -43,6 +43,7 @@ from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import Interval, SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.operation import Operation
+from monitor_node.power import Watch, state_power
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.shift_stage import NAME as SHIFT
 from monitor_node.shift_stage import ShiftWatch
@@ -67,13 +68,16 @@ from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening, innovations
-from reactorwatch.spc.training_errors import CONFIDENCE, TrainingErrors
+from reactorwatch.spc.training_errors import QUANTILE, TrainingErrors
 from reactorwatch.stored_state import unpack_numbers, unpack_times
 
 RAISED = Event.RAISED.value
 
 MOST_KEPT = 3
 """Baselines that can be restored; memory stays bounded."""
+
+TIMES_FEWEST = 2
+"""Times the fewest rows of a training that a part of it needs to judge the rest: with fewer it is too rough."""
 
 CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, TrainingState, str], TrainingCheck]
 """Judges a training by itself, see `training_check`."""
@@ -111,6 +115,7 @@ class PlantPipeline:
         changes: changes of the baseline to come.
         diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`.
         check: judges the training by itself; None: that is not done.
+        power: True to state the deviations that would be seen.
 
     Raises:
         InputError: the settings ask for a process model that does not fit the plant's signals.
@@ -139,11 +144,14 @@ class PlantPipeline:
         changes: deque[ScheduledChange] | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
         check: CheckTraining | None = None,
+        power: bool = False,
     ) -> None:
         self._config = config
-        self._check = check
+        self._check, self._states_power = check, power
+        self._watch: Watch | None = None
         self.promise: PlantPromise | None = None
         self._promised: Promise | None = None
+        self._units = [config.units.get(name, "") for name in config.outputs]
         self.alarm_rates = np.zeros(0)
         self._chance_names = {*(name for name, _ in alarm_names(config)), SHIFT, *SignalChecks.CHANCE_NAMES}
         self._promise_key = keys.key(config.plant, keys.PROMISE, NODE)
@@ -232,6 +240,7 @@ class PlantPipeline:
             self._shift.state,
             None if self.promise is None else self.promise.state,
             None if self._bank is None else self._bank.state,
+            b"" if self.promise is None else Promise(power=self.promise.power).SerializeToString(),
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -269,7 +278,8 @@ class PlantPipeline:
         if watched.baseline:
             self._update.baseline = Baseline.FromString(watched.baseline)
         self._drift.until_next = watched.until_drift
-        self.promise = None if watched.promise is None else PlantPromise(watched.promise)
+        if watched.promise is not None:
+            self.promise = PlantPromise(watched.promise, list(Promise.FromString(watched.power).power))
         self._checks = [Check(name=name, result=result) for name, result in watched.checks]
         learned = [item.learned for item in watched.whiteners]
         outputs = len(self._config.outputs)
@@ -396,6 +406,7 @@ class PlantPipeline:
         if self.is_normal and not row.restarted and self._step_row(row, units, interval, publications):
             return
         self._leave_normal()
+        self._units = units
         if row.restarted:
             self.operation.on_restart()
         measured = self._split_row(row, units, interval, publications)
@@ -480,8 +491,9 @@ class PlantPipeline:
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
-        if not self._training.is_enough([False] * len(self._config.outputs)):
-            raise InputError(f"there are only {self._training.rows} rows to learn from")
+        fewest = TIMES_FEWEST * self._training.fewest_rows
+        if self._training.rows < fewest or not self._training.is_enough([False] * len(self._config.outputs)):
+            raise InputError(f"must have at least {fewest} rows to be judged by, got {self._training.rows}")
         trained = self._training.finish(last_chance=True)
         if trained.refused:
             raise InputError(trained.refused)
@@ -603,7 +615,13 @@ class PlantPipeline:
             self.on_finding(self._diagnose(job))
 
     def _check_training(self, rows: TrainingState) -> None:
-        """Judge the training by itself; an error there leaves the promise without this check."""
+        """Judge the training by itself, and state the power; an error there leaves the promise without them."""
+        if self._watch is not None and self.promise is not None:
+            watch, self._watch = self._watch, None
+            try:
+                self.promise.power = state_power(watch, rows)
+            except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
+                self._failures.add("power", error, "the deviations that would be seen are not stated")
         if self._check is None or self.promise is None or self._reference is None:
             return
         model = self.equations if isinstance(self._reference, ProcessReference) else None
@@ -612,7 +630,7 @@ class PlantPipeline:
         except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
             self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
             return
-        self.promise = PlantPromise(replace(self.promise.state, check=check))
+        self.promise.state = replace(self.promise.state, check=check)
         if not self.promise.is_kept:
             self.notes.append(f"promise: {self.promise.text(self.rows_watched)}")
 
@@ -820,10 +838,21 @@ class PlantPipeline:
         rates += self._drift.chance_alarms(self._evaluated)
         self.alarm_rates = rates / arl0
         rows = false_alarm_budget.DAYS_MIN / period_min
-        mean, upper = rows * self._chance_alarms / arl0, rows * float(np.quantile(self.alarm_rates, CONFIDENCE))
+        mean, upper = rows * self._chance_alarms / arl0, rows * float(np.quantile(self.alarm_rates, QUANTILE))
         before = PromiseState(0.0, 0.0, rows) if self.promise is None else self.promise.state
         state = replace(before, per_30_days=mean, upper_per_30_days=max(mean, upper), rows_in_30_days=rows)
         self.promise = PlantPromise(replace(state, check=TrainingCheck()))
+        if self._states_power:
+            self._watch = Watch(
+                self._config,
+                trained.reference,
+                self._predictors,
+                trained.learned,
+                self._charts.detectors(trained.learned, trained.e, arl0),
+                self._evaluated,
+                dict(zip(self._config.outputs, self._units, strict=True)),
+                period_min,
+            )
 
     def _promise(self, asked: float | None, period_min: float, checks: list[Check]) -> float:
         """False alarms in 30 days that are promised; tests of steps are left out if they would make it impossible."""

@@ -194,4 +194,4 @@ def run(
 def _make_monitor(config: MonitorConfig, zero_ns: int, model: ProcessModel | None) -> Monitor:
     if model is None:
         config, model = load_process(config, zero_ns)
-    return Monitor(config, start_ns=0, points=False, model=model, diagnose=find_deviations)
+    return Monitor(config, start_ns=0, points=False, model=model, diagnose=find_deviations, power=True)

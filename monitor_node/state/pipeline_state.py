@@ -36,6 +36,7 @@ class TrainedState(StoredState, frozen=True):
         shift: tests for lasting steps, one an output; empty without them, and in states of earlier versions.
         promise: state of the promise of false alarms; None: it was stored by a version without one.
         bank: state of the fitted models' bank; None if there is none.
+        power: deviations that would be seen, a serialized `Promise`; empty: not stated.
     """
 
     reference: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
@@ -52,6 +53,7 @@ class TrainedState(StoredState, frozen=True):
     shift: list[StepTestState] = msgspec.field(default_factory=list)
     promise: PromiseState | None = None
     bank: ArxBankState | None = None
+    power: bytes = b""
 
 
 class KeptBaseline(StoredState, frozen=True):
