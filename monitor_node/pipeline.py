@@ -30,8 +30,8 @@ from monitor_node.baseline.references import (
 from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
-from monitor_node.chart_stage import ChartWatch, alarm_names
-from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig
+from monitor_node.chart_stage import ChartWatch, alarm_names, count_chance_alarms
+from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.health import NODE
@@ -41,6 +41,8 @@ from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.operation import Operation
 from monitor_node.power import Watch, state_power
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
+from monitor_node.shift_stage import NAME as SHIFT
+from monitor_node.shift_stage import ShiftWatch
 from monitor_node.signal_checks.stage import SignalChecks
 from monitor_node.state.monitor_state import equations_text
 from monitor_node.state.pipeline_state import PipelineState, TrainedState
@@ -48,7 +50,6 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Check, Estimate, ModelSnapshot, Parameter, Promise
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
@@ -77,7 +78,7 @@ def check_promise(config: MonitorConfig, period_min: float) -> None:
     """
     outputs = len(config.outputs)
     of_drift = outputs if ParameterT2.name in config.charts else 0
-    alarms = len(alarm_names(config)) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
+    alarms = count_chance_alarms(config) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
     false_alarm_budget.promise_per_30_days(config.false_alarms_per_30_days, alarms, period_min)
 
 
@@ -131,7 +132,12 @@ class PlantPipeline:
         self._promised: Promise | None = None
         self._units = [config.units.get(name, "") for name in config.outputs]
         self.alarm_rates = np.zeros(0)
-        self._chance_names = {*config.charts, *SignalChecks.CHANCE_NAMES}
+        self._chance_names = {
+            *(name for name, _ in alarm_names(config)),
+            *config.charts,
+            SHIFT,
+            *SignalChecks.CHANCE_NAMES,
+        }
         self._promise_key = keys.key(config.plant, keys.PROMISE, NODE)
         self._update = ModelUpdate(config, deque() if changes is None else changes)
         self._diagnose = diagnose
@@ -150,6 +156,7 @@ class PlantPipeline:
         self.operation = Operation(config, input_bounds(config, self.model), units)
         board.describe_operation = self._describe
         self._drift = DriftWatch(config, board, publish=points)
+        self._shift = ShiftWatch(config, board)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
@@ -207,6 +214,7 @@ class PlantPipeline:
             self.rows_watched,
             self._drift.until_next,
             b"" if self.baseline is None else self.baseline.SerializeToString(),
+            self._shift.state,
             None if self.promise is None else self.promise.state,
             b"" if self.promise is None else Promise(power=self.promise.power).SerializeToString(),
         )
@@ -250,6 +258,7 @@ class PlantPipeline:
             for i, item in enumerate(watched.whiteners)
         ]
         self._charts.restore(watched.charts, self._evaluated)
+        self._shift.restore(watched.shift)
         if (watched.suspicion is None) != (self._suspicion is None):
             raise ValueError("the state must tell of the search for causes as it is set")
         if self._suspicion is not None and watched.suspicion is not None:
@@ -467,6 +476,7 @@ class PlantPipeline:
         self._quarantined = (False,) * len(self._config.outputs)
         for whitener in self._whiteners:
             whitener.restart()
+        self._shift.restart()
         self.signals.restart()
         self.signals.reset()
 
@@ -535,7 +545,17 @@ class PlantPipeline:
     def _chance_alarms(self) -> int:
         """Number of alarms that can be false alarms."""
         of_signals = SignalChecks.CHANCE_ALARMS * sum(self._evaluated)
-        return self._charts.chance_alarms + of_signals + self._drift.chance_alarms(self._evaluated)
+        return (
+            self._charts.chance_alarms
+            + of_signals
+            + self._count_step_tests
+            + self._drift.chance_alarms(self._evaluated)
+        )
+
+    @property
+    def _count_step_tests(self) -> int:
+        """Number of tests of lasting steps, each of which chance can raise an alarm of."""
+        return sum(self._evaluated) if self._shift.is_active else 0
 
     def _start_diagnosis(self, rows: TrainingState) -> None:
         if self._config.diagnose_training and equations_text(self.model):
@@ -624,7 +644,8 @@ class PlantPipeline:
             again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
         """
         self._leave_out(trained.left_out)
-        unmade = self._charts.choose(self._evaluated, trained.e)
+        unmade = self._charts.choose(self._evaluated, trained.e, trained.values)
+        self._shift.is_active = trained.responses is not None
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
         )
@@ -643,8 +664,10 @@ class PlantPipeline:
         self._whiteners = [
             Prewhitener(item, self._numbers["whiteners"][0, i : i + 1]) for i, item in enumerate(trained.learned)
         ]
-        self._charts.start(trained.learned, trained.e, self._arl0)
+        self._charts.start(trained.learned, trained.e, trained.values, self._arl0)
+        self._shift.start(trained.responses, trained.z, trained.learned, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
+        self.signals.learn_spike_rates(trained.outliers, len(trained.e), self._sampling.period_ns, self._arl0)
         self._start_promise(trained, period_min)
         if not again:
             self.operation.end_training()
@@ -657,7 +680,7 @@ class PlantPipeline:
         errors, arl0 = TrainingErrors.draw(len(trained.learned)), self._arl0
         rates = self._charts.relative_rates(trained.learned, trained.e, arl0, errors)
         rates += self.signals.relative_rates(trained.learned, self._evaluated, arl0, errors)
-        rates += self._drift.chance_alarms(self._evaluated)
+        rates += self._drift.chance_alarms(self._evaluated) + self._count_step_tests
         self.alarm_rates = rates / arl0
         rows = false_alarm_budget.DAYS_MIN / period_min
         mean, upper = rows * self._chance_alarms / arl0, rows * float(np.quantile(self.alarm_rates, QUANTILE))
@@ -671,6 +694,7 @@ class PlantPipeline:
                 self._predictors,
                 trained.learned,
                 self._charts.detectors(trained.learned, trained.e, arl0),
+                self._shift.sensitivities,
                 self._evaluated,
                 dict(zip(self._config.outputs, self._units, strict=True)),
                 period_min,
@@ -697,7 +721,7 @@ class PlantPipeline:
         return self._reference.model if isinstance(self._reference, ProcessReference) else None
 
     def _new_suspicion(self, reference: Reference) -> Suspicion | None:
-        if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.model)):
+        if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.equations)):
             return None
         return Suspicion(self._config, self._board, reference)
 
@@ -760,11 +784,17 @@ class PlantPipeline:
         self.rows_watched += 1
         if self._points:
             self._publish_step(row)
+        before = len(row.publications)
+        if self._shift.is_active:
+            count = len(row.values)
+            self._shift.update(row, self._step.work[0]["outputs"][3 * count : 4 * count].tolist(), points=self._points)
         if self._drift.wanted:
             self._buffer(row)
-            before = len(row.publications)
             row.publications.extend(self._drift.update(time_ns, self._predictors))
-            self._count_alarms(time_ns, row.publications, before)
+        self._count_alarms(time_ns, row.publications, before)
+        if self._board.has_unexplained:  # a lasting step
+            self._leave_normal()
+            self._set_learning()
         if self._suspicion is not None:
             self._suspicion.add(time_min, row.inputs, row.values)
         return True
@@ -800,24 +830,29 @@ class PlantPipeline:
         values = row.values
         if isinstance(reference, ArxReference):
             reference.predictions = self._predict(row)
+            reference.extrapolation_sds = [predictor.extrapolation_sd for predictor in self._predictors]
         elif self._drift.wanted:
             self._buffer(row)
         if row.interval.is_gap:  # the input in it is unknown
             reference.restart()
             self.signals.restart()
+            self._shift.restart()
             for whitener in self._whiteners:
                 whitener.restart()
-        predictions, sds = reference.update(time_ns, row.inputs, values, self._quarantined, row.interval.missing)
+        predictions, sds, extrapolation = reference.update(
+            time_ns, row.inputs, values, self._quarantined, row.interval.missing
+        )
+        z = [(value - prediction) / sd for value, prediction, sd in zip(values, predictions, sds, strict=True)]
+        tested = z
+        if extrapolation is not None:
+            tested = [(value - known) / sd for value, known, sd in zip(values, *extrapolation, strict=True)]
         if isinstance(reference, ArxReference) and reference.beyond:
             self._note_inputs_beyond(reference.beyond)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
             publications.extend(self._estimates(row, predictions, sds, scales, expected))
-        e = [
-            whitener.update((value - prediction) / sd)
-            for whitener, value, prediction, sd in zip(self._whiteners, values, predictions, sds, strict=True)
-        ]
+        e = [whitener.update(residual) for whitener, residual in zip(self._whiteners, z, strict=True)]
         self.rows_watched += 1
         self._quarantined = quarantined = self.signals.check_residuals(time_ns, e, scales, units, publications)
         if True in quarantined:
@@ -825,17 +860,22 @@ class PlantPipeline:
                 if outlier:
                     whitener.reject_last()
         self._charts.update(row, e, quarantined, scales, points=self._points)
+        self._shift.update(row, tested, points=self._points)
         if self._drift.wanted:
             publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
             publications.extend(self._search_causes(row, stuck))
-        if isinstance(reference, BlackBoxReference):
-            reference.set_learning(not self._board.has_unexplained)
-            if reference.unjudged and reference.kind not in self._noted:
-                self._noted.add(reference.kind)
-                self.notes.append(
-                    "rows are not judged while inputs have values that the black box has not learned, and teach it"
-                )
+        self._set_learning()
+        if isinstance(reference, BlackBoxReference) and reference.unjudged and reference.kind not in self._noted:
+            self._noted.add(reference.kind)
+            self.notes.append(
+                "rows are not judged while inputs have values that the black box has not learned, and teach it"
+            )
+
+    def _set_learning(self) -> None:
+        """Let a black box learn while no alarm without a known cause is active."""
+        if isinstance(self._reference, BlackBoxReference):
+            self._reference.set_learning(not self._board.has_unexplained)
 
     def _note_inputs_beyond(self, indices: list[int]) -> None:
         """Note once each input that leaves its range in the training, as rows are not judged then."""
@@ -887,7 +927,7 @@ def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | 
     """Process model for the plant, as the settings ask for it."""
     if config.reference in ("black-box", "arx") or (model is None and config.process == WITHOUT_EQUATIONS):
         return None
-    given, model = model is not None, model or cstr()
+    given, model = model is not None, model or DEFAULT.require_model()
     fits = config.inputs == model.input_names and set(config.outputs) <= set(model.output_names)
     if fits:
         return model

@@ -21,6 +21,9 @@ from reactorwatch.identification.black_box.model import BlackBoxModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
 
+SETTLING_ROWS = 50
+"""Rows at the means before a step response."""
+
 COPY_ROWS = 250
 """Rows between two copies of the parameters."""
 
@@ -227,7 +230,7 @@ class BlackBoxReference:
     def update(
         self, time_ns: int, inputs: Sequence[float], values: list[float], accept: tuple[bool, ...], missing: int = 0
     ) -> RowPrediction:
-        """See `Reference`. There is no prediction where the model knows too little, nor just after a missing row."""
+        """See `Reference`. There is no prediction just after a missing row."""
         time_min, before = time_ns / MINUTE_NS, self._time_min
         if before is None or abs(time_min - before - self.period_min) > TOLERANCE * self.period_min:
             self._filter.restart()
@@ -236,12 +239,46 @@ class BlackBoxReference:
         predicted = self._filter.update(inputs, measured, limits)
         self.accept_row(time_min, tuple(inputs))
         prediction, sd = [nan] * self._count, [1.0] * self._count
-        if predicted is not None and predicted.judged:
-            for i, output in enumerate(self._outputs):
-                prediction[output], sd[output] = predicted.prediction[i], predicted.sd[i]
-        elif predicted is not None:
-            self.unjudged += 1
-        return RowPrediction(prediction, sd)
+        if predicted is None:
+            return RowPrediction(prediction, sd)
+        for i, output in enumerate(self._outputs):
+            prediction[output], sd[output] = predicted.prediction[i], predicted.sd[i]
+        if predicted.judged:
+            return RowPrediction(prediction, sd)
+        self.unjudged += 1
+        return RowPrediction([nan] * self._count, sd, (prediction, sd))
+
+    def step_responses(self, rows: int) -> Array:
+        """Response of each output's normalised residual to a lasting step of one unit, shape (outputs, rows).
+
+        The difference of two runs of the filter from its present state, with the inputs and outputs at their means.
+        NaN for an output that is not predicted.
+
+        Args:
+            rows: number of rows from the onset on.
+        """
+        responses = np.full((self._count, rows), nan)
+        centres = np.array(self.model.centres)
+        steps = self.model.error_sd
+        without = self._normalised_residuals(np.tile(centres, (rows, 1)))
+        for i, output in enumerate(self._outputs):
+            stepped = np.tile(centres, (rows, 1))
+            stepped[:, i] += steps[i]
+            responses[output] = (self._normalised_residuals(stepped) - without)[:, i] / steps[i]
+        return responses
+
+    def _normalised_residuals(self, values: Array) -> Array:
+        """Normalised residuals of rows (outputs, then inputs) that follow some at the means, shape (rows, outputs)."""
+        model, p = self.model, len(self._outputs)
+        copy = BlackBoxFilter(model)
+        copy.limit_sd, copy.state = self._filter.limit_sd, self._filter.state
+        limits, residuals = [inf] * p, []
+        for row in [*[list(model.centres)] * SETTLING_ROWS, *values.tolist()]:
+            predicted = copy.update(row[p:], row[:p], limits)
+            residuals.append(
+                np.full(p, nan) if predicted is None else np.subtract(row[:p], predicted.prediction) / predicted.sd
+            )
+        return np.array(residuals[SETTLING_ROWS:])
 
     def restart(self) -> None:
         """See `Reference`."""

@@ -14,7 +14,7 @@ Snapshots are in the signals' own units.
 """
 
 from collections.abc import Iterator, Sequence
-from math import inf, isfinite, nan
+from math import inf, isfinite, nan, sqrt
 
 import numpy as np
 from msgspec.structs import replace
@@ -66,6 +66,8 @@ class PredictorState(StoredState, frozen=True):
         told: snapshot of the reference, a serialized `ModelSnapshot`; None without snapshots.
         drift: chart of the models' difference; None without one.
         drifted: newest point of that chart.
+        ranges: smallest and largest value of each input of the reference's regressor in the training, scaled; doubles.
+            Empty before the fit, and in states of earlier versions.
     """
 
     buffer: BufferState
@@ -76,6 +78,7 @@ class PredictorState(StoredState, frozen=True):
     told: bytes | None
     drift: ParameterState | None
     drifted: Judgement | None
+    ranges: bytes = b""
 
 
 class ArxPredictor:
@@ -95,6 +98,10 @@ class ArxPredictor:
         self._fitted: Rows | None = None
         self._drift: ParameterT2 | None = None
         self._newest_drift: Judgement | None = None
+        self._ranges: Array | None = None
+        self.extrapolation_sd = 1.0
+        """Standard deviation of the newest residual as a multiple of the usual one: what inputs beyond their range in
+        the training add to the prediction counts as uncertain as it is large."""
 
     def _start(self, structure: Structure) -> None:
         """Start the adaptive model, and the scaling, with the next row."""
@@ -138,6 +145,7 @@ class ArxPredictor:
             None if self._reference_model is None else self._reference_model.SerializeToString(),
             None if self._drift is None else self._drift.state,
             self._newest_drift,
+            b"" if self._ranges is None else pack_numbers(self._ranges),
         )
 
     def restore(self, state: PredictorState) -> None:
@@ -160,6 +168,8 @@ class ArxPredictor:
             self._reference_model = ModelSnapshot.FromString(state.told)
         self._drift = None if state.drift is None else ParameterT2.from_state(state.drift)
         self._newest_drift = state.drifted
+        if state.ranges:
+            self._ranges = unpack_numbers(state.ranges, len(state.ranges) // 16)
 
     def update(self, time_ns: int, inputs: Sequence[float], value: float, *, follows: bool) -> float:
         """Update with a row; returns the prediction made before it, NaN if there is none.
@@ -186,6 +196,7 @@ class ArxPredictor:
         innovation = self._rls.update(regressor, scaled)
         if self._reference is not None:
             self._compare(regressor)
+            self.extrapolation_sd = self._extrapolation_sd(regressor)
             return centre + spread * float(self._reference @ regressor)
         return centre + spread * innovation.prediction
 
@@ -216,6 +227,8 @@ class ArxPredictor:
         in_sample = np.sqrt((len(y) - parameters) / (len(y) + parameters))
         residual[rows.position] = spread * (y - rows.regressors @ theta) / in_sample
         self._reference, self._fitted = theta, rows
+        given = rows.regressors[:, self._inputs]
+        self._ranges = np.array([given.min(axis=0), given.max(axis=0)]) if given.shape[1] else None
         if self._with_snapshots:
             covariance = _covariance(rows.regressors, y, theta)
             singular = np.linalg.svd(rows.regressors, compute_uv=False)
@@ -225,12 +238,35 @@ class ArxPredictor:
             self._reference_model.checks.extend(checks)
         return residual
 
-    def bias_response(self, rows: int) -> Array:
-        """Residuals of the reference after a step of 1 in its output's measurement, shape (rows,)."""
-        response = np.ones(rows)
-        if self._reference is not None:
-            lags = min(self._structure.output_lags, rows - 1)
-            response[1:] -= np.cumsum(np.r_[self._reference[:lags], np.zeros(rows - 1 - lags)])
+    @property
+    def _inputs(self) -> slice:
+        """Inputs in a regressor."""
+        first = self._structure.output_lags
+        return slice(first, first + self._structure.input_lags * self._structure.inputs)
+
+    def _extrapolation_sd(self, regressor: Array) -> float:
+        if self._ranges is None or self._reference is None:
+            return 1.0
+        given = regressor[self._inputs]
+        beyond = given - np.clip(given, *self._ranges)
+        if not beyond.any():
+            return 1.0
+        added = float(self._reference[self._inputs] @ beyond)
+        return sqrt(1.0 + added * added / max(self._rls.noise_variance, 1e-30))
+
+    def step_response(self, rows: int) -> Array:
+        """Response of the reference's residual to a lasting step of one unit of the output, shape (rows,).
+
+        NaN without a reference.
+
+        Args:
+            rows: number of rows from the onset on.
+        """
+        if self._reference is None:
+            return np.full(rows, nan)
+        response, lags = np.ones(rows), self._structure.output_lags
+        for lag, coefficient in enumerate(self._reference[:lags].tolist(), start=1):
+            response[lag:] -= coefficient
         return response
 
     def _simplify(self, time_min: Array, inputs: Array, outputs: Array) -> None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
 from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_structure, fewest_rows
-from monitor_node.baseline.references import ArxReference, ProcessReference, Reference, estimate_training_noise
+from monitor_node.baseline.references import ArxReference, ProcessReference, Reference
 from monitor_node.baseline.resolution import resolution_sd
 from monitor_node.baseline.signal_range import possible_ranges
 from monitor_node.config import MonitorConfig
@@ -32,6 +32,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.prewhitening import Prewhitening, learn
+from reactorwatch.spc.step_test import ROWS as STEP_ROWS
 from reactorwatch.stored_state import StoredState, pack_numbers, pack_times, unpack_numbers, unpack_times
 
 Array = NDArray[np.float64]
@@ -75,20 +76,30 @@ class TrainingResult(NamedTuple):
     Attributes:
         reference: reference for the rows to come.
         learned: prewhitening of its residuals, one an output.
-        e: prewhitened residuals, shape (n, outputs); NaN if missing.
+        z: residuals as the reference normalises them, shape (n, outputs); NaN if missing.
+        e: the same, prewhitened.
         measured: outputs in undisturbed rows, shape (n, outputs); NaN elsewhere.
+        values: all signals, the inputs first, shape (n, inputs + outputs); NaN where disturbed or left out. Unlike
+            `measured` it has rows that could not be predicted.
         checks: checks of the training.
         refused: reason to start again; empty if the training is usable.
         left_out: signals that cannot be monitored, with the reason.
+        responses: response of each residual to a lasting step of one unit of its output, shape (outputs, rows); NaN
+            where there is no model; None for equations.
+        outliers: number of single values of each output that were left out.
     """
 
     reference: Reference
     learned: list[Prewhitening]
+    z: Array
     e: Array
     measured: Array
+    values: Array
     checks: list[Check]
     refused: str
     left_out: dict[str, str]
+    responses: Array | None
+    outliers: list[int]
 
 
 MOST_OUT_OF_RANGE = 1.0 / 3.0
@@ -216,8 +227,9 @@ class Training:
             _refusal(outputs, screenings, evaluated) if any(evaluated) else "; ".join(dict.fromkeys(left_out.values()))
         )
         if refused and last_chance and any(evaluated):
-            refused, screenings = "", [Screening(np.isfinite(column), [], [], 0) for column in z.T]
+            refused, screenings = "", [Screening(known, [], [], 0, np.zeros_like(known)) for known in np.isfinite(z).T]
         usable = np.column_stack([item.usable for item in screenings]) & np.array(evaluated)
+        disturbed = np.column_stack([item.left_out for item in screenings]) | ~np.array(evaluated)
         z = np.where(usable, z, np.nan)
         if isinstance(reference, ProcessReference | BlackBoxReference):
             smallest = [sd / typical for sd, typical in zip(smallest, reference.typical_sd, strict=True)]
@@ -238,7 +250,20 @@ class Training:
         if isinstance(reference, ArxReference):
             checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
-        return TrainingResult(reference, learned, e, np.where(usable, measured, np.nan), checks, refused, left_out)
+        inputs = np.where([name not in left_out for name in self._config.inputs], inputs, np.nan)
+        values = np.hstack([inputs, np.where(disturbed, np.nan, measured)])
+        measured = np.where(usable, measured, np.nan)
+        responses, outliers = self._step_responses(reference), [item.outliers for item in screenings]
+        return TrainingResult(
+            reference, learned, z, e, measured, values, checks, refused, left_out, responses, outliers
+        )
+
+    def _step_responses(self, reference: Reference) -> Array | None:
+        if isinstance(reference, BlackBoxReference):
+            return reference.step_responses(STEP_ROWS)
+        if isinstance(reference, ArxReference):
+            return np.array([predictor.step_response(STEP_ROWS) for predictor in self._predictors])
+        return None
 
     def _simplifications(self, evaluated: list[bool]) -> list[str]:
         """Terms that the identified models lack, each with the outputs."""
@@ -346,8 +371,7 @@ class Training:
     ) -> ProcessReference:
         outputs = self._config.outputs
         assert self._model is not None
-        noise = estimate_training_noise(self._model, outputs, time_min, inputs, measured, smallest)
-        return ProcessReference(self._model, outputs, noise)
+        return ProcessReference.fit(self._model, outputs, time_min, inputs, measured, smallest)
 
 
 def _refit_without_outliers(residuals: Callable[[Array], Residuals], measured: Array) -> tuple[Array, list[Screening]]:

@@ -139,6 +139,12 @@ class SignalChecks:
         of_checks = (check.relative_rates(learned, arl0, errors) for check in self._checks if check.can_be_false)
         return sum((rates[:, list(evaluated)].sum(axis=1) for rates in of_checks), np.zeros(len(errors.mean)))
 
+    def learn_spike_rates(self, counts: Sequence[int], rows: int, period_ns: float, arl0: float) -> None:
+        """Learn how often spikes are usual; arguments as for `SpikeCheck.learn_rates`."""
+        for check in self._checks:
+            if isinstance(check, SpikeCheck):
+                check.learn_rates(counts, rows, period_ns, arl0)
+
     # --- state -----------------------------------------------------------------------------------------------
 
     @property

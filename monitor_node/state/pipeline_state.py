@@ -13,6 +13,7 @@ from monitor_node.isolation.stage import SuspicionState
 from monitor_node.operation import CarriedState
 from monitor_node.signal_checks.stage import SignalChecksState
 from reactorwatch.spc.prewhitening import PrewhitenerState
+from reactorwatch.spc.step_test import StepTestState
 from reactorwatch.stored_state import StoredState
 
 
@@ -31,6 +32,7 @@ class TrainedState(StoredState, frozen=True):
         rows_watched: number of evaluated rows.
         until_drift: number of rows until the next drift point.
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
+        shift: tests for lasting steps, one an output; empty without them, and in states of earlier versions.
         promise: state of the promise of false alarms; None: it was stored by a version without one.
         power: deviations that would be seen, a serialized `Promise`; empty: not stated.
     """
@@ -46,6 +48,7 @@ class TrainedState(StoredState, frozen=True):
     rows_watched: int
     until_drift: int
     baseline: bytes = b""
+    shift: list[StepTestState] = msgspec.field(default_factory=list)
     promise: PromiseState | None = None
     power: bytes = b""
 

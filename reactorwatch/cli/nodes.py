@@ -296,8 +296,9 @@ def alive(
 ) -> None:
     """Check that a node is alive: ends with 0 or 1."""
     from reactorwatch.cli.liveliness import wait_for_node
+    from reactorwatch.contract.keys import DEFAULT_PLANT
 
     _, bus = _settings(config, endpoint, quiet=True)
-    there = wait_for_node(bus, name or "cstr", node, timeout)
+    there = wait_for_node(bus, name or DEFAULT_PLANT, node, timeout)
     print_lines(f"{node} is {'alive' if there else f'not there within {timeout:g} s'}")
     raise typer.Exit(0 if there else 1)

@@ -12,6 +12,9 @@ from typing import NamedTuple
 ROOT = "reactor"
 EVERYTHING = f"{ROOT}/**"
 
+DEFAULT_PLANT = "cstr"
+"""Name of a plant where none is stated."""
+
 SAMPLE = "sample"
 ESTIMATE = "estimate"
 MODEL = "model"

@@ -306,7 +306,7 @@ def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out
     if fitted.rows <= least:
         raise InputError(
             f"order {form.order} with delay {form.delay} needs more than {least} rows to fit, the first half of the "
-            f"record unless another validates, got {fitted.rows}"
+            f"record unless another validates, got {fitted.rows}; lower the order, or record for longer"
         )
     if settle < 0:
         raise InputError(f"settle must be at least 0 rows, got {settle}")

@@ -1,0 +1,207 @@
+"""Lasting steps of a measurement, which one-step predictions follow: found within 20 rows, and what chance raises.
+
+Records of simulated heat exchangers with one input and one output, a row a second: a liquid that is heated by
+condensing steam, its flow a staircase of random levels. Five cells and the wall's heat capacity, a heat transfer that
+grows with the flow, a dead time, a steam temperature that wanders, noise and resolution of the sensor. The plants
+differ in all of these.
+
+    python -m benchmarks.exchanger [--plants N] [--sizes 0.5,1,2] [--reference auto,arx,black-box]
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig, ReferenceName
+from monitor_node.core import Monitor
+from monitor_node.ingest.alignment import Row
+from reactorwatch.arrays import Array
+from reactorwatch.contract.messages_pb2 import Alarm
+
+ROWS, TRAINING = 4000, 1000
+CELLS, SUBSTEPS = 5, 4
+FOUND_ROWS = 20
+SECOND_NS = 10**9
+PLANT = "exchanger"
+
+
+@dataclass(frozen=True)
+class Exchanger:
+    """Constants of an exchanger.
+
+    Attributes:
+        transit_s: time in which the liquid passes, at the flow 1.
+        wall_s: time constant of the wall.
+        transfer: number of transfer units at the flow 1.
+        exponent: exponent of the flow in the heat transfer.
+        dead_s: dead time of the valve.
+        hold_s: shortest and longest time between two moves of the flow.
+        wander: standard deviation of the steam temperature, K; its time constant is 100 s.
+        noise: standard deviation of the sensor's noise, K.
+        resolution: step of its readings, K.
+    """
+
+    transit_s: float = 12.0
+    wall_s: float = 6.0
+    transfer: float = 3.2
+    exponent: float = 0.6
+    dead_s: int = 2
+    hold_s: tuple[int, int] = (5, 60)
+    wander: float = 0.4
+    noise: float = 0.08
+    resolution: float = 0.001
+
+
+def random_exchanger(rng: np.random.Generator) -> Exchanger:
+    """Exchanger of random constants."""
+    return Exchanger(
+        transit_s=rng.uniform(6.0, 25.0),
+        wall_s=rng.uniform(3.0, 12.0),
+        transfer=rng.uniform(2.8, 3.6),
+        exponent=rng.uniform(0.4, 0.8),
+        dead_s=int(rng.integers(0, 4)),
+        wander=rng.uniform(0.1, 0.8),
+        noise=rng.uniform(0.02, 0.15),
+        resolution=float(rng.choice([0.001, 0.01, 0.05])),
+    )
+
+
+def simulate(plant: Exchanger, rows: int, rng: np.random.Generator, calm: int = 0) -> tuple[Array, Array]:
+    """Simulate an exchanger; returns its flow and the measured temperature at the outlet, degC.
+
+    Args:
+        plant: constants.
+        rows: number of rows.
+        rng: source of random numbers.
+        calm: number of rows, from the first one, in which the flow moves less.
+    """
+    holds = rng.integers(*plant.hold_s, rows)
+    flow = np.repeat(rng.uniform(0.65, 1.5, rows), holds)[: rows + plant.dead_s]
+    flow[:calm] = 1.0 + 0.4 * (flow[:calm] - 1.0)
+    wander, steam = 0.0, np.empty(rows)
+    keep = np.exp(-1.0 / 100.0)
+    for k, shock in enumerate(rng.standard_normal(rows)):
+        wander = keep * wander + np.sqrt(1.0 - keep**2) * plant.wander * shock
+        steam[k] = 104.0 + wander
+    cells, wall = np.full(CELLS, 95.0), np.full(CELLS, 100.0)
+    outlet, step = np.empty(rows), 1.0 / SUBSTEPS
+    for k in range(rows):
+        outlet[k] = cells[-1]
+        q = flow[k]
+        inward = plant.transfer * q**plant.exponent / plant.transit_s
+        for _ in range(SUBSTEPS):
+            before = np.concatenate([[25.0], cells[:-1]])
+            cells = cells + step * (CELLS * q / plant.transit_s * (before - cells) + inward * (wall - cells))
+            wall = wall + step * ((steam[k] - wall) - 0.05 * (wall - cells)) / plant.wall_s
+    measured = outlet + plant.noise * rng.standard_normal(rows)
+    return flow[plant.dead_s :][:rows], np.round(measured / plant.resolution) * plant.resolution
+
+
+def config_of(reference: ReferenceName, per_30_days: float | None = None) -> MonitorConfig:
+    """Settings of a monitor of an exchanger."""
+    return MonitorConfig(
+        plant=PLANT,
+        inputs=("q",),
+        outputs=("th",),
+        process=WITHOUT_EQUATIONS,
+        reference=reference,
+        training_rows=TRAINING,
+        false_alarms_per_30_days=per_30_days,
+    )
+
+
+@dataclass
+class Result:
+    """Results of a plant.
+
+    Attributes:
+        reference: kind of the reference.
+        false_alarms: alarms of the sound record, by name.
+        delays: for each size of a step, the delays of its alarms in rows; None: none within `FOUND_ROWS`.
+        missed: for each size, the onsets whose steps were missed.
+        unjudged: rows that were not judged.
+    """
+
+    reference: str
+    false_alarms: list[str]
+    delays: dict[float, list[int | None]]
+    missed: dict[float, list[int]]
+    unjudged: int
+
+
+def watch(flow: Array, measured: Array, config: MonitorConfig, sizes: Sequence[float], onsets: Sequence[int]) -> Result:
+    """Watch a sound record, and from each onset on also with a step of each size in the measurement."""
+    monitor, alarms, copies, rows = Monitor(config, 0, points=False), [], {}, []
+    for k, values in enumerate(zip(flow.tolist(), measured.tolist(), strict=True)):
+        rows.append(values)
+        if k in onsets:
+            copies[k] = monitor.to_bytes()
+        alarms += [f"{name}@{k}" for name in _take_row(monitor, k, values)]
+    result = Result(monitor.reference, alarms, {}, {}, monitor.unjudged_rows)
+    for size in sizes:
+        delays = result.delays[size] = []
+        result.missed[size] = []
+        for onset, state in copies.items():
+            stepped = Monitor(config, 0, points=False)
+            stepped.from_bytes(state)
+            stepped.on_history_end()
+            before = stepped.alarms.has_unexplained
+            found = None
+            for k in range(onset, min(onset + FOUND_ROWS, len(rows))):
+                if _take_row(stepped, k, (rows[k][0], rows[k][1] + size)):
+                    found = k - onset + 1
+                    break
+            if not before:
+                delays.append(found)
+            if found is None and not before:
+                result.missed[size].append(onset)
+    return result
+
+
+def _take_row(monitor: Monitor, row: int, values: tuple[float, float]) -> list[str]:
+    """Process a row; returns the alarms that it raises, but for spikes."""
+    publications = monitor.on_rows([Row(row * SECOND_NS, values, False)])
+    raised = [
+        item.message for item in publications if isinstance(item.message, Alarm) and item.message.event == "raised"
+    ]
+    return [alarm.alarm for alarm in raised if not alarm.alarm.startswith("spike/")]
+
+
+def main() -> None:
+    """Run the benchmark and print its table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--plants", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--sizes", default="0.5,1,2,-2")
+    parser.add_argument("--onsets", type=int, default=20)
+    parser.add_argument("--reference", default="auto,arx,black-box")
+    parser.add_argument("--verbose", action="store_true")
+    chosen = parser.parse_args()
+    sizes = [float(size) for size in chosen.sizes.split(",")]
+    for reference in chosen.reference.split(","):
+        found: dict[float, list[int | None]] = {size: [] for size in sizes}
+        false_alarms = 0
+        for seed in range(chosen.first, chosen.first + chosen.plants):
+            rng = np.random.default_rng(seed)
+            flow, measured = simulate(random_exchanger(rng), ROWS, rng)
+            onsets = sorted(rng.integers(TRAINING + 100, ROWS - FOUND_ROWS, chosen.onsets).tolist())
+            result = watch(flow, measured, config_of(reference), sizes, onsets)
+            false_alarms += len(result.false_alarms)
+            for size in sizes:
+                found[size] += result.delays[size]
+            if chosen.verbose:
+                print(seed, result.reference, result.false_alarms, result.unjudged, result.missed, flush=True)
+        print(f"{reference}: {false_alarms} alarms of {chosen.plants} sound records of {ROWS} rows")
+        for size in sizes:
+            seen = [delay for delay in found[size] if delay is not None]
+            median = np.median(seen) if seen else np.nan
+            print(
+                f"  {size:+.2g} K: {len(seen)} of {len(found[size])} within {FOUND_ROWS} rows, median {median:.0f}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
