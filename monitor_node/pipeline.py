@@ -153,7 +153,12 @@ class PlantPipeline:
         self._promised: Promise | None = None
         self._units = [config.units.get(name, "") for name in config.outputs]
         self.alarm_rates = np.zeros(0)
-        self._chance_names = {*(name for name, _ in alarm_names(config)), SHIFT, *SignalChecks.CHANCE_NAMES}
+        self._chance_names = {
+            *(name for name, _ in alarm_names(config)),
+            *config.charts,
+            SHIFT,
+            *SignalChecks.CHANCE_NAMES,
+        }
         self._promise_key = keys.key(config.plant, keys.PROMISE, NODE)
         self._update = ModelUpdate(config, deque() if changes is None else changes)
         self._diagnose = diagnose
@@ -605,8 +610,17 @@ class PlantPipeline:
     def _chance_alarms(self) -> int:
         """Number of alarms that can be false alarms."""
         of_signals = SignalChecks.CHANCE_ALARMS * sum(self._evaluated)
-        of_steps = sum(self._evaluated) if self._shift.is_active else 0
-        return self._charts.chance_alarms + of_signals + of_steps + self._drift.chance_alarms(self._evaluated)
+        return (
+            self._charts.chance_alarms
+            + of_signals
+            + self._count_step_tests
+            + self._drift.chance_alarms(self._evaluated)
+        )
+
+    @property
+    def _count_step_tests(self) -> int:
+        """Number of tests of lasting steps, each of which chance can raise an alarm of."""
+        return sum(self._evaluated) if self._shift.is_active else 0
 
     def _start_diagnosis(self, rows: TrainingState) -> None:
         if self._config.diagnose_training and equations_text(self.model):
@@ -835,7 +849,7 @@ class PlantPipeline:
         errors, arl0 = TrainingErrors.draw(len(trained.learned)), self._arl0
         rates = self._charts.relative_rates(trained.learned, trained.e, trained.values, arl0, errors)
         rates += self.signals.relative_rates(trained.learned, self._evaluated, arl0, errors)
-        rates += self._drift.chance_alarms(self._evaluated)
+        rates += self._drift.chance_alarms(self._evaluated) + self._count_step_tests
         self.alarm_rates = rates / arl0
         rows = false_alarm_budget.DAYS_MIN / period_min
         mean, upper = rows * self._chance_alarms / arl0, rows * float(np.quantile(self.alarm_rates, QUANTILE))
@@ -849,6 +863,7 @@ class PlantPipeline:
                 self._predictors,
                 trained.learned,
                 self._charts.detectors(trained.learned, trained.e, arl0),
+                self._shift.sensitivities,
                 self._evaluated,
                 dict(zip(self._config.outputs, self._units, strict=True)),
                 period_min,

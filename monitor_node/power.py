@@ -78,6 +78,8 @@ class Watch(NamedTuple):
         predictors: identified models, one an output.
         learned: prewhitening of each output.
         detectors: the charts.
+        steps: statistic of each output's test of lasting steps after a step of one unit, and its limit; empty without
+            tests.
         evaluated: for each output, True if it is evaluated.
         units: units by output.
         period_min: sampling period.
@@ -88,6 +90,7 @@ class Watch(NamedTuple):
     predictors: Sequence[ArxPredictor]
     learned: Sequence[Prewhitening]
     detectors: Sequence[Detector]
+    steps: Sequence[tuple[float, float]]
     evaluated: Sequence[bool]
     units: dict[str, str]
     period_min: float
@@ -105,13 +108,32 @@ def state_power(watch: Watch, rows: TrainingState) -> list[Power]:
         return []
     paths = np.stack([item.path for item in deviations])
     horizons = [minutes / watch.period_min for minutes in HORIZONS_MIN]
+    stepped, tests = _add_step_tests(watch, [item.name for item in deviations], paths)
+    steps = smallest_sizes(stepped, [*watch.detectors, *tests], horizons, 0.0)
+    ramps = smallest_sizes(paths, watch.detectors, horizons, horizons[-1])
     return [
         _message(item, profile, sizes)
-        for profile, ramp_rows in (("", 0.0), (RAMP, horizons[-1]))
-        for item, sizes in zip(
-            deviations, smallest_sizes(paths, watch.detectors, horizons, ramp_rows).tolist(), strict=True
-        )
+        for profile, found in (("", steps), (RAMP, ramps))
+        for item, sizes in zip(deviations, found.tolist(), strict=True)
     ]
+
+
+def _add_step_tests(watch: Watch, names: Sequence[str], paths: Array) -> tuple[Array, list[Detector]]:
+    """Paths with a signal more for each test of lasting steps, and the tests as charts of these signals.
+
+    A test looks at many rows at once; here it looks once, at the first row.
+    """
+    outputs = watch.config.outputs
+    statistics = np.zeros((*paths.shape[:3], len(watch.steps)))
+    for index, (name, (statistic, _)) in enumerate(zip(outputs, watch.steps, strict=False)):
+        if f"{name}.bias" in names:
+            statistics[names.index(f"{name}.bias"), :, 0, index] = statistic
+    tests = [
+        Detector((len(outputs) + index,), np.eye(1), 1.0, limit)
+        for index, (_, limit) in enumerate(watch.steps)
+        if watch.evaluated[index]
+    ]
+    return np.concatenate([paths, statistics], axis=3), tests
 
 
 def _message(deviation: Deviation, profile: str, sizes: Sequence[float]) -> Power:
@@ -148,7 +170,7 @@ def _deviations(watch: Watch, rows: TrainingState) -> list[Deviation]:
     for index, (name, predictor) in enumerate(zip(watch.config.outputs, watch.predictors, strict=True)):
         if watch.evaluated[index]:
             z = np.zeros((1, rows_after, len(watch.config.outputs)))
-            z[0, :, index] = predictor.step_response(rows_after)
+            z[0, :, index] = np.nan_to_num(predictor.step_response(rows_after))
             found.append(_bias(watch, name, z))
     return found
 
