@@ -1,6 +1,6 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench faults study kills cuts fuzz soak promise outside pictures docs examples protobuf lock clean
+.PHONY: help setup demo test lint bench faults study kills cuts fuzz soak promise outside pictures docs examples protobuf lock dist clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -10,6 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py false_alarms.py)
 READY := .venv/.ready
 DOCS_READY := .venv/.docs-ready
+DIST_READY := .venv/.dist-ready
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / \t/' | expand -t 12
@@ -32,7 +33,7 @@ demo: $(READY) ## run a reactor with a fault, watch, record and draw it
 	@$(BIN)/reactorwatch demo
 
 test: $(READY) ## all tests
-	@$(BIN)/python -m pytest --numprocesses auto --dist loadgroup
+	@$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 lint: $(READY) ## style, types, and layers of imports
 	@$(BIN)/ruff format --check .
@@ -89,6 +90,17 @@ $(DOCS_READY): $(READY)
 
 lock: $(READY) ## write deploy/requirements.lock: what the image installs, with hashes
 	@$(BIN)/python deploy/lock.py
+
+dist: $(DIST_READY) ## the wheel, and a bill of materials (CycloneDX) of what the image installs, in dist/
+	@$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	@$(BIN)/cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible \
+		--output-file dist/reactorwatch.cdx.json deploy/requirements.lock
+
+$(DIST_READY): $(READY)
+	@$(BIN)/python -m ensurepip --upgrade >/dev/null
+	@$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
+	@$(BIN)/python -m pip install --quiet --group dist
+	@touch $@
 
 protobuf: $(READY) ## generate the message classes from messages.proto
 	@cd reactorwatch/contract && ../../$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --pyi_out=. messages.proto

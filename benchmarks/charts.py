@@ -83,8 +83,9 @@ def of_a_plant() -> None:
         config = MonitorConfig(charts=charts)
         watch = ChartWatch(config, Annunciator(config))
         e = rng.standard_normal((1000, 2))
-        watch.choose([True, True], e)
-        watch.start(learned, e, 2e6)
+        values = np.column_stack([rng.standard_normal(1000), e])
+        watch.choose([True, True], e, values)
+        watch.start(learned, e, values, 2e6)
 
         def run(watch: ChartWatch = watch) -> None:
             for row in rows:

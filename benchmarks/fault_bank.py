@@ -42,9 +42,10 @@ PHIS = (0.0, 0.5)
 
 HEAD = """# The watch on a bank of faults
 
-Sixteen faults in three sizes and twenty runs each, watched by the monitor as it is configured by default, by an oracle
-that knows the fault, and by the report's method (3 sigma on ARX and on OE residuals) with limits widened to the same
-rate of false alarms, and at its own. `make faults` writes this page; [watching.md](watching.md) explains it.
+Sixteen faults in three sizes, with twenty runs each, are watched by the monitor with its default settings, by an oracle
+that knows the fault, and by the method of the original report: 3 sigma on ARX and on OE residuals, with its own limits
+and with limits widened to the same rate of false alarms. `make faults` writes this page; [watching.md](watching.md)
+explains it.
 """
 
 Result = TypeVar("Result")

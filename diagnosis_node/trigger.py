@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import msgspec
 
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.keys import check_plant
+from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Sample
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS
 from reactorwatch.runtime.setting_rules import check_bounds
@@ -52,7 +52,7 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         tolerance: differences without practical significance, by output, in its unit.
     """
 
-    plant: str = "cstr"
+    plant: str = DEFAULT_PLANT
     out: str | None = None
     window_min: Annotated[float, msgspec.Meta(ge=20.0, le=1e6)] = 240.0
     after_min: Annotated[float, msgspec.Meta(ge=1.0, le=1e6)] = 30.0

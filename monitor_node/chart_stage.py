@@ -1,20 +1,21 @@
 """All the charts of one plant: built from its training and its budget of false alarms, fed row by row.
 
-What comes in is one prewhitened residual an output, in standard deviations. Which charts look at it is a setting; the
-charts there are: `reactorwatch.spc.charts.catalogue`. A chart is restarted when its alarm is cleared, so that false
-alarms do not come in clusters.
+What comes in is one prewhitened residual an output, in standard deviations, and the measured values. Which charts look
+at them is a setting; the charts there are: `reactorwatch.spc.charts.catalogue`. A chart is restarted when its alarm is
+cleared, so that false alarms do not come in clusters.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import compress
-from typing import TypeAlias
+from itertools import compress, islice
+from math import nan
+from typing import NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.alarms.alarms import ChartAlarm, Explanation, chart_point
+from monitor_node.alarms.alarms import ChartAlarm, Explanation, SuspectedCause, chart_point
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig, PriorityName
 from monitor_node.ingest.alignment import MeasuredRow
@@ -28,7 +29,10 @@ from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.shewhart import designed_width
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalState
 from reactorwatch.spc.joint_chart import JointChart
+from reactorwatch.spc.m_of_n import false_alarm_rate
 from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.training_errors import TrainingErrors
+from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
 from reactorwatch.stored_state import StoredState
 
 Array = NDArray[np.float64]
@@ -38,6 +42,12 @@ ALL = "all"
 
 SD = "sd"
 """The unit of what charts show: standard deviations of the residual."""
+
+SUBSTITUTES = ("shewhart", "ewma")
+"""Charts of each output that are made where the settings have charts of values only, and none of them can be made."""
+
+MOST_ENTRIES = 3
+"""Signals that an alarm names as possible entries of a disturbance."""
 
 
 class ChartsState(StoredState, frozen=True):
@@ -61,9 +71,22 @@ def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
         kind = chart(name)
         if issubclass(kind, SignalChart):
             names += [(name, signal) for signal in config.outputs]
-        elif issubclass(kind, JointChart) and len(config.outputs) > 1:
+        elif issubclass(kind, ValueChart) or (issubclass(kind, JointChart) and len(config.outputs) > 1):
             names.append((name, ALL))
+    if _has_values_only(config):
+        names += [(name, signal) for name in SUBSTITUTES for signal in config.outputs]
     return names
+
+
+def _has_values_only(config: MonitorConfig) -> bool:
+    """True if all charts of the settings are of values, so that there may be none after a training."""
+    return all(issubclass(chart(name), ValueChart) for name in config.charts)
+
+
+def count_chance_alarms(config: MonitorConfig) -> int:
+    """Number of the charts' alarms that share the false alarms, with every signal monitored; see `ValueChart`."""
+    of_settings = [pair for pair in alarm_names(config) if pair[0] in config.charts]
+    return sum(len(config.signals) if issubclass(chart(name), ValueChart) else 1 for name, _ in of_settings)
 
 
 _Judgements: TypeAlias = list[Judgement | None] | None
@@ -73,11 +96,29 @@ def _without(known: list[bool], withheld: tuple[bool, ...]) -> list[bool]:
     return [here and not outlier for here, outlier in zip(known, withheld, strict=True)]
 
 
+class _ChartRow(NamedTuple):
+    """A row as charts take it.
+
+    Attributes:
+        e: prewhitened residual of each output; NaN where there is none.
+        known: for each output, True if it has one.
+        withheld: outputs whose value may be an outlier and must not enter a memory yet.
+        inputs: one value an input; NaN where missing.
+        values: one value an output; NaN where missing.
+    """
+
+    e: list[float]
+    known: list[bool]
+    withheld: tuple[bool, ...]
+    inputs: Sequence[float]
+    values: Sequence[float]
+
+
 class _Banked:
     """Compiled charts, one an output.
 
     `update` takes a row and returns the charts' judgements of it, None for a chart without a value; None in place of
-    all if no chart is out, unless `always`. `_OfEach` and `_OfAll` have the same methods.
+    all if no chart is out, unless `always`. `_OfEach`, `_OfAll` and `_OfValues` have the same methods.
     """
 
     def __init__(self, bank: Bank[CompiledChart], kind: type[CompiledChart]) -> None:
@@ -86,9 +127,10 @@ class _Banked:
     def to_bytes(self) -> bytes:
         return self._bank.state.to_bytes()
 
-    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...], *, always: bool) -> _Judgements:
+    def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
+        known, withheld = row.known, row.withheld
         present = _without(known, withheld) if True in withheld and self._has_memory else known
-        return self._bank.judge(e, present, always=always)
+        return self._bank.judge(row.e, present, always=always)
 
     def restart(self, index: int) -> None:
         self._bank.restart(index)
@@ -111,11 +153,12 @@ class _OfEach:
     def to_bytes(self) -> bytes:
         return msgspec.msgpack.encode([item.state.to_bytes() for item in self._charts])
 
-    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...], *, always: bool) -> _Judgements:
-        if True in withheld and self._charts[0].has_memory:
-            known = _without(known, withheld)
+    def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
+        known = row.known
+        if True in row.withheld and self._charts[0].has_memory:
+            known = _without(known, row.withheld)
         judgements = [
-            item.update(value) if here else None for item, value, here in zip(self._charts, e, known, strict=True)
+            item.update(value) if here else None for item, value, here in zip(self._charts, row.e, known, strict=True)
         ]
         is_out = any(judgement is not None and judgement.out for judgement in judgements)
         return judgements if is_out or always else None
@@ -143,8 +186,9 @@ class _OfAll:
     def to_bytes(self) -> bytes:
         return self._chart.state.to_bytes()
 
-    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...], *, always: bool) -> _Judgements:
+    def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
         """Update with a row; a row with a missing output is skipped."""
+        e, known, withheld = row.e, row.known, row.withheld
         if not self._all:
             e, known = list(compress(e, self._evaluated)), list(compress(known, self._evaluated))
         if False in known or True in withheld:
@@ -166,7 +210,42 @@ class _OfAll:
         return self._chart.numbers
 
 
-_Charts: TypeAlias = _Banked | _OfEach | _OfAll
+class _OfValues:
+    """A chart of the measured values of all signals.
+
+    Args:
+        values: the chart.
+        signals: names of the signals of a row, the inputs first.
+    """
+
+    def __init__(self, values: ValueChart, signals: Sequence[str]) -> None:
+        self._chart = values
+        self._indices = [signals.index(name) for name in values.names]
+
+    def to_bytes(self) -> bytes:
+        return self._chart.state.to_bytes()
+
+    def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
+        """Update with a row; a row that the reference does not predict at all is skipped."""
+        if True not in row.known:
+            return None
+        outputs: Sequence[float] = row.values
+        if True in row.withheld:
+            outputs = [nan if is_withheld else y for y, is_withheld in zip(outputs, row.withheld, strict=True)]
+        x = self._chart.fill(np.array([*row.inputs, *outputs])[self._indices])
+        if x is None:
+            return None
+        judgement = self._chart.update(x)
+        return [judgement] if judgement.out or always else None
+
+    def restart(self, index: int) -> None:
+        self._chart.restart()
+
+    def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
+        return self._chart.explain()
+
+
+_Charts: TypeAlias = _Banked | _OfEach | _OfAll | _OfValues
 
 
 @dataclass
@@ -198,6 +277,7 @@ class ChartWatch:
         self._watched: dict[str, _Watched] = {}
         self._evaluated: list[bool] = []
         self._chosen: list[str] = []
+        self._signals: tuple[str, ...] = ()  # of charts of values
         self._passed: list[float] = []
         self.widths: list[float] = []
         """Shewhart limits, one an output, in standard deviations; they are shown about the predictions."""
@@ -216,7 +296,7 @@ class ChartWatch:
     def load(self, p: np.void) -> None:
         """Fill the numbers of a plant, see `row_step.row_type`, from the charts and their alarms."""
         for name, watched in self._watched.items():
-            assert not isinstance(watched.charts, _OfEach)
+            assert isinstance(watched.charts, _Banked | _OfAll)
             p[name] = watched.charts.numbers
         for delay, alarm in zip(p["delays"], self._alarms.values(), strict=False):
             rule = alarm.memory.rule
@@ -225,7 +305,7 @@ class ChartWatch:
     def store(self, p: np.void) -> None:
         """Take over into the charts what compiled steps have written into the numbers of a plant."""
         for name, watched in self._watched.items():
-            assert not isinstance(watched.charts, _OfEach)
+            assert isinstance(watched.charts, _Banked | _OfAll)
             watched.charts.numbers[:] = p[name]
 
     def store_delays(self, p: np.void) -> None:
@@ -253,12 +333,14 @@ class ChartWatch:
             for path, judgement in zip(paths, judgements, strict=False)
         ]
 
-    def choose(self, evaluated: list[bool], e: Array) -> dict[str, str]:
+    def choose(self, evaluated: list[bool], e: Array, values: Array) -> dict[str, str]:
         """Choose the charts that can be made; returns the others, by alarm, each with the reason.
 
         Args:
             evaluated: for each output, True if it is evaluated.
             e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
+            values: its measured values, shape (n, signals), the inputs first; NaN where missing, for each row of a
+                signal that is left out.
         """
         rows, signals = (
             complete_rows(e, np.flatnonzero(evaluated).tolist()),
@@ -269,35 +351,88 @@ class ChartWatch:
             for name in self._names
             if issubclass(kind := chart(name), JointChart) and (why := kind.obstacle(rows, signals))
         }
-        self._evaluated, self._chosen = evaluated, [name for name in self._names if name not in obstacles]
+        self._signals, complete = self._complete_values(values)
+        obstacles |= {
+            name: why
+            for name in self._names
+            if issubclass(kind := chart(name), ValueChart) and (why := kind.obstacle(complete, self._signals))
+        }
+        charts = [name for name in dict.fromkeys(self._config.charts) if name in self._names and name not in obstacles]
+        self._evaluated, self._chosen = evaluated, charts or [name for name in self._names if name not in obstacles]
         return {self._alarms[name, ALL].name: why for name, why in obstacles.items()}
 
     @property
     def chance_alarms(self) -> int:
         """Number of their alarms that chance can raise."""
-        return sum(sum(self._evaluated) if issubclass(chart(name), SignalChart) else 1 for name in self._chosen)
+        kinds = [chart(name) for name in self._chosen]
+        joint = sum(issubclass(kind, JointChart) for kind in kinds)
+        of_each = sum(issubclass(kind, SignalChart) for kind in kinds) * sum(self._evaluated)
+        return joint + of_each + sum(issubclass(kind, ValueChart) for kind in kinds) * len(self._signals)
 
-    def start(self, learned: list[Prewhitening], e: Array, arl0: float) -> None:
+    def _complete_values(self, values: Array) -> tuple[tuple[str, ...], Array]:
+        """Names of the signals with values that vary, and the rows in which none of them is missing."""
+        indices = np.flatnonzero(np.isfinite(values).any(axis=0))
+        complete = complete_rows(values, indices.tolist())
+        varies = np.ptp(complete, axis=0) > 0.0 if len(complete) else np.ones(indices.size, np.bool_)
+        names = tuple(self._config.signals[index] for index in indices[varies].tolist())
+        return names, complete[:, varies]
+
+    def start(self, learned: list[Prewhitening], e: Array, values: Array, arl0: float) -> None:
         """Make the charts, after `choose`.
 
         Args:
             learned: from the training, one an output.
             e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
+            values: measured values of the training, see `choose`.
             arl0: run length of each alarm without a fault, in rows.
         """
-        config = self._config
-        p = false_alarm_budget.point_probability(arl0, config.raise_count, config.window)
-        sds = memory_sds(e, config.chart_settings["ewma_weight"])
-        baseline = Baseline(tuple(learned), e, sds, arl0, p, config.chart_settings)
+        config, baseline = self._config, self._baseline(learned, e, arl0)
+        p = baseline.point_probability
         self.widths, self._passed = [designed_width(p, item) for item in learned], [item.shift_gain for item in learned]
 
         def design_charts(kind: type[Chart]) -> _Charts:
             if issubclass(kind, SignalChart):
                 return _of_each(kind, [kind.design(baseline.of([index])) for index in range(len(config.outputs))])
+            if issubclass(kind, ValueChart):
+                of_values = ValueBaseline(*self._complete_values(values), arl0, config.chart_settings)
+                return _OfValues(kind.design(of_values), config.signals)
             assert issubclass(kind, JointChart)
             return _OfAll(kind.design(baseline.of(np.flatnonzero(self._evaluated).tolist())), self._evaluated)
 
         self._watch(design_charts)
+
+    def _baseline(self, learned: list[Prewhitening], e: Array, arl0: float) -> Baseline:
+        config = self._config
+        p = false_alarm_budget.point_probability(arl0, config.raise_count, config.window)
+        sds = memory_sds(e, config.chart_settings["ewma_weight"])
+        return Baseline(tuple(learned), e, sds, arl0, p, config.chart_settings)
+
+    def relative_rates(self, learned: list[Prewhitening], e: Array, arl0: float, errors: TrainingErrors) -> Array:
+        """Rate of false alarms of all charts by the errors of the training, in shares of one alarm, shape (draws,).
+
+        Args:
+            learned: prewhitening of each output.
+            e: prewhitened residuals of the training, shape (n, outputs); NaN where there is none.
+            arl0: run length of each alarm without a fault, in rows.
+            errors: errors of all outputs.
+        """
+        baseline, evaluated = self._baseline(learned, e, arl0), np.flatnonzero(self._evaluated).tolist()
+        total = np.zeros(len(errors.mean))
+        for name in self._chosen:
+            kind = chart(name)
+            groups = [[index] for index in evaluated] if issubclass(kind, SignalChart) else [evaluated]
+            assert issubclass(kind, SignalChart | JointChart)
+            for group in groups:
+                rates = kind.relative_rates(baseline.of(group), errors.of(group))
+                total += rates if kind.has_memory else self._rule_rates(baseline, rates)
+        return total
+
+    def _rule_rates(self, baseline: Baseline, rates: Array) -> Array:
+        """Relative rate of an alarm that takes several points, from that of single points."""
+        count, window, p = self._config.raise_count, self._config.window, baseline.point_probability
+        nodes = np.geomspace(1e-3 * p, 1.0, 40)
+        of_rule = [false_alarm_rate(count, window, float(node)) * baseline.arl0 for node in nodes]
+        return np.asarray(np.exp(np.interp(np.log(np.maximum(rates * p, nodes[0])), np.log(nodes), np.log(of_rule))))
 
     @property
     def state(self) -> ChartsState:
@@ -319,6 +454,8 @@ class ChartWatch:
         self._evaluated, self._chosen = evaluated, [name for name in self._names if name in state.charts]
         outputs = len(self._config.outputs)
         each = {name for name in self._names if issubclass(chart(name), SignalChart)}
+        if _has_values_only(self._config) and not each & set(state.charts):
+            each = set()
         if not each <= set(state.charts) <= set(self._names) or not len(self.widths) == len(self._passed) == outputs:
             raise ValueError(f"there must be the charts {', '.join(self._names)}, got {', '.join(state.charts)}")
 
@@ -331,6 +468,10 @@ class ChartWatch:
                 return _Banked(Bank.from_state(kind, columns), kind)
             if issubclass(kind, SignalChart):
                 return _OfEach([kind.from_state(kind.State.from_bytes(item)) for item in _split(data, outputs)])
+            if issubclass(kind, ValueChart):
+                of_values = kind.from_state(kind.State.from_bytes(data))
+                self._signals = of_values.names
+                return _OfValues(of_values, self._config.signals)
             assert issubclass(kind, JointChart)
             return _OfAll(kind.from_state(kind.State.from_bytes(data)), self._evaluated)
 
@@ -365,8 +506,9 @@ class ChartWatch:
         """
         publications = row.publications
         known = [size == size for size in e]  # NaN is not equal to itself
+        seen = _ChartRow(e, known, withheld, row.inputs, row.values)
         for watched in self._watched.values():
-            judgements = watched.charts.update(e, known, withheld, always=points or not watched.at_rest)
+            judgements = watched.charts.update(seen, always=points or not watched.at_rest)
             if judgements is None:
                 continue
             for index, (alarm, judgement) in enumerate(zip(watched.alarms, judgements, strict=True)):
@@ -382,6 +524,8 @@ class ChartWatch:
                     continue
                 explanation = self._explain(watched.charts, index, judgement, scales, row.units) if raised else None
                 publications.append(self._board.record_change(alarm, row.time_ns, judgement, SD, explanation))
+                if explanation is not None and isinstance(watched.charts, _OfValues):
+                    publications += self._board.set_suspects(row.time_ns, _entries(explanation.contributions))
                 if not raised:
                     watched.charts.restart(index)
             rules = [alarm.memory.rule for alarm in watched.alarms]
@@ -392,6 +536,14 @@ class ChartWatch:
     ) -> Explanation:
         signals = [Shown(*item) for item in zip(self._config.outputs, units, scales, self._passed, strict=True)]
         return Explanation(*charts.explain(index, judgement, signals))
+
+
+def _entries(shares: Mapping[str, float]) -> list[SuspectedCause]:
+    """Signals at which a disturbance may enter, the likeliest first."""
+    return [
+        SuspectedCause(name, share, kind="process", text=f"the disturbance enters at {name}")
+        for name, share in islice(shares.items(), MOST_ENTRIES)
+    ]
 
 
 def _of_each(kind: type[SignalChart], charts: list[SignalChart]) -> _Charts:

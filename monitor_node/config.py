@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 
 import msgspec
 
-from reactorwatch.contract.keys import check_plant
+from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
+from reactorwatch.description.find import find_process
 from reactorwatch.runtime.setting_rules import check_bounds
 from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.m_of_n import check_rule
+from reactorwatch.spc.value_chart import FEWEST_SIGNALS
 
 CHART_SETTINGS = [setting for chart in CHARTS for setting in chart.settings]
 
@@ -34,28 +36,29 @@ ReferenceName = Literal["auto", "equations", "black-box", "arx"]
 OLDER_REFERENCES = {"process": "equations"}
 """Older words for references in settings files."""
 
-REACTOR = "cstr"
-"""The default process."""
-
-REACTOR_TRAINING_MIN = 100.0
-"""Training of the reactor where nothing is stated, in minutes."""
+DEFAULT = find_process()
+"""Process that is watched where none is named."""
 
 DEFAULT_TRAINING_ROWS = 1000
-"""Training of other processes where nothing is stated."""
+"""Training where nothing is stated, of a process that has no duration of its own."""
 
-DEFAULT_PRIORITIES: dict[str, PriorityName] = {"T": "high"}
-"""Default priorities of signals that are outputs."""
+LARGEST_FALSE_ALARMS = 1e6
+"""Most false alarms in 30 days that can be asked for."""
 
+USUAL_CHARTS = ("shewhart", "ewma", "mewma")
+"""Charts where the settings name none."""
 
-SMALLEST_SD = {"C": 2e-4, "T": 0.05}
-"""Defaults for the reactor's outputs; other outputs have none."""
-
+CHARTS_OF_MANY = ("residual_space",)
+"""Charts where the settings name none, of many signals that no equations judge."""
 
 WITHOUT_EQUATIONS = ""
 """Setting `process` of a plant that no equations judge."""
 
-DEFAULT_SIGNALS = {"inputs": ("qc",), "outputs": ("C", "T")}
+DEFAULT_SIGNALS = {"inputs": DEFAULT.inputs, "outputs": DEFAULT.outputs}
 """Signals of the default process, by key."""
+
+DEFAULT_PRIORITIES: dict[str, PriorityName] = msgspec.convert(DEFAULT.watch.priorities, dict[str, PriorityName])
+"""Priorities where none are stated; the same object, so that it is recognised."""
 
 
 class TrainingLength(NamedTuple):
@@ -107,7 +110,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             inputs no black box).
         process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
             nominal reactor where its signals are watched; empty: no equations judge.
-        charts: charts of the residuals.
+        charts: charts of the residuals and of the values; where none are named, `residual_space` for 8 signals or more
+            that no equations judge, else `shewhart`, `ewma` and `mewma`.
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
             nearest number that the charts can keep for the number of alarms and the sampling period.
         smallest_sd: least standard deviation of the residual by output, in its unit; smaller deviations do not matter.
@@ -129,7 +133,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         priorities: priority of the alarms by signal; medium for signals without an entry.
     """
 
-    plant: str = "cstr"
+    plant: str = DEFAULT_PLANT
     inputs: tuple[str, ...] = DEFAULT_SIGNALS["inputs"]
     outputs: tuple[str, ...] = DEFAULT_SIGNALS["outputs"]
     setpoints: tuple[str, ...] = ()
@@ -146,9 +150,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     diagnose_training: bool = True
     reference: ReferenceName | Literal["process"] = "auto"
     process: str | None = None
-    charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
-    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None
-    smallest_sd: dict[str, float] = msgspec.field(default_factory=SMALLEST_SD.copy)
+    charts: tuple[ChartName, ...] = USUAL_CHARTS
+    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=LARGEST_FALSE_ALARMS)] | None = None
+    smallest_sd: dict[str, float] = msgspec.field(default_factory=lambda: dict(DEFAULT.watch.smallest_sd))
     isolation: bool = True
     isolation_rows: Annotated[int, msgspec.Meta(ge=50, le=10_000)] = 600
     raise_count: int = 3
@@ -190,6 +194,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
                 f"training_min and training_rows both state the training, got {self.training_min:g} and "
                 f"{self.training_rows}; leave one out"
             )
+        if self.charts is USUAL_CHARTS or self.charts is CHARTS_OF_MANY:  # no others are named
+            are_many = len(self.signals) >= FEWEST_SIGNALS and not self._may_have_equations
+            msgspec.structs.force_setattr(self, "charts", CHARTS_OF_MANY if are_many else USUAL_CHARTS)
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
         if self.process is not None and self.outputs == DEFAULT_SIGNALS["outputs"]:
@@ -205,7 +212,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             if not 0 < step < 1e6:
                 raise ValueError(f"resolution of {signal} must be in (0, 1e6), got {step:g}")
         for signal, sd in self.smallest_sd.items():
-            if signal not in (*self.outputs, *SMALLEST_SD):
+            if signal not in (*self.outputs, *DEFAULT.watch.smallest_sd):
                 raise ValueError(f"smallest_sd is by output, {self.outputs}, got {signal!r}")
             if not 0 <= sd < 1e6:
                 raise ValueError(f"smallest_sd of {signal} must be in [0, 1e6), got {sd:g}")
@@ -218,15 +225,22 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
 
     @property
     def training_length(self) -> TrainingLength:
-        """Duration of the training: as stated, else 100 minutes of the reactor and 1,000 rows of another process."""
+        """Duration of the training: as stated, else that of the default process and 1,000 rows of another one."""
         if self.training_rows is not None:
             return TrainingLength(None, self.training_rows)
-        if self.training_min is None and not self.is_reactor:
+        minutes = DEFAULT.watch.training_min if self.is_default_process else None
+        if self.training_min is None and minutes is None:
             return TrainingLength(None, DEFAULT_TRAINING_ROWS)
-        return TrainingLength(REACTOR_TRAINING_MIN if self.training_min is None else self.training_min)
+        return TrainingLength(minutes if self.training_min is None else self.training_min)
 
     @property
-    def is_reactor(self) -> bool:
+    def _may_have_equations(self) -> bool:
+        if self.reference in ("black-box", "arx") or self.process == WITHOUT_EQUATIONS:
+            return False
+        return self.process is not None or self.is_default_process
+
+    @property
+    def is_default_process(self) -> bool:
         """True if the signals are those of the default process."""
         return self.inputs == DEFAULT_SIGNALS["inputs"] and set(self.outputs) <= set(DEFAULT_SIGNALS["outputs"])
 

@@ -33,10 +33,11 @@ from monitor_node.pipeline import PlantPipeline
 from monitor_node.process_settings import order_inputs
 from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
+from monitor_node.training_check import check_training
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.commands import decode_command
-from reactorwatch.contract.messages_pb2 import Alarm, Baseline, BaselineCommand, CommandReply, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, BaselineCommand, CommandReply, Promise, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -449,6 +450,12 @@ class Monitor:
         return self.pipeline.expected_false_alarms
 
     @property
+    def promise(self) -> Promise | None:
+        """Promise of false alarms, as it is now; None before the end of the training."""
+        promise = self.pipeline.promise
+        return None if promise is None else promise.message(self.last_ns or 0, self.pipeline.rows_watched)
+
+    @property
     def excluded_signals(self) -> dict[str, str]:
         """Signals that are not monitored, with the reason: no value came, or the training could not use them."""
         never_came = (signal for signal in self._signals if signal not in self._heard_from_ns)
@@ -557,6 +564,7 @@ class Monitor:
             failures=self.failures,
             changes=self._changes,
             diagnose=self._diagnose,
+            check=check_training,
         )
 
     def _contain(self, stage: str, error: Exception) -> None:

@@ -10,15 +10,19 @@ after the training is charted as drift.
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from math import isfinite, nan
+from typing import TypeAlias
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.alarms.states import Event
 from monitor_node.baseline.black_box_reference import BlackBoxReference, BlackBoxReferenceState
 from monitor_node.baseline.commands import ACCEPT, RESTORE, TRAINED, check_command, is_command
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.predictor import ArxPredictor, arx_structure
+from monitor_node.baseline.promise import PlantPromise, PromiseState, TrainingCheck
 from monitor_node.baseline.references import (
     ArxReference,
     ArxReferenceState,
@@ -29,8 +33,8 @@ from monitor_node.baseline.references import (
 from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
-from monitor_node.chart_stage import ChartWatch, alarm_names
-from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig
+from monitor_node.chart_stage import ChartWatch, alarm_names, count_chance_alarms
+from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.health import NODE
@@ -46,18 +50,32 @@ from monitor_node.state.monitor_state import equations_text
 from monitor_node.state.pipeline_state import KeptBaseline, PipelineState, TrainedState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, Check, Estimate, ModelSnapshot, Parameter
+from reactorwatch.contract.messages_pb2 import (
+    Alarm,
+    Baseline,
+    BaselineCommand,
+    Check,
+    Estimate,
+    ModelSnapshot,
+    Parameter,
+    Promise,
+)
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
+from reactorwatch.spc.training_errors import CONFIDENCE, TrainingErrors
 from reactorwatch.stored_state import unpack_numbers, unpack_times
 
 MOST_KEPT = 3
 """Baselines that can be restored; memory stays bounded."""
+
+RAISED = Event.RAISED.value
+
+CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, TrainingState, str], TrainingCheck]
+"""Judges a training by itself, see `training_check`."""
 
 
 def check_promise(config: MonitorConfig, period_min: float) -> None:
@@ -72,7 +90,7 @@ def check_promise(config: MonitorConfig, period_min: float) -> None:
     """
     outputs = len(config.outputs)
     of_drift = outputs if ParameterT2.name in config.charts else 0
-    alarms = len(alarm_names(config)) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
+    alarms = count_chance_alarms(config) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
     false_alarm_budget.promise_per_30_days(config.false_alarms_per_30_days, alarms, period_min)
 
 
@@ -87,6 +105,7 @@ class PlantPipeline:
         failures: counter of errors in the search for causes; None: a new one.
         changes: changes of the baseline to come.
         diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`.
+        check: judges the training by itself; None: that is not done.
 
     Raises:
         InputError: the settings ask for a process model that does not fit the plant's signals.
@@ -100,6 +119,8 @@ class PlantPipeline:
         signals: signal checks.
         operation: operation of the plant, for the texts of alarms.
         training_rows: number of rows of the training, after its end.
+        promise: promise of false alarms; None before the end of the training.
+        alarm_rates: false alarms a row by the errors that the training may have made, shape (draws,), after its end.
     """
 
     def __init__(
@@ -112,8 +133,15 @@ class PlantPipeline:
         failures: Failures | None = None,
         changes: deque[ScheduledChange] | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
+        check: CheckTraining | None = None,
     ) -> None:
         self._config = config
+        self._check = check
+        self.promise: PlantPromise | None = None
+        self._promised: Promise | None = None
+        self.alarm_rates = np.zeros(0)
+        self._chance_names = {*(name for name, _ in alarm_names(config)), SHIFT, *SignalChecks.CHANCE_NAMES}
+        self._promise_key = keys.key(config.plant, keys.PROMISE, NODE)
         self._update = ModelUpdate(config, deque() if changes is None else changes)
         self._diagnose = diagnose
         self._failures = Failures() if failures is None else failures
@@ -129,7 +157,7 @@ class PlantPipeline:
         self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         units = {**config.units, **(self.model.units if self.model is not None else {})}
         self.operation = Operation(config, input_bounds(config, self.model), units)
-        board.describe_operation = self.operation.describe
+        board.describe_operation = self._describe
         self._drift = DriftWatch(config, board, publish=points)
         self._shift = ShiftWatch(config, board)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
@@ -196,6 +224,7 @@ class PlantPipeline:
             self._drift.until_next,
             b"" if self.baseline is None else self.baseline.SerializeToString(),
             self._shift.state,
+            None if self.promise is None else self.promise.state,
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -233,6 +262,7 @@ class PlantPipeline:
         if watched.baseline:
             self._update.baseline = Baseline.FromString(watched.baseline)
         self._drift.until_next = watched.until_drift
+        self.promise = None if watched.promise is None else PlantPromise(watched.promise)
         self._checks = [Check(name=name, result=result) for name, result in watched.checks]
         learned = [item.learned for item in watched.whiteners]
         outputs = len(self._config.outputs)
@@ -331,9 +361,14 @@ class PlantPipeline:
         return self._refusals
 
     @property
+    def opportunities(self) -> float:
+        """Number of rows so far, times the alarms that chance can raise in each."""
+        return self.rows_watched * self._chance_alarms
+
+    @property
     def expected_false_alarms(self) -> float:
         """Mean number of false alarms expected so far."""
-        return self.rows_watched * self._chance_alarms / self._arl0 if self._arl0 else 0.0
+        return self.opportunities / self._arl0 if self._arl0 else 0.0
 
     def update(self, row: Row, units: list[str], publications: list[Publication]) -> None:
         """Process a row.
@@ -345,7 +380,7 @@ class PlantPipeline:
         """
         time_ns = row.time_ns
         if self._update.changes:
-            self._change_model(time_ns, publications)
+            self._change_baseline(time_ns, publications)
         interval = self._sampling.update(time_ns)
         inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
         follows = interval.follows and not row.restarted
@@ -365,19 +400,20 @@ class PlantPipeline:
         else:
             if row.restarted:
                 self.signals.reset()
+            before = len(publications)
             self._evaluate(measured)
+            self._count_alarms(time_ns, publications, before)
             self.is_normal = self._find_normal(time_ns)
         self.operation.inputs = ()
 
     def snapshots(self, time_ns: int) -> list[Publication]:
-        """Snapshots of each output's models: the adaptive one, the one fitted to the training, and the reference.
+        """Snapshots of the promise and of each output's models: adaptive, fitted to the training, and the reference.
 
         The fitted model is only compared with the adaptive one, which is the reference if that is `arx`.
         """
-        publications: list[Publication] = []
         if not self._points:
-            return publications
-        reference = self._reference
+            return []
+        publications, reference = self._promise_messages(time_ns), self._reference
         outputs = zip(self._model_keys, self._config.outputs, self._predictors, strict=True)
         for index, (key, output, predictor) in enumerate(outputs):
             adaptive, fitted = predictor.adaptive_snapshot(), predictor.reference_snapshot()
@@ -424,7 +460,33 @@ class PlantPipeline:
             raise InputError(f"there is no output to watch: {trained.refused}")
         self._start(trained)
         self._start_diagnosis(rows)
-        self._change_model(time_ns, [])
+        if not self._change_model(time_ns, []):
+            self._check_training(rows)
+
+    def new_trials(self) -> Callable[[MonitorConfig], "PlantPipeline"]:
+        """Learn from the rows so far; returns a function that makes pipelines which start with what was learned.
+
+        Their settings may differ in the false alarms.
+
+        Raises:
+            InputError: there are too few rows to learn from, or no output can be watched.
+        """
+        if not self._training.is_enough([False] * len(self._config.outputs)):
+            raise InputError(f"there are only {self._training.rows} rows to learn from")
+        trained = self._training.finish(last_chance=True)
+        if trained.refused:
+            raise InputError(trained.refused)
+        state, reference = self.state, trained.reference.state
+
+        def start(config: MonitorConfig) -> "PlantPipeline":
+            pipeline = PlantPipeline(config, Annunciator(config), points=False, model=self.model)
+            pipeline.restore(state, 0)
+            pipeline._start(
+                trained._replace(reference=pipeline._restore_reference(reference), checks=list(trained.checks))
+            )
+            return pipeline
+
+        return start
 
     def start_run(self) -> None:
         """Expect the first row of another run of the plant, whose times are unrelated to those of the training."""
@@ -467,9 +529,11 @@ class PlantPipeline:
             else:
                 self._start(trained)
                 self._start_diagnosis(rows)
-                self._change_model(time_ns, publications)
+                if not self._change_model(time_ns, publications):
+                    self._check_training(rows)
                 self._evaluate(row)
                 publications.extend(self.snapshots(time_ns))
+                publications.extend(self._promise_messages(time_ns))
                 return
         self._training.add(time_ns, row.inputs, values)
         if not self._points:
@@ -522,30 +586,83 @@ class PlantPipeline:
         if self._diagnose is not None and (job := self.diagnosis_job) is not None:
             self.on_finding(self._diagnose(job))
 
-    def _change_model(self, time_ns: int, publications: list[Publication]) -> None:
-        """Learn the baseline again with the model of a change, if one holds from this row on."""
-        change = self._update.pop_due(time_ns)
-        if change is None:
+    def _check_training(self, rows: TrainingState) -> None:
+        """Judge the training by itself; an error there leaves the promise without this check."""
+        if self._check is None or self.promise is None or self._reference is None:
             return
-        self._leave_normal()
-        if is_command(change):
+        model = self.equations if isinstance(self._reference, ProcessReference) else None
+        try:
+            check = self._check(self._config, model, rows, self._reference.kind)
+        except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
+            self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
+            return
+        self.promise = PlantPromise(replace(self.promise.state, check=check))
+        if not self.promise.is_kept:
+            self.notes.append(f"promise: {self.promise.text(self.rows_watched)}")
+
+    def _describe(self, time_ns: int) -> str:
+        """Operation of the plant, and a promise that it does not keep, as the text of an alarm has them."""
+        warning = "" if self.promise is None else self.promise.warning
+        return "; ".join(filter(None, (self.operation.describe(time_ns), warning)))
+
+    def _promise_messages(self, time_ns: int) -> list[Publication]:
+        """The promise as it is now; without points only one that is not kept or no longer holds."""
+        promise, rows = self.promise, self.rows_watched
+        if promise is None or not (self._points or not promise.is_kept or promise.has_drifted(rows)):
+            return []
+        message = promise.message(time_ns, rows)
+        if message == self._promised:  # it was published for another reason in this row
+            return []
+        self._promised = message
+        return [Publication(self._promise_key, message)]
+
+    def _count_alarms(self, time_ns: int, publications: list[Publication], before: int) -> None:
+        """Count the alarms that chance can raise among the publications of a row, from an index on."""
+        if self.promise is None:
+            return
+        alarms = [item.message for item in publications[before:] if isinstance(item.message, Alarm)]
+        raised = [alarm for alarm in alarms if alarm.event == RAISED]
+        if count := sum(alarm.alarm.partition("/")[0] in self._chance_names for alarm in raised):
+            had_drifted = self.promise.has_drifted(self.rows_watched)
+            self.promise.count_alarms(count, self.rows_watched)
+            publications.extend(self._promise_messages(time_ns))
+            if self.promise.has_drifted(self.rows_watched) and not had_drifted:
+                self.notes.append(f"promise: {self.promise.text(self.rows_watched)}")
+
+    def _change_baseline(self, time_ns: int, publications: list[Publication]) -> None:
+        """Execute the change that holds from a row on, if there is one."""
+        if not is_command(self._update.changes[0].baseline):
+            self._change_model(time_ns, publications)
+        elif (change := self._update.pop_due(time_ns)) is not None:
+            self._leave_normal()
             self._execute_change(change)
             publications.append(Publication(self._baseline_key, change))
-            return
+
+    def _change_model(self, time_ns: int, publications: list[Publication]) -> bool:
+        """Learn the baseline again with the model of a change, if one holds from this row on; returns True if so."""
+        if self._update.changes and is_command(self._update.changes[0].baseline):
+            return False
+        rows, change = self._update.rows, self._update.pop_due(time_ns)
+        if change is None or rows is None:
+            return False
+        self._leave_normal()
         try:
             trained = self._update.relearn(change, self._predictors)
         except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
             self._failures.add("baseline", error, "the plant is judged by the equations as given")
-            return
+            return False
         if trained is None:
             self.notes.append("the identified models predict the training better; the baseline stays as it is")
-            return
+            return False
         self._start(trained, again=True)
+        self._check_training(rows)
         publications.append(Publication(self._baseline_key, change))
         if self.rows_watched:  # the filter stands at the end of the training, and rows have come since
             trained.reference.restart()
             self._quarantined = (False,) * len(self._config.outputs)
             publications.extend(self.snapshots(time_ns))
+            publications.extend(self._promise_messages(time_ns))
+        return True
 
     # --- commands --------------------------------------------------------------------------------------------
 
@@ -616,6 +733,7 @@ class PlantPipeline:
         self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         self._leave_out({})
         self._refusals = self.rows_watched = 0
+        self.promise = None
         self._start_training(time_ns)
         if rows is None:
             return
@@ -647,13 +765,13 @@ class PlantPipeline:
             again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
         """
         self._leave_out(trained.left_out)
-        unmade = self._charts.choose(self._evaluated, trained.e)
+        unmade = self._charts.choose(self._evaluated, trained.e, trained.values)
         self._shift.is_active = trained.responses is not None
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
         )
         asked, period_min = self._config.false_alarms_per_30_days, self._sampling.period_ns / MINUTE_NS
-        promised = self._promise(asked, period_min, trained.checks)
+        promised = self._promise_rate(asked, period_min, trained.checks)
         if asked is None and promised != false_alarm_budget.USUAL_PER_30_DAYS:
             text = (
                 f"{promised:.3g} false alarms in 30 days are promised instead of "
@@ -670,17 +788,19 @@ class PlantPipeline:
         if isinstance(trained.reference, ArxReference):
             for predictor in self._predictors:
                 predictor.start_judging()
-        self._charts.start(trained.learned, trained.e, self._arl0)
+        self._charts.start(trained.learned, trained.e, trained.values, self._arl0)
         responses = trained.responses if self._shift.is_active else None
         self._shift.start(responses, trained.z, trained.learned, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
+        self.signals.learn_spike_rates(trained.outliers, len(trained.e), self._sampling.period_ns, self._arl0)
+        self._start_promise(trained, period_min)
         if not again:
             self.operation.end_training()
             self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
 
-    def _promise(self, asked: float | None, period_min: float, checks: list[Check]) -> float:
+    def _promise_rate(self, asked: float | None, period_min: float, checks: list[Check]) -> float:
         """False alarms in 30 days that are promised; tests of steps are left out if they would make it impossible."""
         try:
             return false_alarm_budget.promise_per_30_days(asked, self._chance_alarms, period_min)
@@ -691,6 +811,19 @@ class PlantPipeline:
             why = f"{asked:g} false alarms in 30 days cannot be kept with more alarms"
             checks.append(Check(name=SHIFT, result=f"lasting steps are not tested for: {why}"))
             return false_alarm_budget.promise_per_30_days(asked, self._chance_alarms, period_min)
+
+    def _start_promise(self, trained: TrainingResult, period_min: float) -> None:
+        """State the promise of false alarms; alarms so far go on to count."""
+        errors, arl0 = TrainingErrors.draw(len(trained.learned)), self._arl0
+        rates = self._charts.relative_rates(trained.learned, trained.e, arl0, errors)
+        rates += self.signals.relative_rates(trained.learned, self._evaluated, arl0, errors)
+        rates += self._drift.chance_alarms(self._evaluated) + (sum(self._evaluated) if self._shift.is_active else 0)
+        self.alarm_rates = rates / arl0
+        rows = false_alarm_budget.DAYS_MIN / period_min
+        mean, upper = rows * self._chance_alarms / arl0, rows * float(np.quantile(self.alarm_rates, CONFIDENCE))
+        before = PromiseState(0.0, 0.0, rows) if self.promise is None else self.promise.state
+        state = replace(before, per_30_days=mean, upper_per_30_days=max(mean, upper), rows_in_30_days=rows)
+        self.promise = PlantPromise(replace(state, check=TrainingCheck()))
 
     def _set_reference(self, reference: Reference, learned: list[Prewhitening], arl0: float) -> None:
         """Set the reference for the rows to come."""
@@ -713,7 +846,7 @@ class PlantPipeline:
         return self._reference.model if isinstance(self._reference, ProcessReference) else None
 
     def _new_suspicion(self, reference: Reference) -> Suspicion | None:
-        if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.model)):
+        if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.equations)):
             return None
         return Suspicion(self._config, self._board, reference)
 
@@ -776,12 +909,14 @@ class PlantPipeline:
         self.rows_watched += 1
         if self._points:
             self._publish_step(row)
+        before = len(row.publications)
         if self._shift.is_active:
             count = len(row.values)
             self._shift.update(row, self._step.work[0]["outputs"][3 * count : 4 * count].tolist(), points=self._points)
         if self._drift.wanted:
             self._update_beside(row)
             row.publications.extend(self._drift.update(time_ns, self._predictors))
+        self._count_alarms(time_ns, row.publications, before)
         if self._board.has_unexplained:  # a lasting step
             self._leave_normal()
             self._set_learning()
@@ -922,7 +1057,7 @@ def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | 
     """Process model for the plant, as the settings ask for it."""
     if config.reference in ("black-box", "arx") or (model is None and config.process == WITHOUT_EQUATIONS):
         return None
-    given, model = model is not None, model or cstr()
+    given, model = model is not None, model or DEFAULT.require_model()
     fits = config.inputs == model.input_names and set(config.outputs) <= set(model.output_names)
     if fits:
         return model

@@ -5,11 +5,10 @@ from typing import Any, NamedTuple
 import msgspec
 
 from monitor_node.config import (
+    DEFAULT,
     DEFAULT_PRIORITIES,
     DEFAULT_SIGNALS,
     DEFAULT_TRAINING_ROWS,
-    REACTOR,
-    SMALLEST_SD,
     WITHOUT_EQUATIONS,
     MonitorConfig,
 )
@@ -69,13 +68,14 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
             raise InputError(describe_unknown("signal", signal, (*process.inputs, *process.outputs)))
     if process.model is None:
         changed["process"] = WITHOUT_EQUATIONS
-    if process.name != REACTOR:
-        if config.smallest_sd == SMALLEST_SD:
-            changed["smallest_sd"] = {}
+    if process.name != DEFAULT.name:
+        if config.smallest_sd == DEFAULT.watch.smallest_sd:
+            changed["smallest_sd"] = dict(process.watch.smallest_sd)
         if config.priorities == DEFAULT_PRIORITIES:
-            changed["priorities"] = {}
-        if config.training_min is None and config.training_rows is None:
-            changed["training_rows"] = DEFAULT_TRAINING_ROWS
+            changed["priorities"] = dict(process.watch.priorities)
+        if not _states_training(config):
+            minutes = process.watch.training_min
+            changed |= {"training_rows": DEFAULT_TRAINING_ROWS} if minutes is None else {"training_min": minutes}
     changed_config = msgspec.structs.replace(config, **changed)
     return WatchedProcess(limit_training(changed_config, rows, is_stated=_states_training(config)), process.model)
 

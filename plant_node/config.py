@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
-from reactorwatch.contract.keys import check_plant
+from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.process import OPERATIONS
 from reactorwatch.process.library.cstr.controllers import LevelControl, TemperatureControl
 from reactorwatch.runtime.setting_rules import check_bounds
@@ -61,7 +61,7 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )
     """Older names of keys, each with the present one and the function from a value of the older to one of it."""
 
-    name: str = "cstr"
+    name: str = DEFAULT_PLANT
     period_min: Annotated[float, msgspec.Meta(ge=1e-4, le=60.0)] = 0.1
     speed: float = 1.0
     duration_min: float | None = None

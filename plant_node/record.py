@@ -11,7 +11,7 @@ from plant_node.core import Plant
 from plant_node.process_settings import fit_settings
 from plant_node.scenario import FromFile, HeldRecord, Scenario
 from reactorwatch.description.choice import ProcessChoice
-from reactorwatch.description.find import find_process
+from reactorwatch.description.find import build_process, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import convert_to_process
 from reactorwatch.process.effect import TIMING
@@ -61,7 +61,7 @@ def load_process(config: PlantConfig) -> tuple[PlantConfig, Process]:
     timing = [item for item in loaded.effects if item.effect.location == TIMING]
     physical = replace(loaded, effects=tuple(item for item in loaded.effects if item not in timing))
     faults = (*config.faults, *(str(item) for item in timing))
-    return with_changes(config, faults=faults), find_process(physical.build())
+    return with_changes(config, faults=faults), build_process(physical)
 
 
 def _read_input(path: Path, name: str, process: Process) -> Record:

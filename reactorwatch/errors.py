@@ -1,7 +1,8 @@
 """Errors in the user's input, each reported in one line."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class InputError(ValueError):
@@ -22,3 +23,12 @@ def describe_unknown(what: str, name: str, valid: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, names, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ""
     return f"unknown {what} {name!r}{hint} (valid: {', '.join(names) or 'none'})"
+
+
+@contextmanager
+def name_file(file: object) -> Iterator[None]:
+    """Start the text of an error about the contents of a file with its path."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error

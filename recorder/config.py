@@ -46,7 +46,7 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             times this long, so that the last messages of other nodes are recorded.
     """
 
-    plant: str = "cstr"
+    plant: str = keys.DEFAULT_PLANT
     out: str = "."
     key_expression: str = keys.EVERYTHING
     health_period_s: float = 5.0

@@ -14,6 +14,8 @@ import structlog
 from tests.running import Command
 
 ROOT = Path(__file__).parents[1]
+WAITING = ("end_to_end", "integration")
+"""Folders of tests that wait for processes to start, or for as long as a cut lasts, half of the time."""
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command does: the last bits depend on it
 
@@ -23,15 +25,23 @@ hypothesis.settings.load_profile("reactorwatch")
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """One more than there are cores: half of the time tests wait, for processes to start or for what a cut lasts."""
+    """One more than there are cores, as some tests wait."""
     return len(os.sched_getaffinity(0)) + 1
 
 
-def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
-    """Some files whole, all other tests one by one; see there."""
-    from tests.together import scheduling
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mix the files that wait among those that compute, so that no core is idle; the last quarter computes.
 
-    return scheduling(config, log) if config.getvalue("dist") == "loadgroup" else None
+    Workers take the files in this order. Where there is one process, the order stays that of the folders.
+    """
+    if not hasattr(config, "workerinput"):
+        return
+    files = dict.fromkeys(item.path for item in items)
+    waiting = [path for path in files if path.parent.name in WAITING]
+    computing = [path for path in files if path.parent.name not in WAITING]
+    position = {path: 0.75 * number / len(waiting) for number, path in enumerate(waiting)}
+    position |= {path: number / len(computing) for number, path in enumerate(computing)}
+    items.sort(key=lambda item: position[item.path])
 
 
 @pytest.fixture(scope="session")

@@ -89,12 +89,13 @@ def violations(source: str) -> set[str]:
     tree = ast.parse(source)
     owners: dict[int, str] = {}
     found: set[str] = set()
-    for name, node in _definitions(tree):
+    definitions = list(_definitions(tree))
+    for name, node in definitions:
         owners.update(dict.fromkeys(range(_first_line(node), (node.end_lineno or node.lineno) + 1), name))
         if isinstance(node, _Function) and is_participle(node.name) and not _is_flag(node):
             found.add(f"{name}: participle")
     docstrings: set[int] = set()
-    for name, constant, text in _docstrings(tree):
+    for name, constant, text in _docstrings(tree, definitions):
         docstrings.add(id(constant))
         if HEAD.match(text):
             found.add(f"{name}: head")
@@ -158,9 +159,12 @@ def _target(node: _Assignment) -> str:
     return ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target)
 
 
-def _docstrings(tree: ast.Module) -> Iterator[tuple[str, ast.Constant, str]]:
+def _docstrings(
+    tree: ast.Module, definitions: list[tuple[str, _Definition | _Assignment]]
+) -> Iterator[tuple[str, ast.Constant, str]]:
     """Docstrings of a module, of its classes and functions, and below assigned names."""
-    for name, node in [("module", tree), *_definitions(tree)]:
+    modules: list[tuple[str, ast.Module | _Definition | _Assignment]] = [("module", tree)]
+    for name, node in [*modules, *definitions]:
         if isinstance(node, _Assignment):
             continue
         before: ast.stmt | None = None

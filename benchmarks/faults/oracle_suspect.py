@@ -14,11 +14,14 @@ import numpy as np
 
 from benchmarks.faults.bank import BANK, Case
 from benchmarks.faults.runs import NOISE_SD, SIGNAL, Truth, measurements_of, profile_changes, simulator_of
-from monitor_node.isolation.causes import CAUSES
+from monitor_node.isolation.causes import causes_of
 from reactorwatch.arrays import Array
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.integrate import SimulationError
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record
+
+CAUSES = causes_of(cstr())
 
 REACH = 3.0
 """Sizes up to this times the large one of the bank are tried."""

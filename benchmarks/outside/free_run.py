@@ -18,7 +18,7 @@ from benchmarks.outside.command import run
 from benchmarks.outside.table import Row
 from reactorwatch.errors import InputError
 
-MODELS = ("arx", "oe", "armax", "bj", "narx")
+MODELS = ("arx", "oe", "armax", "bj", "narx", "noe")
 ORDERS = (1, 2, 3, 4)
 SETTLE = 50
 _TANKS = ("--time-unit", "s", "--input", "pump_V", "--output", "level_V")

@@ -10,7 +10,7 @@ from benchmarks.study_figures.figure import Figure, Finding
 from benchmarks.study_figures.measured_records import measured_figure
 from benchmarks.study_figures.page import FOLDER, page
 from benchmarks.study_figures.study import Study
-from reactorwatch.cli.batch import run_in_order
+from reactorwatch.cli.batch import results_in_order
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import fill_folder, make_folder
@@ -77,10 +77,11 @@ def reproduce(
     with fill_folder(out, "--out") as folder:
         pictures = make_folder(folder / FOLDER).absolute()
         jobs = [Job(figure.key, pictures / figure.file_name, seed, measured, data) for figure in figures]
-        for figure, finding in zip(figures, run_in_order(draw, jobs, "reproducing", processes, scheduler), strict=True):
-            if isinstance(finding, Failed):
-                raise (RuntimeError if finding.is_internal else InputError)(f"{figure.heading}: {finding.reason}")
-            found.append((figure, finding))
+        with results_in_order(draw, jobs, "reproducing", processes, scheduler) as findings:
+            for figure, finding in zip(figures, findings, strict=True):
+                if isinstance(finding, Failed):
+                    raise (RuntimeError if finding.is_internal else InputError)(f"{figure.heading}: {finding.reason}")
+                found.append((figure, finding))
         text = page(found, seed, measured.name if measured else "")
         with atomic_write(folder / PAGE) as temporary:
             temporary.write_text(text, encoding="utf-8")

@@ -47,12 +47,14 @@ class Screening(NamedTuple):
         disturbed_intervals: disturbed rows, each (first, last), both included.
         shifts: deviation of each interval's mean, in robust standard deviations of single values.
         outliers: number of single values left out.
+        left_out: shape (n,), True in disturbed rows and for outliers.
     """
 
     usable: Mask
     disturbed_intervals: list[tuple[int, int]]
     shifts: list[float]
     outliers: int
+    left_out: Mask
 
     @property
     def refused(self) -> bool:
@@ -70,7 +72,7 @@ def screen_baseline(z: Array, smallest_sd: float = 0.0) -> Screening:
     """
     present = np.isfinite(z)
     if not present.any():
-        return Screening(present, [], [], 0)
+        return Screening(present, [], [], 0, np.zeros(z.size, np.bool_))
     centre, sd = _centre_and_sd(z[present], smallest_sd)
     size = max(SMALLEST_BLOCK, z.size // BLOCKS)
     starts = np.arange(0, z.size - size + 1, size)
@@ -85,7 +87,8 @@ def screen_baseline(z: Array, smallest_sd: float = 0.0) -> Screening:
     centre, sd = _centre_and_sd(z[screen_baseline], smallest_sd)
     shifts = [float(np.nanmean(z[first : last + 1]) - centre) / max(sd, 1e-300) for first, last in disturbed_intervals]
     single = screen_baseline & (np.abs(np.where(present, z, centre) - centre) > OUTLIER * sd) & (sd > 0)
-    return Screening(screen_baseline & ~single, disturbed_intervals, shifts, int(np.count_nonzero(single)))
+    usable = screen_baseline & ~single
+    return Screening(usable, disturbed_intervals, shifts, int(np.count_nonzero(single)), present & ~usable)
 
 
 def _centre_and_sd(z: Array, smallest_sd: float) -> tuple[float, float]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
 from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_structure, fewest_rows
-from monitor_node.baseline.references import ArxReference, ProcessReference, Reference, estimate_training_noise
+from monitor_node.baseline.references import ArxReference, ProcessReference, Reference
 from monitor_node.baseline.resolution import resolution_sd
 from monitor_node.baseline.signal_range import possible_ranges
 from monitor_node.config import MonitorConfig
@@ -79,11 +79,14 @@ class TrainingResult(NamedTuple):
         z: residuals as the reference normalises them, shape (n, outputs); NaN if missing.
         e: the same, prewhitened.
         measured: outputs in undisturbed rows, shape (n, outputs); NaN elsewhere.
+        values: all signals, the inputs first, shape (n, inputs + outputs); NaN where disturbed or left out. Unlike
+            `measured` it has rows that could not be predicted.
         checks: checks of the training.
         refused: reason to start again; empty if the training is usable.
         left_out: signals that cannot be monitored, with the reason.
         responses: response of each residual to a lasting step of one unit of its output, shape (outputs, rows); NaN
             where there is no model; None for equations.
+        outliers: number of single values of each output that were left out.
     """
 
     reference: Reference
@@ -91,10 +94,12 @@ class TrainingResult(NamedTuple):
     z: Array
     e: Array
     measured: Array
+    values: Array
     checks: list[Check]
     refused: str
     left_out: dict[str, str]
     responses: Array | None
+    outliers: list[int]
 
 
 MOST_OUT_OF_RANGE = 1.0 / 3.0
@@ -222,8 +227,9 @@ class Training:
             _refusal(outputs, screenings, evaluated) if any(evaluated) else "; ".join(dict.fromkeys(left_out.values()))
         )
         if refused and last_chance and any(evaluated):
-            refused, screenings = "", [Screening(np.isfinite(column), [], [], 0) for column in z.T]
+            refused, screenings = "", [Screening(known, [], [], 0, np.zeros_like(known)) for known in np.isfinite(z).T]
         usable = np.column_stack([item.usable for item in screenings]) & np.array(evaluated)
+        disturbed = np.column_stack([item.left_out for item in screenings]) | ~np.array(evaluated)
         z = np.where(usable, z, np.nan)
         if isinstance(reference, ProcessReference | BlackBoxReference):
             smallest = [sd / typical for sd, typical in zip(smallest, reference.typical_sd, strict=True)]
@@ -244,9 +250,13 @@ class Training:
         if isinstance(reference, ArxReference):
             checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
+        inputs = np.where([name not in left_out for name in self._config.inputs], inputs, np.nan)
+        values = np.hstack([inputs, np.where(disturbed, np.nan, measured)])
         measured = np.where(usable, measured, np.nan)
-        responses = self._step_responses(reference)
-        return TrainingResult(reference, learned, z, e, measured, checks, refused, left_out, responses)
+        responses, outliers = self._step_responses(reference), [item.outliers for item in screenings]
+        return TrainingResult(
+            reference, learned, z, e, measured, values, checks, refused, left_out, responses, outliers
+        )
 
     def _step_responses(self, reference: Reference) -> Array | None:
         if isinstance(reference, BlackBoxReference):
@@ -361,8 +371,7 @@ class Training:
     ) -> ProcessReference:
         outputs = self._config.outputs
         assert self._model is not None
-        noise = estimate_training_noise(self._model, outputs, time_min, inputs, measured, smallest)
-        return ProcessReference(self._model, outputs, noise)
+        return ProcessReference.fit(self._model, outputs, time_min, inputs, measured, smallest)
 
 
 def _refit_without_outliers(residuals: Callable[[Array], Residuals], measured: Array) -> tuple[Array, list[Screening]]:

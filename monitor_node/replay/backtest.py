@@ -13,7 +13,7 @@ from monitor_node.state.pipeline_state import PipelineState
 from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm, Baseline
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Promise
 from reactorwatch.process.model import ProcessModel
 
 RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
@@ -56,6 +56,7 @@ class Backtest:
         noise_levels: standard deviations of the equations' filter: of each sensor in its unit (`sensors`), of each
             state in its unit per square root of a minute (`states`); None with another reference.
         training_rows: number of rows of the training; 0 if no row was evaluated.
+        promise: promise of false alarms for the evaluated rows; None if no row was evaluated.
         baseline: change of the model after the diagnosis of the training; None: rows were evaluated by the equations as
             given.
     """
@@ -78,6 +79,7 @@ class Backtest:
     noise_levels: dict[str, dict[str, float]] | None = None
     baseline: Baseline | None = None
     training_rows: int = 0
+    promise: Promise | None = None
 
     @property
     def raised_alarms(self) -> list[tuple[Alarm, int | None]]:
@@ -182,6 +184,7 @@ def run(
         noise_levels=monitor.noise_levels,
         baseline=monitor.baseline,
         training_rows=monitor.pipeline.training_rows if trained is None else trained.rows,
+        promise=monitor.promise,
     )
 
 

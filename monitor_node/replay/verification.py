@@ -30,7 +30,10 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 
 COMPARED = frozenset(
-    {keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.ALARM_KPIS, keys.RECONSTRUCTION, keys.BASELINE}
+    {
+        *(keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.ALARM_KPIS, keys.RECONSTRUCTION),
+        *(keys.BASELINE, keys.PROMISE),
+    }
 )
 """Kinds of messages that follow from the samples; health does not."""
 

@@ -6,12 +6,17 @@ A row passes the hooks in this order. Before the end of the training only `on_ro
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import numpy as np
+
 from monitor_node.alarms.alarms import ChartAlarm, Explanation, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
+from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.spc.charts.base import Judgement
+from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.training_errors import TrainingErrors
 
 PLANT = "plant"
 """Name in place of a signal for alarms of all signals together."""
@@ -65,6 +70,18 @@ class SignalCheck:
             e: prewhitened residuals of each output; NaN where there are none.
             arl0: run length of each alarm without a fault, in rows.
         """
+
+    def relative_rates(self, learned: Sequence[Prewhitening], arl0: float, errors: TrainingErrors) -> Array:
+        """Rate of false alarms by the errors of the training, in shares of one alarm, shape (draws, outputs).
+
+        After `start`; of a check that chance can raise. Where it is not known, each has its share.
+
+        Args:
+            learned: prewhitening of each output.
+            arl0: run length of each alarm without a fault, in rows.
+            errors: errors of all outputs.
+        """
+        return np.ones_like(errors.mean)
 
     def on_row(self, time_ns: int, values: tuple[float, ...]) -> list[Publication]:
         """Check a row, inputs first; values are NaN where missing."""

@@ -21,7 +21,10 @@ from monitor_node.signal_checks.range import RangeCheck
 from monitor_node.signal_checks.spike import SpikeCheck, SpikeState
 from monitor_node.signal_checks.stuck import StuckCheck, StuckState
 from monitor_node.signal_checks.timeout import DataTimeoutState, SilenceCheck
+from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
+from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.training_errors import TrainingErrors
 from reactorwatch.stored_state import StoredState
 
 
@@ -55,8 +58,11 @@ class SignalChecks:
         numbers: numbers of the plant's stages, see `row_step.row_type`; None: the checks have their own.
     """
 
-    CHANCE_ALARMS = sum(check.can_be_false for check in CHECKS)
-    """Number of an output's alarms that can be false alarms."""
+    CHANCE_NAMES = tuple(check.name for check in CHECKS if check.can_be_false)
+    """Names of an output's alarms that can be false alarms."""
+
+    CHANCE_ALARMS = len(CHANCE_NAMES)
+    """Number of them."""
 
     def __init__(
         self,
@@ -118,6 +124,26 @@ class SignalChecks:
         """Learn from the training; arguments as for `SignalCheck.start`."""
         for check in self._checks:
             check.start(values, e, arl0)
+
+    def relative_rates(
+        self, learned: Sequence[Prewhitening], evaluated: Sequence[bool], arl0: float, errors: TrainingErrors
+    ) -> Array:
+        """Rate of all false alarms by the errors of the training, in shares of one alarm, shape (draws,).
+
+        Args:
+            learned: prewhitening of each output.
+            evaluated: for each output, True if it is evaluated.
+            arl0: run length of each alarm without a fault, in rows.
+            errors: errors of all outputs.
+        """
+        of_checks = (check.relative_rates(learned, arl0, errors) for check in self._checks if check.can_be_false)
+        return sum((rates[:, list(evaluated)].sum(axis=1) for rates in of_checks), np.zeros(len(errors.mean)))
+
+    def learn_spike_rates(self, counts: Sequence[int], rows: int, period_ns: float, arl0: float) -> None:
+        """Learn how often spikes are usual; arguments as for `SpikeCheck.learn_rates`."""
+        for check in self._checks:
+            if isinstance(check, SpikeCheck):
+                check.learn_rates(counts, rows, period_ns, arl0)
 
     # --- state -----------------------------------------------------------------------------------------------
 

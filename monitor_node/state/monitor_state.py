@@ -4,10 +4,8 @@ The bytes are MessagePack behind a seal (see `seal`): damaged bytes are refused.
 with another model of the plant, is refused as well, and the difference is named.
 """
 
-from hashlib import blake2b
 from typing import Any
 
-import casadi as ca
 import msgspec
 
 from monitor_node.config import MonitorConfig
@@ -15,10 +13,11 @@ from monitor_node.ingest.alignment import AlignmentState
 from monitor_node.ingest.sequence_check import SequenceCheck
 from monitor_node.state import version_2, version_3
 from monitor_node.state.pipeline_state import PipelineState
-from monitor_node.state.seal import DIGEST_BYTES, Seal
+from monitor_node.state.seal import Seal
 from reactorwatch.errors import InputError
 from reactorwatch.process import EFFECTS_OF
-from reactorwatch.process.extended_model import extended_model_of
+from reactorwatch.process.extended_model import extended_model_of, is_complete
+from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import StoredState
 
@@ -98,22 +97,9 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
             del fields[name]
     if model is not None:
         del fields["units"]  # the equations have their own
-    fields |= {"points": points, "equations": fingerprint(model)}
+    fields |= {"points": points, "equations": "" if model is None else fingerprint(model)}
     settings: dict[str, Any] = msgspec.msgpack.decode(msgspec.msgpack.encode(fields))  # as they are read back
     return settings
-
-
-def fingerprint(model: ProcessModel | None) -> str:
-    """Digest of a model's equations, names and numbers; empty without a model."""
-    if model is None:
-        return ""
-    x, u, p = model.arguments()
-    memory = [*model.at_rest.values(), *model.resets.values()]
-    function = ca.Function("memory", [x, u, p], memory, {"allow_free": True})
-    words = (model.name, *model.state_names, *model.input_names, *model.output_names, *model.parameter_names)
-    texts = (*words, *model.breakpoints, *model.at_rest, *model.resets, model.function().serialize())
-    values = model.values().tobytes()
-    return blake2b("\0".join((*texts, function.serialize())).encode() + values, digest_size=DIGEST_BYTES).hexdigest()
 
 
 def equations_text(model: ProcessModel | None) -> str:
@@ -121,7 +107,7 @@ def equations_text(model: ProcessModel | None) -> str:
     if model is None or model.name not in EFFECTS_OF:
         return ""
     extended = extended_model_of(model)
-    if fingerprint(extended.build()) != fingerprint(model):
+    if not is_complete(extended, model):
         return ""
     return msgspec.json.encode(extended.to_object()).decode()
 

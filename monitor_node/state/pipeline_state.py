@@ -4,6 +4,7 @@ import msgspec
 
 from monitor_node.baseline.black_box_reference import BlackBoxReferenceState
 from monitor_node.baseline.predictor import PredictorState
+from monitor_node.baseline.promise import PromiseState
 from monitor_node.baseline.references import ArxReferenceState, ProcessReferenceState
 from monitor_node.baseline.training import TrainingState
 from monitor_node.chart_stage import ChartsState
@@ -32,6 +33,7 @@ class TrainedState(StoredState, frozen=True):
         until_drift: number of rows until the next drift point.
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
         shift: tests for lasting steps, one an output; empty without them, and in states of earlier versions.
+        promise: state of the promise of false alarms; None: it was stored by a version without one.
     """
 
     reference: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
@@ -46,6 +48,7 @@ class TrainedState(StoredState, frozen=True):
     until_drift: int
     baseline: bytes = b""
     shift: list[StepTestState] = msgspec.field(default_factory=list)
+    promise: PromiseState | None = None
 
 
 class KeptBaseline(StoredState, frozen=True):

@@ -110,7 +110,10 @@ class StateRecovery:
 
     def _wait_for_router(self) -> None:
         """Wait until this monitor is connected and sees the others."""
-        while not (self._bus.has_router or self._ended.is_set()):
-            while not (self._bus.has_router or self._ended.wait(POLL_S)):
-                pass
+        while self._is_alone():
+            while self._is_alone():
+                self._ended.wait(POLL_S)
             self._ended.wait(RETURN_S)
+
+    def _is_alone(self) -> bool:
+        return not (self._bus.has_router or self._ended.is_set())

@@ -34,6 +34,7 @@ class RaisedAlarm(msgspec.Struct, frozen=True):
         raised_min: minute in which it was raised.
         cleared_min: minute in which it was cleared; None: it is active at the end.
         signals: signals that contributed to it.
+        contributions: share of each of them.
         suspect: likely causes, the likeliest first.
     """
 
@@ -42,6 +43,7 @@ class RaisedAlarm(msgspec.Struct, frozen=True):
     raised_min: float
     cleared_min: float | None
     signals: list[str]
+    contributions: list[dict[str, Any]]
     suspect: list[Suspect]
 
 
@@ -55,6 +57,8 @@ class BacktestResult(msgspec.Struct, frozen=True):
         runs: number of runs of the plant.
         trained_until_min: end of the training; None: the record is shorter.
         expected_false_alarms: number of alarms expected by chance after the training.
+        promise: promise of false alarms, and how training and rows bear it out; None: no row was judged.
+        power: for each deviation the sizes that are seen within 10 min, an hour and a day.
         signals: inputs, outputs, and signals that are not watched with the reason.
         reference: model that the rows are judged by, `equations` or `arx`; None: no row was judged.
         noise_levels: standard deviations of the equations' noise; None: they did not judge.
@@ -70,6 +74,8 @@ class BacktestResult(msgspec.Struct, frozen=True):
     runs: int
     trained_until_min: float | None
     expected_false_alarms: float
+    promise: dict[str, Any] | None
+    power: list[dict[str, Any]]
     signals: dict[str, Any]
     reference: str | None
     noise_levels: dict[str, dict[str, float]] | None

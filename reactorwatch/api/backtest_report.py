@@ -9,6 +9,8 @@ import msgspec
 from monitor_node.replay.backtest import Backtest
 from reactorwatch.api.alarm_lines import alarm_headline, alarm_lines
 from reactorwatch.contract.alarm_text import priority_word
+from reactorwatch.contract.messages_pb2 import Promise
+from reactorwatch.contract.promise_text import describe_power, promise_fields
 from reactorwatch.records.record import to_minutes
 from reactorwatch.terminal import printable_lines
 
@@ -38,6 +40,7 @@ def backtest_object(
         "runs": result.runs,
         "trained_until_min": 0.0 if is_trained else minutes(result.watching_since_ns),
         "expected_false_alarms": float(f"{result.expected_false_alarms:.3g}"),
+        **_promise(result.promise, result.expected_false_alarms),
         "signals": {
             "inputs": [name for name in result.inputs if name not in result.left_out],
             "outputs": [name for name in result.outputs if name not in result.left_out],
@@ -53,6 +56,7 @@ def backtest_object(
                 "raised_min": minutes(alarm.raised_ns),
                 "cleared_min": minutes(cleared_ns),
                 "signals": [item.signal for item in alarm.contributions],
+                "contributions": [{"signal": item.signal, "share": item.share} for item in alarm.contributions],
                 "suspect": [
                     {"cause": item.cause, "probability": item.probability, "text": item.text} for item in alarm.suspects
                 ],
@@ -60,6 +64,20 @@ def backtest_object(
             for alarm, cleared_ns in result.raised_alarms
         ],
     }
+
+
+def _promise(promise: Promise | None, expected: float) -> dict[str, Any]:
+    """Fields `promise`, for the rows that were judged, and `power`.
+
+    Args:
+        promise: the promise at the end of the record; None: no row was judged.
+        expected: false alarms promised in these rows.
+    """
+    fields = promise_fields(promise)
+    if promise is not None:
+        upper = expected * promise.expected_90 / promise.expected
+        fields["promise"] |= {"expected": float(f"{expected:.3g}"), "expected_90": float(f"{upper:.3g}")}
+    return fields
 
 
 def _baseline(result: Backtest, minutes: Callable[[int], float | None]) -> dict[str, Any] | None:
@@ -92,6 +110,10 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path, *, is_trained: boo
             f"{report['expected_false_alarms']:.2g} false alarms are to be expected in the rest by chance"
         )
         lines.append(_reference_line(result))
+        if result.promise is not None:
+            lines.append(f"promise: {result.promise.text}")
+        if report["power"]:
+            lines.append(f"seen within an hour, in nine of ten cases: {describe_power(report['power'])}")
     lines += alarm_lines(result.raised_alarms, zero_ns)
     lines += [f"  note: {note}" for note in result.notes]
     if not result.raised_alarms and report["trained_until_min"] is not None:

@@ -12,6 +12,7 @@ from reactorwatch.api.records import ProcessLike, check_signals, process_of
 from reactorwatch.api.report_origin import report_origin
 from reactorwatch.api.views import diagnosis as view
 from reactorwatch.description.find import find_process
+from reactorwatch.description.toml_file import add_description
 from reactorwatch.diagnosis.diagnose import diagnose as find_causes
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import report_object
@@ -129,5 +130,6 @@ def diagnose(
     known = described.uncertain | dict(uncertain or {})
     found = find_causes(record, model, causes, dict(tolerance or {}) or None, known, dict(limits or {}) or None)
     values = {item.name: getattr(found, item.name) for item in fields(found)}
+    values["extended_model"] = add_description(found.extended_model, described)
     seconds = time.monotonic() - started
     return DiagnosisResult(**values, record=record, model=model, effects=causes, seconds=seconds)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from reactorwatch.contract.codec import Encoded, encode
-from reactorwatch.contract.keys import check_plant
+from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS, FileFormat
@@ -20,8 +20,6 @@ from reactorwatch.records.source_text import TABLE_SUFFIXES, is_table
 
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process
-
-DEFAULT_PLANT = "cstr"
 
 
 def record(

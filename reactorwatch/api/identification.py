@@ -1,6 +1,7 @@
 """Identify linear models of a record from Python."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,13 +89,13 @@ def identify(
         input: names of the inputs, none, one or several; None: those of the process.
         validate: record to validate on; all of `record` is then fitted.
         settle: number of first held-out rows that may set the state, and are left out of the fits.
-        form: `model` (`arx`, `oe`, `armax`, `bj`, `narx`), `order`, `delay` and `recursive`, like the options of the
-            command.
+        form: `model` (`arx`, `oe`, `armax`, `bj`, `narx`, `noe`), `order`, `delay`, `scheme`, `recursive`,
+            `forgetting`, `adaptation` and `gain`, like the options of the command.
 
     Raises:
         InputError: a signal is missing, the record cannot determine the model, or `form` has another name.
     """
-    known = ("model", "order", "delay", "recursive")
+    known = [field.name for field in fields(ModelForm)]
     for name in form:
         if name not in known:
             raise InputError(describe_unknown("argument", name, known))

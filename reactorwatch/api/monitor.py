@@ -10,7 +10,6 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor as MonitorCore
 from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.watched_process import load_process, watch_process
-from reactorwatch.api.files import DEFAULT_PLANT
 from reactorwatch.api.records import ProcessLike
 from reactorwatch.api.rows import iterate_rows
 from reactorwatch.contract import keys
@@ -161,4 +160,4 @@ def monitor_settings(settings: Mapping[str, Any]) -> MonitorConfig:
     Raises:
         InputError: an unknown name or a value outside its range.
     """
-    return section(MonitorConfig, "monitor", {}, {"plant": DEFAULT_PLANT} | dict(settings))
+    return section(MonitorConfig, "monitor", {}, {"plant": keys.DEFAULT_PLANT} | dict(settings))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from monitor_node.config import DEFAULT_TRAINING_ROWS, MonitorConfig
+from monitor_node.config import DEFAULT, DEFAULT_TRAINING_ROWS, MonitorConfig
 from monitor_node.replay.backtest import Backtest, TrainedPlant, run, train
 from monitor_node.replay.record_checks import check_training_record
 from monitor_node.replay.report_watch import watch
@@ -27,7 +27,6 @@ from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.description.find import DEFAULT_PROCESS
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.record import to_minutes, to_time_ns
@@ -125,13 +124,13 @@ class _Opened(NamedTuple):
 def choose_settings(settings: MonitorConfig, choice: ProcessChoice) -> ProcessChoice:
     """Choice of a process with that of the settings, where no other is named.
 
-    Signals in the settings that are none of the reactor's describe a process without equations.
+    Signals in the settings that are none of the default process's describe a process without equations.
     """
     if not choice.is_default:
         return choice
-    if settings.process is not None or settings.is_reactor:
-        needs_reactor = settings.reference == "equations"
-        return ProcessChoice(settings.process or (DEFAULT_PROCESS if needs_reactor else None))
+    if settings.process is not None or settings.is_default_process:
+        needs_default = settings.reference == "equations"
+        return ProcessChoice(settings.process or (DEFAULT_PROCESS if needs_default else None))
     return ProcessChoice(None, settings.inputs, settings.outputs)
 
 
@@ -187,7 +186,7 @@ def run_job(job: Job) -> JobResult:
         text = backtest_text(result, zero_ns, job.file, is_trained=job.trained is not None)
     remarks = [f"read as: {source.read_as}"] if source.read_as else []
     if opened.process is None or model is not None:
-        remarks += filter(None, [first.unit_remark(model or cstr())])
+        remarks += filter(None, [first.unit_remark(model or DEFAULT.require_model())])
     logged = None if log is None else RowsOfFile(job.file, _logged_rows(log, source, zero_ns), zero_ns)
     return JobResult(text, _row(job.file, found), remark="; ".join(remarks), extra=logged)
 
@@ -232,7 +231,7 @@ def _open(file: Path, asked: BacktestOptions, *, learns: bool) -> _Opened:
     source = source._replace(messages=messages)
     if choice.is_default:
         recorded = source.process if source.measured is None else None
-        if recorded is None or recorded.name == cstr().name:
+        if recorded is None or recorded.name == DEFAULT.name:
             return _Opened(source, load_process(limit_training(settings, rows)), None, {})
         return _Opened(source, watch_process(settings, recorded, rows), recorded, {})
     process = choice.load(source.zero_ns or 0, on_bus=True)

@@ -7,7 +7,8 @@ a single file itself.
 import csv
 import glob
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -137,18 +138,19 @@ def run_jobs(
         return
     rows: list[Row] = []
     extras: list[Any] = []
-    for file, outcome in zip(files, run_in_order(kind.work, jobs, kind.doing, processes, scheduler), strict=True):
-        if isinstance(outcome, Failed):
-            reason = _strip_name(outcome.reason, file)
-            print_lines(f"reactorwatch: {file}: {reason}", err=True)
-            rows.append({"file": str(file), **dict.fromkeys(kind.columns), "error": reason})
-        else:
-            print_report(outcome.text, as_json=as_json)
-            write_remark(file, outcome.remark)
-            if outcome.not_written:
-                print_lines(f"reactorwatch: {file}: {outcome.not_written}", err=True)
-            rows.append(outcome.row)
-            extras.append(outcome.extra)
+    with results_in_order(kind.work, jobs, kind.doing, processes, scheduler) as outcomes:
+        for file, outcome in zip(files, outcomes, strict=True):
+            if isinstance(outcome, Failed):
+                reason = _strip_name(outcome.reason, file)
+                print_lines(f"reactorwatch: {file}: {reason}", err=True)
+                rows.append({"file": str(file), **dict.fromkeys(kind.columns), "error": reason})
+            else:
+                print_report(outcome.text, as_json=as_json)
+                write_remark(file, outcome.remark)
+                if outcome.not_written:
+                    print_lines(f"reactorwatch: {file}: {outcome.not_written}", err=True)
+                rows.append(outcome.row)
+                extras.append(outcome.extra)
     failed = sum(bool(row["error"]) for row in rows)
     if len(rows) > 1 and not as_json:
         print_report(f"\n{kind.summary(rows)}")
@@ -160,10 +162,14 @@ def run_jobs(
         raise typer.Exit(2)
 
 
-def run_in_order(
+@contextmanager
+def results_in_order(
     work: Callable[[Job], Result], jobs: Sequence[Job], doing: str, processes: int | None, scheduler: str | None
-) -> Iterator[Result | Failed]:
-    """Yield the results of jobs in their order, with a bar that counts the finished ones.
+) -> Generator[Iterator[Result | Failed]]:
+    """Run jobs, with a bar that counts the finished ones; leaving the context ends the work.
+
+    Left to the garbage collection, the work would be ended while nothing handles the interrupt, which would be raised
+    again in the midst of it.
 
     Args:
         work: a plain function.
@@ -172,19 +178,22 @@ def run_in_order(
         processes: number of processes; None: one a core.
         scheduler: address of a cluster, or None.
 
+    Yields:
+        The results in the order of the jobs.
+
     Raises:
         InputError: there are no such workers.
     """
     executor = choose_executor(processes, scheduler)
-    with bar(doing, len(jobs)) as advance:
+    with bar(doing, len(jobs)) as advance, closing(executor.map_unordered(work, jobs)) as outcomes:
 
         def count_results() -> Iterator[tuple[int, Result | Failed]]:
             advance(0, f"{doing}, none of {len(jobs)} done")
-            for count, done in enumerate(executor.map_unordered(work, jobs), start=1):
+            for count, done in enumerate(outcomes, start=1):
                 advance(count, f"{doing}, {count} of {len(jobs)} done")
                 yield done
 
-        yield from in_job_order(count_results())
+        yield in_job_order(count_results())
 
 
 def write_remark(file: Path, remark: str) -> None:

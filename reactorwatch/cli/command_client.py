@@ -59,7 +59,7 @@ def send_command(
 
     tables, bus_config = load_settings(config, endpoint)
     try:
-        plant = keys.check_plant(plant or str(tables.get(node, {}).get("plant") or "cstr"))
+        plant = keys.check_plant(plant or str(tables.get(node, {}).get("plant") or keys.DEFAULT_PLANT))
     except ValueError as error:
         raise InputError(str(error)) from error
     stop = StopSignal()

@@ -1,7 +1,7 @@
 """Read and check a record, diagnose the simulation against it, and write the report."""
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeAlias
@@ -13,12 +13,13 @@ from reactorwatch.api.files import described_process, process_on_clock, record
 from reactorwatch.api.report_origin import report_origin
 from reactorwatch.cli.options import check_recording
 from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.process import Process
+from reactorwatch.description.toml_file import add_description
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.parameter_priors import parse_priors
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import report_object
 from reactorwatch.diagnosis.result import Diagnosis, Experiment
-from reactorwatch.process import MODELS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
@@ -77,6 +78,7 @@ class Case:
         effects: possible causes.
         uncertain: standard deviations of uncertain parameters, by name.
         asked: options of the diagnosis.
+        process: the process, for the file of the extended model; None: that file describes no signals.
     """
 
     file: Path
@@ -86,6 +88,7 @@ class Case:
     folder: Path | None
     uncertain: dict[str, float] = field(default_factory=dict)
     asked: DiagnosisOptions = field(default_factory=DiagnosisOptions)
+    process: Process | None = None
 
 
 def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path | None = None) -> Case:
@@ -109,7 +112,7 @@ def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path
     if asked.uncertain is not None:
         known = known | parse_priors(asked.uncertain, model)
     make_run(measured, model)
-    return Case(file, measured, model, simulated.select_causes(asked.without), folder, known, asked)
+    return Case(file, measured, model, simulated.select_causes(asked.without), folder, known, asked, simulated)
 
 
 def run_diagnosis(
@@ -122,6 +125,8 @@ def run_diagnosis(
     """
     started = time.monotonic()
     diagnosis = diagnose(case.measured, case.model, case.effects, tolerance, case.uncertain, limits)
+    if case.process is not None:
+        diagnosis = replace(diagnosis, extended_model=add_description(diagnosis.extended_model, case.process))
     return diagnosis, time.monotonic() - started
 
 
@@ -136,7 +141,6 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
 
     assert case.folder is not None
     folder = case.folder
-    on_the_bus = any(make().name == case.model.name for make in MODELS)  # so that its extended model can be loaded
     files = (str(case.file), str(folder / MODEL), str(folder / EXPERIMENT))
     asked = case.asked
     settings = {
@@ -149,7 +153,7 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
         "columns": asked.columns,
     }
     origin = report_origin(case.file, settings)
-    page = as_page(diagnosis, case.model, case.effects, *files, on_the_bus=on_the_bus, origin=origin)
+    page = as_page(diagnosis, case.model, case.effects, *files, origin=origin)
     plain = msgspec.json.format(
         msgspec.json.encode(report_object(diagnosis, str(case.file), seconds, case.measured.zero)), indent=2
     )

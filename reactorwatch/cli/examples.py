@@ -19,7 +19,8 @@ def example(
     name: Annotated[
         str,
         typer.Argument(
-            help="sound, leak, fouling, analyser_drift, two_causes or unknown (a law in no catalogue).",
+            help="Of cstr: sound, leak, fouling, analyser_drift, two_causes or unknown (a law in no catalogue); "
+            "three_tanks or cascaded_tanks.",
             show_default=False,
         ),
     ],

@@ -15,15 +15,13 @@ from reactorwatch.identification.identify import Coefficients, Identification, M
 from reactorwatch.identification.selection import Selection, select
 from reactorwatch.records.record import Record
 
-DEFAULT_OUTPUTS = {DEFAULT_PROCESS: ("T",)}
-"""Outputs that are identified where none is named, by process; else all."""
-
 NAMES = {
     "arx": "ARX",
     "oe": "OE",
     "armax": "ARMAX",
     "bj": "Box-Jenkins model",
     "narx": "polynomial NARX",
+    "noe": "polynomial output-error",
 }
 
 
@@ -61,7 +59,7 @@ def choose_outputs(
     for output in outputs:
         if output not in described.outputs:
             raise InputError(describe_unknown("--output", output, described.outputs))
-    return described, outputs or DEFAULT_OUTPUTS.get(described.name, described.outputs)
+    return described, outputs or described.watch.identified or described.outputs
 
 
 def fit(

@@ -35,10 +35,19 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     elif signal.getsignal(signal.SIGALRM) is signal.SIG_IGN:  # it was on its way when the interrupts were cleared
         return
     signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
-    if isinstance(sys.exception(), KeyboardInterrupt):  # it is being handled
+    if _is_handled(sys.exception()):
         return
     while frame is not None:
         if frame.f_code.co_name.startswith(_CALLBACKS):
             return
         frame = frame.f_back
     raise KeyboardInterrupt
+
+
+def _is_handled(error: BaseException | None) -> bool:
+    """True while an interrupt is handled, also by closing a generator, whose GeneratorExit has it as context."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__context__
+    return False

@@ -43,7 +43,7 @@ NAME = "reactorwatch"
 
 app = typer.Typer(
     name=NAME,
-    help="Watches a chemical reactor as it runs, and explains it when it misbehaves.",
+    help="Watches a process plant as it runs, and explains it when it misbehaves.",
     no_args_is_help=True,
     rich_markup_mode=None,  # importing rich for the help alone takes longer than all the rest
     pretty_exceptions_enable=False,
@@ -80,7 +80,7 @@ def _print_version(wanted: bool) -> None:
 def _root(
     _version: bool = typer.Option(False, "--version", callback=_print_version, is_eager=True, help="Show the version."),
 ) -> None:
-    """Watches a chemical reactor as it runs, and explains it when it misbehaves."""
+    """Watches a process plant as it runs, and explains it when it misbehaves."""
 
 
 def main() -> None:

@@ -49,7 +49,7 @@ def identify(
             show_default=False,
         ),
     ] = None,
-    model: Annotated[str, typer.Option(help="arx, oe, armax, bj (Box-Jenkins) or narx (polynomial).")] = "arx",
+    model: Annotated[str, typer.Option(help="arx, oe, armax, bj (Box-Jenkins), narx or noe (polynomials).")] = "arx",
     order: Annotated[int, typer.Option(help="Lags of the output, each input and the disturbance.")] = 3,
     delay: Annotated[int, typer.Option(help="Samples from a move of an input to its first effect.")] = 1,
     validate: Annotated[
@@ -60,6 +60,19 @@ def identify(
         int, typer.Option(help="Held-out rows that may set the state of the free run, and are left out of fits.")
     ] = 0,
     recursive: Annotated[bool, typer.Option("--recursive", help="Learn row by row, as the monitor does.")] = False,
+    forgetting: Annotated[
+        float, typer.Option(help="With --recursive: weight of a row relative to its successor, in (0, 1].")
+    ] = 1.0,
+    adaptation: Annotated[
+        str,
+        typer.Option(
+            help="With --recursive: forgetting (least squares), kalman, gradient (LMS) or normalized-gradient (NLMS); "
+            "the last three of arx."
+        ),
+    ] = "forgetting",
+    gain: Annotated[
+        float | None, typer.Option(help="Of an adaptation other than forgetting.", show_default=False)
+    ] = None,
     scheme: Annotated[
         str, typer.Option(help="least-squares, or report: as the original report fits (arx and oe).")
     ] = "least-squares",
@@ -80,10 +93,20 @@ def identify(
     from reactorwatch.cli.batch import write_remark
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.unit_remarks import unit_remark
+    from reactorwatch.errors import name_file
     from reactorwatch.identification.identify import ModelForm
 
     described, outputs = identification.choose_outputs(process, split_names(inputs), split_names(output))
-    form = ModelForm(model, order, delay, recursive=recursive, scheme=scheme)
+    form = ModelForm(
+        model,
+        order,
+        delay,
+        recursive=recursive,
+        forgetting=forgetting,
+        adaptation=adaptation,
+        gain=gain,
+        scheme=scheme,
+    )
     if compare and (validate is not None or settle):
         raise InputError("--compare chooses by the second half of FILE: leave --validate and --settle out")
     measured, held_out = (
@@ -93,7 +116,7 @@ def identify(
     assert measured is not None
     equations = described.model
     remark = "" if equations is None else unit_remark(equations, measured.columns, measured.time_min)
-    with task(f"identifying {file.name}"):
+    with task(f"identifying {file.name}"), name_file(file):
         if compare:
             text = identification.compare(measured, described.inputs, outputs, form, neural=neural, as_json=as_json)
         else:

@@ -232,7 +232,8 @@ def replay(
 ) -> None:
     """Publish a recording or a record as the plant did, or verify a recording.
 
-    While it runs, `playback` pauses, resumes or steps it, or changes its rate.
+    While it runs, `playback` pauses, resumes or steps it, or changes its rate; in a terminal, so do the keys space,
+    right, up and down.
     """
     if verify:
         from reactorwatch.cli.verification import run
@@ -295,8 +296,9 @@ def alive(
 ) -> None:
     """Check that a node is alive: ends with 0 or 1."""
     from reactorwatch.cli.liveliness import wait_for_node
+    from reactorwatch.contract.keys import DEFAULT_PLANT
 
     _, bus = _settings(config, endpoint, quiet=True)
-    there = wait_for_node(bus, name or "cstr", node, timeout)
+    there = wait_for_node(bus, name or DEFAULT_PLANT, node, timeout)
     print_lines(f"{node} is {'alive' if there else f'not there within {timeout:g} s'}")
     raise typer.Exit(0 if there else 1)

@@ -4,7 +4,7 @@ import contextlib
 import threading
 import time
 from collections import Counter
-from math import isnan
+from math import inf, isnan
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -15,7 +15,8 @@ from reactorwatch.cli.status_view import format_plant
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import priority_word, state_word
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode_message
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, ListAlarms, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, ListAlarms, Promise, Sample
+from reactorwatch.contract.promise_text import promise_fields
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
@@ -50,6 +51,7 @@ class StatusBoard:
         self._alive: set[tuple[str, str]] = set()
         self._health: dict[tuple[str, str], Health] = {}
         self._alarms: dict[tuple[str, str], Alarm] = {}
+        self._promises: dict[str, Promise] = {}
         self._samples: dict[str, Counter[int]] = {}  # by plant and second
         self._lock = threading.Lock()
 
@@ -74,6 +76,8 @@ class StatusBoard:
                 self._health[topic.plant, topic.name] = body
             elif isinstance(body, Alarm):
                 self._alarms[topic.plant, body.alarm] = body
+            elif isinstance(body, Promise):
+                self._promises[topic.plant] = body
             elif isinstance(body, Sample):
                 self._newest.setdefault(topic.plant, {})[topic.name] = body
                 seconds = self._samples.setdefault(topic.plant, Counter())
@@ -110,6 +114,7 @@ class StatusBoard:
                 "signals": self._signals(name),
                 "nodes": [self._node(name, node, now_ns) for node in sorted(nodes)],
                 "alarms": [_alarm(alarm, now) for alarm in self._visible_alarms(name)],
+                **promise_fields(self._promises.get(name)),
             }
 
     def text(self, now_ns: int, width: int | None = None, *, colour: bool = False) -> str:
@@ -211,6 +216,7 @@ def _subscribe(bus: ZenohBus, plant: str, process: "Process | None") -> StatusBo
     board = StatusBoard(time.time_ns(), process)
     bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), board.on_token)
     bus.subscribe(keys.all_keys(plant, keys.HEALTH), board.on_message, history_s=HISTORY_S)
+    bus.subscribe(keys.all_keys(plant, keys.PROMISE), board.on_message, history_s=inf)
     for kind in (keys.SAMPLE, keys.ALARM):
         bus.subscribe(keys.all_keys(plant, kind), board.on_message)
     return board

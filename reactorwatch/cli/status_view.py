@@ -6,6 +6,7 @@ from typing import Any
 from reactorwatch.cli.alarm_rows import Now, advise_acknowledgement, alarm_rows
 from reactorwatch.cli.display import ATTENTION, FAINT, RIGHT, STRONG, WRONG, Cell, Row, format_age, format_rows
 from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.contract.promise_text import describe_power
 
 _INDENT = 2
 
@@ -25,6 +26,7 @@ def format_plant(
     parts = [format_rows([_values(plant)], width=width, colour=colour)]
     nodes = [_node(node) for node in plant["nodes"]]
     parts.append(format_rows(nodes or [("no nodes",)], _INDENT, width=width, colour=colour))
+    parts.append(format_rows(_promise(plant), _INDENT, width=width, colour=colour))
     if alarms:
         parts.append(format_rows(alarm_rows(alarms, now), _INDENT, width=width, colour=colour))
         advice = advise_acknowledgement(alarms, plant["plant"])
@@ -47,6 +49,18 @@ def _values(plant: dict[str, Any]) -> Row:
         cells.append(Cell(f"no {', '.join(missing)}", WRONG))
     rate = plant["samples_per_s"]
     return (*cells, *([] if rate is None else [Cell(f"{rate:.3g} samples/s", FAINT if rate else WRONG)]))
+
+
+def _promise(plant: dict[str, Any]) -> list[Row]:
+    """Promise of false alarms and the power, if they are known."""
+    promise = plant["promise"]
+    if promise is None:
+        return []
+    is_good = promise["kept"] and not promise["drifted"]
+    rows: list[Row] = [("promise", Cell(promise["text"], "" if is_good else ATTENTION))]
+    if plant["power"]:
+        rows.append(("seen in an hour", Cell(describe_power(plant["power"]), FAINT)))
+    return rows
 
 
 def _node(node: dict[str, Any]) -> Row:

@@ -119,10 +119,10 @@ def backtest(
 ) -> None:
     """Run the monitor over recordings at full speed."""
     from monitor_node.config import MonitorConfig
-    from reactorwatch.api.files import DEFAULT_PLANT
     from reactorwatch.cli.backtest_jobs import BACKTEST, BacktestOptions, make_jobs, train_on, write_rows
     from reactorwatch.cli.batch import SUMMARY, expand_files, run_jobs
     from reactorwatch.cli.progress import task
+    from reactorwatch.contract.keys import DEFAULT_PLANT
     from reactorwatch.records.output import check_output_folder
     from reactorwatch.runtime.config import read_settings, section
 

@@ -27,6 +27,7 @@ MESSAGES: tuple[type[Message], ...] = (
     messages.AlarmKpis,
     messages.Reconstruction,
     messages.Baseline,
+    messages.Promise,
     messages.Health,
     messages.Fault,
     messages.Audit,
@@ -50,6 +51,7 @@ Body: TypeAlias = (
     | messages.AlarmKpis
     | messages.Reconstruction
     | messages.Baseline
+    | messages.Promise
     | messages.Health
     | messages.Fault
     | messages.Audit

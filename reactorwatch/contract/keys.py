@@ -12,6 +12,9 @@ from typing import NamedTuple
 ROOT = "reactor"
 EVERYTHING = f"{ROOT}/**"
 
+DEFAULT_PLANT = "cstr"
+"""Name of a plant where none is stated."""
+
 SAMPLE = "sample"
 ESTIMATE = "estimate"
 MODEL = "model"
@@ -20,6 +23,7 @@ ALARM = "alarm"
 ALARM_KPIS = "alarm_kpis"
 RECONSTRUCTION = "reconstruction"
 BASELINE = "baseline"
+PROMISE = "promise"
 HEALTH = "health"
 FAULT = "fault"
 COMMAND = "command"

@@ -357,6 +357,54 @@ class Baseline(_message.Message):
     restored: int
     def __init__(self, time_ns: _Optional[int] = ..., what: _Optional[str] = ..., by: _Optional[str] = ..., why: _Optional[str] = ..., id: _Optional[int] = ..., model: _Optional[str] = ..., restored: _Optional[int] = ...) -> None: ...
 
+class Promise(_message.Message):
+    __slots__ = ("time_ns", "expected", "expected_90", "checked_rows", "found_in_training", "expected_in_training", "kept", "can_keep_per_30_days", "text", "power", "rows", "found", "expected_so_far", "drifted")
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_90_FIELD_NUMBER: _ClassVar[int]
+    CHECKED_ROWS_FIELD_NUMBER: _ClassVar[int]
+    FOUND_IN_TRAINING_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_IN_TRAINING_FIELD_NUMBER: _ClassVar[int]
+    KEPT_FIELD_NUMBER: _ClassVar[int]
+    CAN_KEEP_PER_30_DAYS_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    POWER_FIELD_NUMBER: _ClassVar[int]
+    ROWS_FIELD_NUMBER: _ClassVar[int]
+    FOUND_FIELD_NUMBER: _ClassVar[int]
+    EXPECTED_SO_FAR_FIELD_NUMBER: _ClassVar[int]
+    DRIFTED_FIELD_NUMBER: _ClassVar[int]
+    time_ns: int
+    expected: float
+    expected_90: float
+    checked_rows: int
+    found_in_training: int
+    expected_in_training: float
+    kept: bool
+    can_keep_per_30_days: float
+    text: str
+    power: _containers.RepeatedCompositeFieldContainer[Power]
+    rows: int
+    found: int
+    expected_so_far: float
+    drifted: bool
+    def __init__(self, time_ns: _Optional[int] = ..., expected: _Optional[float] = ..., expected_90: _Optional[float] = ..., checked_rows: _Optional[int] = ..., found_in_training: _Optional[int] = ..., expected_in_training: _Optional[float] = ..., kept: bool = ..., can_keep_per_30_days: _Optional[float] = ..., text: _Optional[str] = ..., power: _Optional[_Iterable[_Union[Power, _Mapping]]] = ..., rows: _Optional[int] = ..., found: _Optional[int] = ..., expected_so_far: _Optional[float] = ..., drifted: bool = ...) -> None: ...
+
+class Power(_message.Message):
+    __slots__ = ("deviation", "unit", "profile", "within_10_min", "within_1_h", "within_1_day")
+    DEVIATION_FIELD_NUMBER: _ClassVar[int]
+    UNIT_FIELD_NUMBER: _ClassVar[int]
+    PROFILE_FIELD_NUMBER: _ClassVar[int]
+    WITHIN_10_MIN_FIELD_NUMBER: _ClassVar[int]
+    WITHIN_1_H_FIELD_NUMBER: _ClassVar[int]
+    WITHIN_1_DAY_FIELD_NUMBER: _ClassVar[int]
+    deviation: str
+    unit: str
+    profile: str
+    within_10_min: float
+    within_1_h: float
+    within_1_day: float
+    def __init__(self, deviation: _Optional[str] = ..., unit: _Optional[str] = ..., profile: _Optional[str] = ..., within_10_min: _Optional[float] = ..., within_1_h: _Optional[float] = ..., within_1_day: _Optional[float] = ...) -> None: ...
+
 class Fault(_message.Message):
     __slots__ = ("time_ns", "cause", "specification", "active", "onset_ns")
     TIME_NS_FIELD_NUMBER: _ClassVar[int]

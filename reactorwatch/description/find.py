@@ -6,9 +6,9 @@ from pathlib import Path
 
 from reactorwatch.description.catalogue import Catalogue, check_process
 from reactorwatch.description.process import Process, describe_model
-from reactorwatch.description.toml_file import parse_process
+from reactorwatch.description.toml_file import parse_process, parse_tables
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.process.extended_model import parse_extended_model
+from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.input_file import wrap_read_errors
 
@@ -62,10 +62,21 @@ def find_process(
             extended = replace(extended, zero_ns=extended.zero_ns or zero_ns).rebase(0)
         elif zero_ns:
             extended = extended.rebase(zero_ns)
-        model = extended.build()
-        return describe_model(model)
+        return build_process(extended)
     except InputError as error:
         raise InputError(f"process file {path}: {error}") from error
+
+
+def build_process(extended: ExtendedModel) -> Process:
+    """Process of an extended model: as its file describes it, else with the signals of the equations.
+
+    Raises:
+        InputError: the model cannot be built, or the description breaks a rule.
+    """
+    named = describe_model(extended.build())
+    if extended.description is None:
+        return named
+    return parse_tables({**extended.description, "equations": extended.name}, lambda _name: named)
 
 
 def _find_equations(name: str, folder: Path, zero_ns: int, *, on_bus: bool) -> Process:

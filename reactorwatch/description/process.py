@@ -6,12 +6,13 @@ from functools import cached_property
 from typing import Literal, get_args
 
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.process import CONTROLLERS_OF, EFFECTS_OF, OPERATIONS
+from reactorwatch.process import CONTROLLERS_OF, OPERATIONS, WATCH_DEFAULTS, own_effects
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.effect_twins import add_generic
 from reactorwatch.process.generic_effects import generic_effects
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.operation import Operation
+from reactorwatch.process.operation import Operation, WatchDefaults
+from reactorwatch.process.stored_equations import store_equations
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.units import conversion
 
@@ -90,6 +91,7 @@ class Process:
         file_format: statements on how to read its files; the rest is guessed for each file.
         operation: levels of its inputs, noise of its sensors and named runs, for a simulation.
         generic: whether effects made from its equations are possible causes beside its own (`causes`).
+        watch: settings of its watch where none are stated.
 
     Raises:
         InputError: a rule above is broken, or signals and equations do not fit.
@@ -104,6 +106,7 @@ class Process:
     file_format: FileFormat = field(default_factory=FileFormat)
     operation: Operation = field(default_factory=Operation)
     generic: bool = False
+    watch: WatchDefaults = field(default_factory=WatchDefaults)
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -139,10 +142,12 @@ class Process:
 
     @cached_property
     def model(self) -> ProcessModel | None:
-        """The equations with the given values of their parameters; None: the process has no equations."""
+        """The equations with the given parameters and the effects; None: the process has no equations."""
         if self.equations is None:
             return None
-        return self.equations.with_values({name: item.value for name, item in self._parameters_in_model_units.items()})
+        given = {name: item.value for name, item in self._parameters_in_model_units.items()}
+        model = self.equations.with_values(given)
+        return model if own_effects(model) == tuple(self.effects) else replace(model, effects=tuple(self.effects))
 
     @cached_property
     def causes(self) -> tuple[Effect, ...]:
@@ -208,7 +213,7 @@ class Process:
                 raise InputError(f"{self._of_parameter(name)}: sd must be at least 0, got {item.sd:g}")
             unit = _find_parameter(self, name)
             if item.unit and item.unit != unit:
-                scale, offset = conversion(item.unit, unit, self._of_parameter(name))
+                scale, offset = _convert(item.unit, unit, self._of_parameter(name))
                 item = KnownParameter(scale * item.value + offset, scale * item.sd, unit)
             known[name] = item
         return known
@@ -250,11 +255,54 @@ class Process:
                 )
         for signal in self.signals:
             if signal.unit and signal.name in model.units:
-                conversion(signal.unit, model.units[signal.name], f"process {self.name!r}, signal {signal.name!r}")
+                _convert(signal.unit, model.units[signal.name], f"process {self.name!r}, signal {signal.name!r}")
         try:
-            _ = self.model
+            extended = self.model
         except ValueError as error:
             raise InputError(f"process {self.name!r}: {error}") from error
+        assert extended is not None
+        if extended.effects is not None:  # its equations may be code of the user
+            _check_expressions(self.name, extended)
+        for effect in extended.effects or ():
+            _check_effect(self.name, effect, extended)
+
+
+def _convert(unit: str, wanted: str, name: str) -> tuple[float, float]:
+    """Conversion of a unit, see `conversion`; an error says what to correct."""
+    try:
+        return conversion(unit, wanted, name)
+    except InputError as error:
+        raise InputError(f"{error}; correct the unit in the description") from error
+
+
+def _check_expressions(process: str, model: ProcessModel) -> None:
+    """Check that the equations are expressions of a model's own symbols.
+
+    Raises:
+        InputError: they are not.
+    """
+    try:
+        store_equations(model)
+    except ValueError as error:
+        known = ", ".join((*model.state_names, *model.input_names, *model.parameter_names))
+        raise InputError(
+            f"process {process!r}: {error}; write them with its states, inputs and parameters ({known})"
+        ) from error
+
+
+def _check_effect(process: str, effect: Effect, model: ProcessModel) -> None:
+    """Check that an effect, which may be code of the user, fits a model.
+
+    Raises:
+        InputError: it does not.
+    """
+    try:
+        effect.extend(model)
+    except Exception as error:
+        name = getattr(effect, "name", type(effect).__name__)
+        raise InputError(
+            f"process {process!r}, effect {name!r}: must extend the equations, got {type(error).__name__}: {error}"
+        ) from error
 
 
 def describe_model(model: ProcessModel) -> Process:
@@ -267,9 +315,10 @@ def describe_model(model: ProcessModel) -> Process:
         model.name,
         signals,
         model,
-        EFFECTS_OF.get(model.name, ()),
+        own_effects(model),
         CONTROLLERS_OF.get(model.name, ()),
         operation=OPERATIONS.get(model.name, Operation()),
+        watch=WATCH_DEFAULTS.get(model.name, WatchDefaults()),
     )
 
 

@@ -2,11 +2,12 @@
 
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import Annotated, Any
 
 import msgspec
 
-from reactorwatch.description.process import KnownParameter, Process, Signal
+from reactorwatch.description.process import KnownParameter, Process, Signal, describe_model
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.toml_text import parse_toml
@@ -87,7 +88,15 @@ def parse_process(content: bytes, find_equations: Callable[[str], Process]) -> P
     Raises:
         InputError: it is not TOML, or a part of it breaks a rule.
     """
-    tables = parse_toml(content)
+    return parse_tables(parse_toml(content), find_equations)
+
+
+def parse_tables(tables: Mapping[str, Any], find_equations: Callable[[str], Process]) -> Process:
+    """Parse the tables of a description, see `parse_process`.
+
+    Raises:
+        InputError: a part of it breaks a rule.
+    """
     try:
         document = msgspec.convert(tables, _Document)
     except msgspec.ValidationError as error:
@@ -104,6 +113,41 @@ def parse_process(content: bytes, find_equations: Callable[[str], Process]) -> P
         generic=document.generic,
         **described,
     )
+
+
+def to_tables(process: Process) -> dict[str, Any]:
+    """Tables that describe the signals and files of a process, without its equations; `parse_tables` reads them."""
+    stated = process.file_format
+    time = _Time(stated.time, stated.period, stated.time_unit, stated.zone, stated.time_format)
+    file = _File(stated.header, stated.separator, stated.decimal, stated.transposed)
+    signals = [
+        {name: value for name, value in asdict(signal).items() if value is not None and value != ""}
+        for signal in process.signals
+    ]
+    return {
+        "name": process.name,
+        "signals": signals,
+        **({"generic": True} if process.generic else {}),
+        **({"missing": list(stated.missing)} if stated.missing else {}),
+        **{
+            name: given
+            for name, table in (("time", time), ("file", file))
+            if (given := {key: value for key, value in msgspec.structs.asdict(table).items() if value is not None})
+        },
+    }
+
+
+def add_description(extended: Mapping[str, Any], process: Process) -> dict[str, Any]:
+    """Object of an extended model with the description of its process, unless it has just the signals of its equations.
+
+    Args:
+        extended: object of the extended model, see `reactorwatch.process.extended_model`.
+        process: the process, which has equations.
+    """
+    named = describe_model(process.require_model())
+    own = (process.name, process.signals, process.file_format, process.generic)
+    is_plain = own == (named.name, named.signals, named.file_format, named.generic)
+    return dict(extended) if is_plain else {**extended, "process": to_tables(process)}
 
 
 def _file_format(document: _Document) -> FileFormat:
@@ -134,6 +178,16 @@ def _file_format(document: _Document) -> FileFormat:
         raise InputError(text) from error
 
 
+def _find_wrong_parameter(tables: Mapping[str, Any]) -> str:
+    """Name of the first parameter of the wrong form."""
+    for name, table in tables.items():
+        try:
+            msgspec.convert(table, _Parameter)
+        except msgspec.ValidationError:
+            return name
+    return ""
+
+
 def _describe_error(text: str, tables: Mapping[str, Any]) -> str:
     """Describe a part of the wrong form by its table or signal; for an unknown key with the valid ones."""
     match = _PLACE.search(text)
@@ -143,6 +197,8 @@ def _describe_error(text: str, tables: Mapping[str, Any]) -> str:
     unknown = _UNKNOWN_FIELD.search(text)
     if unknown is not None and table in _STRUCTS:
         text = describe_unknown("key", unknown[1], [item.name for item in msgspec.structs.fields(_STRUCTS[table])])
+    if table == "parameters":
+        place = place.replace("[...]", f" {_find_wrong_parameter(tables['parameters'])!r}", 1)
     index = _SIGNAL.match(place)
     if index is not None:
         number = int(index[1])

@@ -40,6 +40,7 @@ from reactorwatch.diagnosis.result import (
 )
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.cause_prior import FROM_BEGINNING
+from reactorwatch.diagnosis.search.noise_growth import search_noise_growth
 from reactorwatch.diagnosis.search.noise_masking import search_single_cause
 from reactorwatch.diagnosis.search.pairs import search_pairs
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult, smallest_noise
@@ -111,7 +112,7 @@ def diagnose(
     single = result.best
     if not (np.any(minus_log10_p(single.fit.w, run.inputs) >= DOUBTFUL) and unknowns.is_simple):
         result = search_pairs(search, result)
-    result = _drop_hidden(result, hidden)
+    result = _drop_hidden(search_noise_growth(search, result), hidden)
     best = result.best if result.nominal.bic - result.best.bic >= LEAST_GAIN else result.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
     verdict = _decide_verdict(result, best)
@@ -121,7 +122,8 @@ def diagnose(
     remarks = [*_describe_record(record), *_describe_outliers(whole, run)]
     unknown: Localised | None = None
     if verdict == UNKNOWN or np.any(adequacy >= DOUBTFUL) or (best.label and _may_be_unknown(result, best, model)):
-        unknown = unknowns.localise()
+        white = best.label and not np.any(adequacy >= DOUBTFUL) and not _seems_noisy(result, model)
+        unknown = unknowns.localise(best.bic if white else np.inf)
         by_source = verdict == UNKNOWN and not np.any(adequacy >= DOUBTFUL)
         if verdict == UNKNOWN or _is_unknown(unknown, result, best, run, float(np.max(adequacy))):
             verdict, best = UNKNOWN, result.nominal

@@ -37,7 +37,7 @@ def refine_parameters(search: Search, best: FittedHypothesis) -> tuple[FittedHyp
         for number, sd in numbers.items():
             share = sd / max(float(np.sqrt(whole[number, number])), 1e-300)
             share = (
-                share if effect.is_discontinuous else max(share, 1.0)
+                max(share, 1.0) if effect.has_derivative else share
             )  # the derivatives' spread is marginal over the others
             whole[number] *= share
             whole[:, number] *= share

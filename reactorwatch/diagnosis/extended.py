@@ -6,7 +6,7 @@ from typing import Any
 
 from reactorwatch.diagnosis.result import Cause
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.extended_model import extended_model_of
+from reactorwatch.process.extended_model import are_named, extend, extended_model_of, is_complete
 from reactorwatch.process.fault import FaultSpecification
 from reactorwatch.process.law import ExtendedLaw
 from reactorwatch.process.model import ProcessModel
@@ -35,8 +35,11 @@ def extended_model(
     named = {effect.name: effect for effect in effects}
     before = extended_model_of(model, effects, zero_ns=zero_ns)
     result = [_specification(named[cause.cause], cause) for cause in causes]
-    laws = before.laws if law is None else (*before.laws, law)
-    return replace(before, effects=(*before.effects, *result), laws=laws).to_object()
+    new_laws = () if law is None else (law,)
+    found = replace(before, effects=(*before.effects, *result), laws=(*before.laws, *new_laws))
+    if not (is_complete(before, model) and are_named(found)):
+        found = replace(found, equations=extend(model, result, new_laws))
+    return found.to_object()
 
 
 def _specification(effect: Effect, cause: Cause) -> FaultSpecification:

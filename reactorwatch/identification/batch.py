@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
+from reactorwatch.identification.adaptation import AdaptiveRegression
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.regressor import Rows, rows_of
 from reactorwatch.identification.rls import RecursiveLeastSquares
@@ -129,7 +130,9 @@ def linear_model(
     return LinearModel(structure, parameters, covariance, noise_sd, solution.condition, rows, simulates)
 
 
-def model_of(structure: Structure, scaling: Scaling, estimator: RecursiveLeastSquares, simulates: bool) -> LinearModel:
+def model_of(
+    structure: Structure, scaling: Scaling, estimator: RecursiveLeastSquares | AdaptiveRegression, simulates: bool
+) -> LinearModel:
     """Make a model of one output from a recursive estimator of scaled signals."""
     solution = LeastSquares(
         estimator.parameters[None, :],

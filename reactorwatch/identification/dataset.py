@@ -128,7 +128,8 @@ class Dataset:
                 continue
             if name == self.output_name:
                 raise InputError(
-                    f"output {name} is constant, {measured[0]:g} in all rows to fit: there is nothing to identify"
+                    f"output {name} is constant, {measured[0]:g} in all rows to fit: there is nothing to identify; "
+                    "name another output, or a record in which it changes"
                 )
             raise InputError(
                 f"input {name} never moves, {measured[0]:g} in all rows to fit: a constant input excites none of the "

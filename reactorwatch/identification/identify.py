@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification import report_scheme
+from reactorwatch.identification.adaptation import GAINS, AdaptiveRegression
 from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, model_of
 from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.excitation import check_record
@@ -19,8 +20,9 @@ from reactorwatch.identification.free_run import free_run
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.output_error import fit_oe
 from reactorwatch.identification.polynomial_narx import PolynomialModel, fit_narx, name_product
-from reactorwatch.identification.prediction_error import PredictionErrorModel, fit_armax, fit_box_jenkins
-from reactorwatch.identification.recursive_output_error import RecursiveOutputError
+from reactorwatch.identification.polynomial_oe import fit_noe
+from reactorwatch.identification.prediction_error import Kind, PredictionErrorModel, fit_armax, fit_box_jenkins
+from reactorwatch.identification.recursive_prediction_error import RecursivePredictionError
 from reactorwatch.identification.regressor import consecutive_rows, rows_of
 from reactorwatch.identification.residual_tests import DEFAULT_LAGS, independence, whiteness
 from reactorwatch.identification.rls import RecursiveLeastSquares
@@ -36,6 +38,7 @@ MODELS: dict[str, Callable[..., FittedModel]] = {
     "armax": fit_armax,
     "bj": fit_box_jenkins,
     "narx": fit_narx,
+    "noe": fit_noe,
 }
 """Fits by the kind of model."""
 
@@ -45,7 +48,11 @@ SCHEMES: Mapping[str, Mapping[str, Callable[..., FittedModel]]] = {
 }
 """Fits by scheme and kind of model."""
 
-RECURSIVE_MODELS = ("arx", "oe")
+FORGETTING = "forgetting"
+
+RECURSIVE_MODELS: Mapping[str, Kind | None] = {"arx": None, "oe": None, "armax": "armax", "bj": "bj"}
+"""Models that can be learned row by row, with their model of the disturbance."""
+
 WORST_MINUS_LOG10_P = 6.0
 
 Coefficients = tuple[float, ...]
@@ -57,11 +64,14 @@ class ModelForm:
     """Choice of a model.
 
     Attributes:
-        model: `arx`, `oe`, `armax`, `bj` (Box-Jenkins) or `narx` (polynomial of degree 2).
+        model: `arx`, `oe`, `armax`, `bj` (Box-Jenkins), `narx` or `noe` (polynomials of degree 2, fitted by one-step
+            prediction, and of degree 3, fitted by simulation).
         order: number of lags of the output, of each input and of the disturbance.
         delay: samples from a move of an input to its first effect, at least 1.
         recursive: whether it is learned row by row instead of from all rows at once.
         forgetting: forgetting factor of the recursive methods, in (0, 1].
+        adaptation: gain of a recursive ARX model: `forgetting` (least squares), or one of `adaptation.GAINS`.
+        gain: gain of an adaptation other than `forgetting`; None: its default.
         scheme: `least-squares`, or `report` for the scheme of the original report (see `report_scheme`).
 
     Raises:
@@ -73,13 +83,23 @@ class ModelForm:
     delay: int = 1
     recursive: bool = False
     forgetting: float = 1.0
+    adaptation: str = FORGETTING
+    gain: float | None = None
     scheme: str = "least-squares"
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise InputError(describe_unknown("model", self.model, MODELS))
         if self.recursive and self.model not in RECURSIVE_MODELS:
-            raise InputError(f"only {' and '.join(RECURSIVE_MODELS)} can be recursive, got {self.model}")
+            raise InputError(f"only {', '.join(RECURSIVE_MODELS)} can be recursive, got {self.model}")
+        if self.adaptation not in (FORGETTING, *GAINS):
+            raise InputError(describe_unknown("adaptation", self.adaptation, (FORGETTING, *GAINS)))
+        if not self.recursive and (self.adaptation, self.gain, self.forgetting) != (FORGETTING, None, 1.0):
+            raise InputError("adaptation, gain and forgetting are of recursive models: add --recursive")
+        if self.adaptation == FORGETTING and self.gain is not None:
+            raise InputError(f"a gain is of an adaptation, {', '.join(GAINS)}: of {FORGETTING} give the factor")
+        if self.adaptation != FORGETTING and (self.model != "arx" or self.forgetting != 1.0):
+            raise InputError(f"adaptation {self.adaptation} is for arx, without forgetting, got {self.model}")
         if self.scheme not in SCHEMES:
             raise InputError(describe_unknown("scheme", self.scheme, SCHEMES))
         if self.model not in SCHEMES[self.scheme] or (self.recursive and self.scheme == "report"):
@@ -144,11 +164,11 @@ class Identification(msgspec.Struct, frozen=True):
     y[k] = a1 y[k-1] + ... + an y[k-n] + b1 u[k-d] + ... + bn u[k-d-n+1] + offset, d the delay, in the signals' own
     units; in an output-error model y stands for the model's own output. An ARMAX model adds e[k] + c1 e[k-1] + ... +
     cn e[k-n], with e its one-step error. A Box-Jenkins model is w + v, w[k] = f1 w[k-1] + ... + b1 u[k-d] + ... +
-    offset and v[k] = d1 v[k-1] + ... + e[k] + c1 e[k-1] + ...; it has no a. A polynomial NARX model is the sum of its
-    terms and the offset; it has neither a nor b.
+    offset and v[k] = d1 v[k-1] + ... + e[k] + c1 e[k-1] + ...; it has no a. A polynomial model, NARX or
+    output-error, is the sum of its terms and the offset; it has neither a nor b.
 
     Attributes:
-        model: `arx`, `oe`, `armax`, `bj` or `narx`.
+        model: `arx`, `oe`, `armax`, `bj`, `narx` or `noe`.
         order: n.
         delay: delay in samples.
         output: name of the output.
@@ -165,7 +185,7 @@ class Identification(msgspec.Struct, frozen=True):
         c: n coefficients of past errors, of an ARMAX or Box-Jenkins model.
         d: n coefficients of the past disturbance of a Box-Jenkins model.
         f: n coefficients of the plant's own past of a Box-Jenkins model.
-        terms: terms of a polynomial NARX model.
+        terms: terms of a polynomial model.
         rmse: errors on the held-out rows, where a record was given for validation or rows set the state.
     """
 
@@ -251,7 +271,7 @@ def identify_and_run(
             f"{model.condition:.0e}: these are the parameters of least norm"
         )
     residuals = model.residuals(*fitted.arrays)[:, 0]
-    of_own_past = {"arx": form.order, "narx": form.order, "oe": 0}.get(form.model, 2 * form.order)
+    of_own_past = {"arx": form.order, "narx": form.order, "oe": 0, "noe": 0}.get(form.model, 2 * form.order)
     lags, white = max(DEFAULT_LAGS, of_own_past + 10), math.nan
     if np.isfinite(residuals).sum() >= 5 * lags:
         white = whiteness(residuals, lags, of_own_past).minus_log10_p
@@ -286,7 +306,7 @@ def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out
     if fitted.rows <= least:
         raise InputError(
             f"order {form.order} with delay {form.delay} needs more than {least} rows to fit, the first half of the "
-            f"record unless another validates, got {fitted.rows}"
+            f"record unless another validates, got {fitted.rows}; lower the order, or record for longer"
         )
     if settle < 0:
         raise InputError(f"settle must be at least 0 rows, got {settle}")
@@ -300,8 +320,8 @@ def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
     if not form.recursive:
         return SCHEMES[form.scheme][form.model](structure, u, y, t)
     scaling = Scaling.of(u, y)
-    if form.model == "oe":
-        running = RecursiveOutputError(structure, scaling, form.forgetting)
+    if form.model != "arx":
+        running = RecursivePredictionError(structure, scaling, form.forgetting, RECURSIVE_MODELS[form.model])
         for k, unbroken_rows in enumerate(consecutive_rows(np.concatenate([u, y], axis=1), t)):
             if unbroken_rows <= 1:
                 running.restart()
@@ -309,6 +329,11 @@ def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
                 running.update(u[k], float(y[k, 0]))
         return running.model
     rows = rows_of(structure, scaling.inputs(u), scaling.outputs(y), t)
+    if form.adaptation != FORGETTING:
+        adaptive = AdaptiveRegression(structure.parameters, form.adaptation, form.gain)
+        for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
+            adaptive.update(regressor, float(value))
+        return model_of(structure, scaling, adaptive, simulates=False)
     estimator = RecursiveLeastSquares(structure.parameters, form.forgetting)
     for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
         estimator.update(regressor, value)

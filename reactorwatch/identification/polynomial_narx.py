@@ -31,7 +31,7 @@ DEGREE = 2
 LARGEST_SIZE = 30
 """Number of terms beyond which no more are selected."""
 
-_DIVERGED = 1e6  # a scaled output beyond this, a million times its spread, has diverged
+DIVERGED = 1e6  # a scaled output beyond this, a million times its spread, has diverged
 
 Product = tuple[int, ...]
 """Indices of the factors among the lagged signals, increasing; empty: the constant."""
@@ -48,6 +48,7 @@ class PolynomialModel:
         values: coefficients of the terms, shape (terms,).
         covariance: shape (terms, terms), of the coefficients for scaled signals.
         rows: number of rows of the fit.
+        simulates: whether it was fitted by simulation.
     """
 
     structure: Structure
@@ -56,6 +57,7 @@ class PolynomialModel:
     values: Array
     covariance: Array
     rows: int
+    simulates: bool = False
 
     @property
     def parameter_count(self) -> int:
@@ -70,7 +72,7 @@ class PolynomialModel:
     def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
         """See `LinearModel.predict`."""
         u, y = self._scale(inputs, outputs)
-        rows = rows_of(_lags(self.structure), u, y, time)
+        rows = rows_of(lagged_signals(self.structure), u, y, time)
         predicted = np.full(y.shape, np.nan)
         predicted[rows.position, 0] = _multiply(rows.regressors, self.products) @ self.values
         return predicted * self.scaling.output_spreads[0] + self.scaling.output_centres[0]
@@ -79,15 +81,16 @@ class PolynomialModel:
         """See `LinearModel.simulate`."""
         u, y = self._scale(inputs, outputs)
         plan = plan_run(self.structure, u, y, time)
-        s, factors = self.structure, _factors(self.products)
+        s, factors = self.structure, factors_of(self.products)
         run = run_products(
             self.values, factors, s.output_lags, s.input_lags, s.delay, u, y[:, 0], plan.starts, plan.running
         )
         return (run * self.scaling.output_spreads[0] + self.scaling.output_centres[0])[:, None]
 
     def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
-        """Measured minus one-step prediction, shape (rows, 1)."""
-        return as_columns(outputs, "outputs", 1) - self.predict(inputs, outputs, time)
+        """Measured minus predicted or simulated, as in the fit, shape (rows, 1)."""
+        run = self.simulate if self.simulates else self.predict
+        return as_columns(outputs, "outputs", 1) - run(inputs, outputs, time)
 
     def expand(self) -> tuple[tuple[Product, ...], Array, Array]:
         """Terms in the signals' own units.
@@ -144,7 +147,7 @@ def fit_narx(
     u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
     check_not_constant(y)
     scaling = Scaling.of(u, y)
-    rows = rows_of(_lags(structure), scaling.inputs(u), scaling.outputs(y), time)
+    rows = rows_of(lagged_signals(structure), scaling.inputs(u), scaling.outputs(y), time)
     check_row_count(rows, len(y))
     candidates = candidate_products(structure)
     if rows.position.size < len(candidates):
@@ -182,10 +185,10 @@ def fit_narx(
     return fit(best, slice(None))
 
 
-def candidate_products(structure: Structure) -> tuple[Product, ...]:
+def candidate_products(structure: Structure, degree: int = DEGREE) -> tuple[Product, ...]:
     """All products of the lagged signals up to the degree, the constant and the linear ones first."""
-    signals = range(_lags(structure).parameters)
-    return tuple(product for degree in range(DEGREE + 1) for product in combinations_with_replacement(signals, degree))
+    signals = range(lagged_signals(structure).parameters)
+    return tuple(product for size in range(degree + 1) for product in combinations_with_replacement(signals, size))
 
 
 def name_product(product: Product, structure: Structure, inputs: tuple[str, ...], output: str) -> str:
@@ -200,7 +203,7 @@ def name_product(product: Product, structure: Structure, inputs: tuple[str, ...]
     return "*".join(names)
 
 
-def _lags(structure: Structure) -> Structure:
+def lagged_signals(structure: Structure) -> Structure:
     """The lagged signals alone, without the constant."""
     return Structure(
         structure.output_lags, structure.input_lags, structure.delay, structure.inputs, structure.outputs, offset=False
@@ -234,9 +237,9 @@ def _select(regressors: Array, target: Array, first: int) -> list[int]:
     return [first + index for index in taken]
 
 
-def _factors(products: tuple[Product, ...]) -> NDArray[np.int64]:
+def factors_of(products: tuple[Product, ...]) -> NDArray[np.int64]:
     """Indices of the factors, shape (products, degree); -1 where there is none."""
-    factors = np.full((len(products), DEGREE), -1)
+    factors = np.full((len(products), max(map(len, products))), -1)
     for i, product in enumerate(products):
         factors[i, : len(product)] = product
     return factors
@@ -291,6 +294,6 @@ def run_products(
                 if factors[term, position] >= 0:
                     product *= signals[factors[term, position]]
             total += product
-        own[k] = min(max(total, -_DIVERGED), _DIVERGED)
-        run[k] = own[k] if abs(own[k]) < _DIVERGED else np.inf
+        own[k] = min(max(total, -DIVERGED), DIVERGED)
+        run[k] = own[k] if abs(own[k]) < DIVERGED else np.inf
     return run

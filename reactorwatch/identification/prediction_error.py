@@ -105,6 +105,45 @@ class PredictionErrorModel:
         return as_columns(outputs, "outputs", 1) - self.predict(inputs, outputs, time)
 
 
+def full_index(kind: Kind, structure: Structure) -> NDArray[np.int64]:
+    """Indices of f, b, offset, d and c among the parameters: an ARMAX model uses `a` for both f and d."""
+    lags = structure.output_lags
+    if kind == "bj":
+        return np.arange(structure.parameters + 2 * lags)
+    order = np.arange(structure.parameters + lags)
+    return np.concatenate([order[: structure.parameters], order[:lags], order[structure.parameters :]])
+
+
+def unscale(
+    kind: Kind,
+    structure: Structure,
+    scaling: Scaling,
+    parameters: Array,
+    inverse: Array,
+    *,
+    variance: float,
+    rows: int,
+) -> PredictionErrorModel:
+    """Make a model in the signals' own units from parameters for scaled signals.
+
+    Args:
+        kind: `armax` or `bj`.
+        structure: lags of the plant.
+        scaling: scaling of the signals.
+        parameters: shape (parameters,).
+        inverse: covariance of the parameters for noise of variance 1, shape (parameters, parameters).
+        variance: variance of e.
+        rows: number of rows of the fit.
+    """
+    plant = structure.parameters
+    matrix, shift = np.eye(parameters.size), np.zeros(parameters.size)
+    matrix[:plant, :plant], shift[:plant] = scaling.unscaling(structure)
+    known = np.isfinite(variance) and np.all(np.isfinite(inverse))
+    covariance = variance * matrix @ inverse @ matrix.T if known else np.full_like(matrix, np.inf)
+    noise_sd = float(np.sqrt(variance)) * scaling.output_spreads[0]
+    return PredictionErrorModel(kind, structure, matrix @ parameters + shift, covariance, noise_sd, rows)
+
+
 class _Objective:
     """Prediction errors of one record and their gradient.
 
@@ -129,14 +168,7 @@ class _Objective:
         self._outputs = np.ascontiguousarray(outputs[:, 0])
         self._plan = plan
         self.compared = plan.running & np.isfinite(self._outputs)
-        lags = structure.output_lags
-        order = np.arange(structure.parameters + lags)
-        # Indices of f, b, offset, d and c among the parameters: an ARMAX model uses `a` for both f and d.
-        self._index = (
-            np.concatenate([order[: structure.parameters], order[:lags], order[structure.parameters :]])
-            if kind == "armax"
-            else np.arange(structure.parameters + 2 * lags)
-        )
+        self._index = full_index(kind, structure)
         self.size = int(self._index.max()) + 1
 
     def predict(self, theta: Array) -> tuple[Array, Array]:
@@ -218,17 +250,7 @@ def _fit(
     errors, gradient = objective(theta)
     # As for least squares: at the minimum the gradient takes the place of the regressors.
     inverse, variance = least_squares(gradient, errors).inverse, error_variance(errors, theta.size)[0]
-    plant = structure.parameters
-    matrix, shift = np.eye(theta.size), np.zeros(theta.size)
-    matrix[:plant, :plant], shift[:plant] = scaling.unscaling(structure)
-    return PredictionErrorModel(
-        kind,
-        structure,
-        matrix @ theta + shift,
-        variance * matrix @ inverse @ matrix.T,
-        float(np.sqrt(variance)) * scaling.output_spreads[0],
-        errors.size,
-    )
+    return unscale(kind, structure, scaling, theta, inverse, variance=variance, rows=errors.size)
 
 
 def _minimise(kind: Kind, structure: Structure, u: Array, y: Array, time: ArrayLike | None) -> tuple[Array, _Objective]:

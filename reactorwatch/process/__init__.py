@@ -12,12 +12,13 @@ from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.locations import LOCATIONS as CSTR_LOCATIONS
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.library.cstr.operation import OPERATION as CSTR_OPERATION
+from reactorwatch.process.library.cstr.operation import WATCH_DEFAULTS as CSTR_WATCH_DEFAULTS
 from reactorwatch.process.library.three_tanks.effects import THREE_TANKS_EFFECTS
 from reactorwatch.process.library.three_tanks.model import three_tanks
 from reactorwatch.process.library.three_tanks.operation import CONTROLLERS
 from reactorwatch.process.library.three_tanks.operation import OPERATION as THREE_TANKS_OPERATION
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.operation import Operation
+from reactorwatch.process.operation import Operation, WatchDefaults
 
 MODELS = (cstr, tanks, three_tanks)
 """The catalogue of process models: functions that build them."""
@@ -36,6 +37,9 @@ OPERATIONS: Mapping[str, Operation] = {
 }
 """Operation in a simulation, by name of a model."""
 
+WATCH_DEFAULTS: Mapping[str, WatchDefaults] = {"cstr": CSTR_WATCH_DEFAULTS}
+"""Default settings of the watch, by name of a model; others have none of their own."""
+
 LOCATION_PHRASES: Mapping[str, str] = CSTR_LOCATIONS
 """Phrases of locations whose name is not enough, such as `on the side of the coolant`."""
 
@@ -43,13 +47,18 @@ CONTROLLERS_OF: Mapping[str, tuple[Controller, ...]] = {"three_tanks": CONTROLLE
 """Controllers in a simulation, by name of a model; others are simulated in open loop."""
 
 
+def own_effects(model: ProcessModel) -> tuple[Effect, ...]:
+    """Effects of a model's own: those that it has, else those of the catalogue under its name."""
+    return EFFECTS_OF.get(model.name, ()) if model.effects is None else model.effects
+
+
 def effects_of(model: ProcessModel) -> tuple[Effect, ...]:
-    """Effects of a model: its own catalogue, or the generic ones if it has none."""
-    return EFFECTS_OF.get(model.name) or generic_effects(model)
+    """Effects of a model: its own, or the generic ones if it has none."""
+    return own_effects(model) or generic_effects(model)
 
 
 def named_effects(model: ProcessModel) -> tuple[Effect, ...]:
-    """Effects that a text may name: those of the model's own catalogue first, then the generic ones."""
-    own = EFFECTS_OF.get(model.name, ())
+    """Effects that a text may name: those of the model's own first, then the generic ones."""
+    own = own_effects(model)
     names = {effect.name for effect in own}
     return (*own, *(effect for effect in generic_effects(model) if effect.name not in names))

@@ -10,9 +10,14 @@
 
 An effect is stored as the text that injects it into the plant as a fault (`fault`), to full precision, so a model that
 is read equals the one that was written. `parameters` are those of the model that differ from its nominal values, in its
-units. Laws of what was unknown (`law`) are items of a list `laws`, which is left out where it is empty. Times are
+units. Laws of what was unknown (`law`) are items of a list `laws`, and what a filter of the model estimates beside its
+states (`kalman.uncertain_model`) of a list `uncertain`; both are left out where they are empty. Times are
 minutes of the record in which the deviations were found, counted from `zero_ns`, nanoseconds since 1970-01-01 UTC; 0
 where that is unknown, as for a .csv.
+
+Of a model that the catalogue lacks, the file has all `equations`, with parameters and effects in them
+(`stored_equations`), and no code is needed to read it; `effects` is then for people. `process` describes the signals,
+where they are not just those of the equations: its keys are those of a process file.
 """
 
 import re
@@ -23,12 +28,15 @@ from typing import Any
 import msgspec
 
 from reactorwatch.errors import InputError
-from reactorwatch.process import MODELS, named_effects
+from reactorwatch.process import EFFECTS_OF, MODELS, named_effects
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
+from reactorwatch.process.fingerprint import fingerprint
+from reactorwatch.process.generic_effects import is_generic
 from reactorwatch.process.law import ExtendedLaw
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, free_profile
+from reactorwatch.process.stored_equations import build_equations, store_equations
 
 FORMAT = "reactorwatch.model.v1"
 
@@ -60,11 +68,14 @@ class _ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     parameters: dict[str, float] = {}  # msgspec copies the default
     zero_ns: int = 0
     laws: tuple[_LawFile, ...] = ()
+    equations: dict[str, Any] | None = None
+    process: dict[str, Any] | None = None
+    uncertain: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class ExtendedModel:
-    """A model of the catalogue with effects and changed parameters.
+    """A model with effects and changed parameters.
 
     Attributes:
         name: name of the model.
@@ -72,6 +83,10 @@ class ExtendedModel:
         parameters: values that differ from the model's nominal ones, by name, in their units.
         zero_ns: time from which the minutes are counted; 0: unknown.
         laws: laws of what was unknown, which act all the time.
+        equations: the model with all of these in it, where the catalogue lacks the model; None: the catalogue has it.
+        description: description of the process, as in its file (`reactorwatch.description.toml_file`); None: it has
+            the signals of the equations.
+        uncertain: see `ProcessModel`.
     """
 
     name: str
@@ -79,6 +94,9 @@ class ExtendedModel:
     parameters: Mapping[str, float] = field(default_factory=dict)
     zero_ns: int = 0
     laws: tuple[ExtendedLaw, ...] = ()
+    equations: ProcessModel | None = None
+    description: Mapping[str, Any] | None = None
+    uncertain: tuple[str, ...] = ()
 
     def build(self, models: Sequence[Callable[[], ProcessModel]] = MODELS) -> ProcessModel:
         """Build the model; its clock is that of the record.
@@ -89,26 +107,26 @@ class ExtendedModel:
         Raises:
             InputError: there is no such model, or it cannot have these parameters or effects.
         """
+        model = self._build_extended(models) if self.equations is None else self.equations
+        return replace(model, uncertain=self.uncertain) if self.uncertain else model
+
+    def _build_extended(self, models: Sequence[Callable[[], ProcessModel]]) -> ProcessModel:
         nominal = {item.name: item for item in (make() for make in models)}
         if self.name not in nominal:
             raise InputError(f"unknown model {self.name!r} (valid: {', '.join(nominal)})")
         try:
-            model = nominal[self.name].with_values(self.parameters)
-            for law in self.laws:
-                model = law.extend(model)
-            # A timing effect shifts the times of all others, and so comes last.
-            for item in sorted(self.effects, key=lambda item: item.effect.location == TIMING):
-                model = item.extend(model)
+            return extend(nominal[self.name].with_values(self.parameters), self.effects, self.laws)
         except ValueError as error:
             raise InputError(str(error)) from error
-        return model
 
     def rebase(self, zero_ns: int) -> "ExtendedModel":
         """Copy with minutes counted from another time; unchanged where its own zero is unknown."""
         if not self.zero_ns:
             return self
         by_min = (self.zero_ns - zero_ns) / _MINUTE_NS
-        return replace(self, effects=tuple(item.shift(by_min) for item in self.effects), zero_ns=zero_ns)
+        equations = None if self.equations is None else _shift(self.equations, by_min)
+        effects = tuple(item.shift(by_min) for item in self.effects)
+        return replace(self, effects=effects, zero_ns=zero_ns, equations=equations)
 
     def to_object(self) -> dict[str, Any]:
         """Convert to the JSON object."""
@@ -119,7 +137,33 @@ class ExtendedModel:
             "effects": [str(item) for item in self.effects],
             "zero_ns": self.zero_ns,
             **({"laws": [_law_object(item) for item in self.laws]} if self.laws else {}),
+            **({} if self.equations is None else {"equations": store_equations(self.equations)}),
+            **({} if self.description is None else {"process": dict(self.description)}),
+            **({"uncertain": list(self.uncertain)} if self.uncertain else {}),
         }
+
+
+def extend(
+    model: ProcessModel, effects: Sequence[FaultSpecification], laws: Sequence[ExtendedLaw] = ()
+) -> ProcessModel:
+    """Add laws and effects to a model.
+
+    Raises:
+        ValueError: it cannot have one of them.
+    """
+    for law in laws:
+        model = law.extend(model)
+    # A timing effect shifts the times of all others, and so comes last.
+    for item in sorted(effects, key=lambda item: item.effect.location == TIMING):
+        model = item.extend(model)
+    return model
+
+
+def _shift(model: ProcessModel, by_min: float) -> ProcessModel:
+    """Copy with the times of its effects later."""
+    values = {item.name: item.value for item in model.parameters}
+    times = [name for name in model.breakpoints if f"{name.rpartition('.')[0]}.size" in values]
+    return model.with_values({name: values[name] + by_min for name in times})
 
 
 def _law_object(law: ExtendedLaw) -> dict[str, Any]:
@@ -156,6 +200,11 @@ def parse_extended_model(
         raise InputError(f"is not JSON: {error}") from error
     if file.format != FORMAT:
         raise InputError(f"format must be {FORMAT!r}, got {file.format!r}")
+    if file.equations is not None:
+        equations = build_equations(file.model, file.equations)
+        return ExtendedModel(
+            file.model, zero_ns=file.zero_ns, equations=equations, description=file.process, uncertain=file.uncertain
+        )
     if effects is None:
         effects = named_effects(ExtendedModel(file.model).build(models))
     extended = ExtendedModel(
@@ -164,6 +213,8 @@ def parse_extended_model(
         file.parameters,
         file.zero_ns,
         tuple(item.law() for item in file.laws),
+        description=file.process,
+        uncertain=file.uncertain,
     )
     extended.build(models)  # reports invalid combinations now
     return extended
@@ -197,7 +248,21 @@ def extended_model_of(
         for item in (nominal.parameters if nominal else ())
         if values[item.name] != item.value
     }
-    return ExtendedModel(model.name, tuple(found), differing, zero_ns, model.laws)
+    return ExtendedModel(model.name, tuple(found), differing, zero_ns, model.laws, uncertain=model.uncertain)
+
+
+def are_named(extended: ExtendedModel) -> bool:
+    """True if the catalogue has the effects of an extended model, so that their names are enough."""
+    own = EFFECTS_OF.get(extended.name, ())
+    return all(item.effect in own or is_generic(item.effect) for item in extended.effects)
+
+
+def is_complete(extended: ExtendedModel, model: ProcessModel) -> bool:
+    """True if the catalogue makes this very model from an extended model without equations."""
+    try:
+        return are_named(extended) and fingerprint(replace(extended, equations=None).build()) == fingerprint(model)
+    except InputError:
+        return False
 
 
 def _specification(effect: Effect, values: Mapping[str, float], prefix: str) -> FaultSpecification:

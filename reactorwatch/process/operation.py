@@ -1,10 +1,10 @@
-"""Operation of a process in a simulation: levels of its inputs, noise of its sensors, and named runs."""
+"""Operation of a process: levels of its inputs, noise of its sensors, named runs, and default settings of its watch."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from reactorwatch.process.model import Variable
+from reactorwatch.process.model import ProcessModel, Variable
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,44 @@ class Preset:
 
 
 @dataclass(frozen=True)
+class Example:
+    """A simulated sample record.
+
+    Attributes:
+        meaning: a one-line description.
+        faults: specifications of the faults in it, with onsets and ends.
+        law: law in it that no cause of the catalogue has; None: there is none.
+        with_law: adds that law to the equations; None: there is none.
+        rows: number of rows.
+        settings: other settings of the plant, as for `Preset`.
+    """
+
+    meaning: str
+    faults: tuple[str, ...] = ()
+    law: str | None = None
+    with_law: Callable[[ProcessModel], ProcessModel] | None = None
+    rows: int = 2400
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class WatchDefaults:
+    """Settings of the watch of a process, and of its identification, where none are stated.
+
+    Attributes:
+        training_min: duration of the training in minutes; None: a number of rows.
+        smallest_sd: least standard deviation of the residual by output, in its unit.
+        priorities: priority of the alarms by output; others have a medium one.
+        identified: outputs that are identified; empty: all.
+    """
+
+    training_min: float | None = None
+    smallest_sd: Mapping[str, float] = field(default_factory=dict)
+    priorities: Mapping[str, str] = field(default_factory=dict)
+    identified: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Operation:
     """Operation of a process in a simulation.
 
@@ -72,9 +110,11 @@ class Operation:
         noise_sd: standard deviation of the sensors' noise by signal, in the unit of the equations; others have none.
         fault: fault of a demonstration, as `cause:profile:size`; empty: a step of the first effect.
         presets: named runs.
+        examples: sample records by name.
     """
 
     inputs: Mapping[str, InputLevels] = field(default_factory=dict)
     noise_sd: Mapping[str, float] = field(default_factory=dict)
     fault: str = ""
     presets: tuple[Preset, ...] = ()
+    examples: Mapping[str, Example] = field(default_factory=dict)

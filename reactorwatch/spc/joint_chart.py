@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -15,6 +16,7 @@ from reactorwatch.spc.false_alarm_budget import degrees_of_freedom
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.run_length.design import mewma_limit
 from reactorwatch.spc.run_length.mewma import LARGEST_DIMENSION_WITHOUT_SHIFT as LARGEST_DIMENSION
+from reactorwatch.spc.training_errors import TrainingErrors, joint_relative_rate
 
 ROWS_A_SIGNAL = 2
 """Rows of the training that a chart of all signals needs for each: with fewer their correlations are hardly known."""
@@ -30,6 +32,18 @@ class JointChart(Chart):
     @abstractmethod
     def design(cls, baseline: Baseline) -> Self:
         """The chart for a training; there must be no obstacle to it."""
+
+    @classmethod
+    def relative_rates(cls, baseline: Baseline, errors: TrainingErrors) -> Array:
+        """Rate of false alarms by the errors of the training, relative to the intended one, shape (draws,).
+
+        Of a chart without memory it is that of its single points. A chart that does not define it counts as T2.
+
+        Args:
+            baseline: training of the signals, as for `design`.
+            errors: errors of these signals.
+        """
+        return joint_rates(1.0 / baseline.arl0 if cls.has_memory else baseline.point_probability, 1.0, baseline, errors)
 
     @abstractmethod
     def update(self, x: ArrayLike) -> Judgement:
@@ -100,6 +114,27 @@ def joint_limit(arl0: float, weight: float, learned: Sequence[Prewhitening], row
     """
     dimension = len(learned)
     known = mewma_limit(arl0, dimension, weight)
-    freedoms = np.array([degrees_of_freedom(item, weight) for item in learned])
-    limit = estimated_t2_quantile(float(special.chdtrc(dimension, known)), freedoms, rows)
+    freedoms = tuple(degrees_of_freedom(item, weight) for item in learned)
+    limit = _estimated_quantile(float(special.chdtrc(dimension, known)), freedoms, rows)
     return limit * (1.0 + (2.0 - weight) / (weight * min(item.rows for item in learned)))
+
+
+@lru_cache(maxsize=16)
+def _estimated_quantile(tail: float, freedoms: tuple[float, ...], rows: float) -> float:
+    """See `estimated_t2_quantile`; a chart's design and its rates need the same one."""
+    return estimated_t2_quantile(tail, np.array(freedoms), rows)
+
+
+def joint_rates(share: float, weight: float, baseline: Baseline, errors: TrainingErrors) -> Array:
+    """Rate of a MEWMA, or with the weight 1 of a T2, relative to the intended one, shape (draws,).
+
+    Args:
+        share: intended probability of a point, or 1 / run length.
+        weight: lambda.
+        baseline: training of the signals.
+        errors: errors of these signals.
+    """
+    learned, rows = baseline.learned, len(baseline.e)
+    known = mewma_limit(1.0 / share, len(learned), weight)
+    limit = joint_limit(1.0 / share, weight, learned, rows)
+    return joint_relative_rate(known, limit, weight, learned, rows, errors)

@@ -133,6 +133,26 @@ class HealthReport(NamedTuple):
     reference: str = ""
 
 
+class PromiseReport(NamedTuple):
+    """Promise of false alarms: as stated, and as the alarms so far bear it out.
+
+    Attributes:
+        time_ns: time of the newest row.
+        found: number of alarms so far that chance can raise.
+        expected: number promised so far.
+        holds: False if the training or the alarms show that it is not kept.
+        text: one sentence.
+        power: deviations with the sizes that are seen, one line each.
+    """
+
+    time_ns: int
+    found: int
+    expected: float
+    holds: bool
+    text: str
+    power: tuple[str, ...]
+
+
 class SignalStatistics(NamedTuple):
     """Number, mean and range of a signal's values so far."""
 
@@ -179,6 +199,7 @@ class RunColumns:
         reconstructions: reconstructed signals.
         models: snapshots in order of time, by signal and purpose of the model, such as `ADAPTIVE`.
         health: health reports in order of time, by node.
+        promises: reports on the promise of false alarms in order of time.
         statistics: statistics of each signal up to the end of the segment.
         context: data of earlier segments.
         given_zero_ns: time that minutes count from; None for the first sample.
@@ -195,6 +216,7 @@ class RunColumns:
     reconstructions: dict[str, ReconstructionColumns] = field(default_factory=dict)
     models: dict[tuple[str, str], tuple[Snapshot, ...]] = field(default_factory=dict)
     health: dict[str, tuple[HealthReport, ...]] = field(default_factory=dict)
+    promises: tuple[PromiseReport, ...] = ()
     statistics: dict[str, SignalStatistics] = field(default_factory=dict)
     context: SegmentContext = SegmentContext()
     given_zero_ns: int | None = None

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
+from reactorwatch.contract.promise_text import describe_sizes, promise_fields
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.units import conversion
@@ -32,6 +33,7 @@ from recorder.columns.run import (
     EstimateColumns,
     FaultChange,
     HealthReport,
+    PromiseReport,
     ReconstructionColumns,
     RunColumns,
     SampleColumns,
@@ -109,6 +111,7 @@ class RunReader:
         self._faults: list[FaultChange] = []
         self._models: dict[tuple[str, str], list[Snapshot]] = {}
         self._health: dict[str, list[HealthReport]] = {}
+        self._promises: list[PromiseReport] = []
         self._newest_ns: int | None = None
         self._clock = ContinuousTime()
         self._statistics: dict[str, SignalStatistics] = {}
@@ -158,6 +161,8 @@ class RunReader:
             self._faults.append(fault._replace(time_ns=time_ns, onset_ns=onset_ns))
         elif kind == keys.MODEL:
             self._models.setdefault((into.topic.name, _purpose(message)), []).append(_snapshot(message, time_ns))
+        elif kind == keys.PROMISE:
+            self._promises.append(_promise(message, time_ns))
 
     def set_zero(self, time_ns: int) -> None:
         """Set the time that minutes count from, before the first segment."""
@@ -206,6 +211,7 @@ class RunReader:
             },
             models={name: _last_of_each_time(items) for name, items in self._models.items()},
             health={node: _last_of_each_time(items) for node, items in self._health.items()},
+            promises=_last_of_each_time(self._promises),
             statistics=dict(self._statistics),
             context=self._context,
             given_zero_ns=self._given_zero_ns,
@@ -214,7 +220,7 @@ class RunReader:
         self._context = _next_context(run)
         for item in found:
             item.clear()
-        self._alarms, self._faults, self._models, self._health = [], [], {}, {}
+        self._alarms, self._faults, self._models, self._health, self._promises = [], [], {}, {}, []
         return run
 
 
@@ -277,7 +283,7 @@ BESIDE = "/arx"
 """End of the names of predictions by the recursive ARX model beside another reference."""
 
 
-_Dated = TypeVar("_Dated", Snapshot, HealthReport)
+_Dated = TypeVar("_Dated", Snapshot, HealthReport, PromiseReport)
 
 
 def _last_of_each_time(items: list[_Dated]) -> tuple[_Dated, ...]:
@@ -305,6 +311,12 @@ def _report(message: messages.Health, time_ns: int) -> HealthReport:
     return HealthReport(time_ns, message.phase, message.lag_ms, counts, message.reference)
 
 
+def _promise(message: messages.Promise, time_ns: int) -> PromiseReport:
+    holds = message.kept and not message.drifted
+    power = tuple(describe_sizes(item) for item in promise_fields(message)["power"])
+    return PromiseReport(time_ns, message.found, message.expected_so_far, holds, message.text, power)
+
+
 class _Kind(NamedTuple):
     message: type[Message]
     numbers: Callable[[Any], tuple[float, ...]] | None = (
@@ -323,6 +335,7 @@ _KINDS = {
     keys.FAULT: _Kind(messages.Fault),
     keys.MODEL: _Kind(messages.ModelSnapshot),
     keys.HEALTH: _Kind(messages.Health),
+    keys.PROMISE: _Kind(messages.Promise),
 }
 
 

@@ -3,7 +3,7 @@
 A new panel is a file here that ends in `PANEL = Panel(title, draw)`, and a line in the tuple below.
 """
 
-from recorder.panels import alarms, charts, health, model, overview, phase_plane
+from recorder.panels import alarms, charts, health, model, overview, phase_plane, promise
 from recorder.panels.base import Panel
 
 PANELS: tuple[Panel, ...] = (
@@ -12,5 +12,6 @@ PANELS: tuple[Panel, ...] = (
     alarms.PANEL,
     model.PANEL,
     phase_plane.PANEL,
+    promise.PANEL,
     health.PANEL,
 )

@@ -1,8 +1,8 @@
 """Latched messages repeated at the start of each file, so that every file is self-contained. Pure.
 
-Models, alarms, baselines and faults are published when they change. A file in which none changes would not contain
-them. So the last message of each is repeated at the start of a file, marked as `RecordedMessage.latched`, with the time
-of its sample and with the start time of the file as its time of receipt.
+Models, alarms, baselines, promises and faults are published when they change. A file in which none changes would not
+contain them. So the last message of each is repeated at the start of a file, marked as `RecordedMessage.latched`, with
+the time of its sample and with the start time of the file as its time of receipt.
 """
 
 from google.protobuf.message import Message
@@ -13,7 +13,7 @@ from recorder.policy.channel_budget import MAX_KEYS
 
 
 class LatchedMessages:
-    """Last message of each model, alarm, baseline and fault.
+    """Last message of each model, alarm, baseline, promise and fault.
 
     Args:
         capacity: largest number of messages; beyond it the oldest is dropped.
@@ -28,7 +28,7 @@ class LatchedMessages:
         if isinstance(message, messages.ModelSnapshot):
             # models that share a key: the adaptive one, the one held since the training, the reference
             name = (recorded.key, (message.structure, message.reference, message.held))
-        elif isinstance(message, messages.Alarm | messages.Baseline | messages.Fault):
+        elif isinstance(message, messages.Alarm | messages.Baseline | messages.Promise | messages.Fault):
             name = (recorded.key, ("", False, False))
         else:
             return

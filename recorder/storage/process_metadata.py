@@ -1,7 +1,8 @@
 """Metadata record of a plant's process: its signals with their units and roles, and its equations. Pure.
 
-Equations are stored where they are those of the catalogue: by name, with the constants that differ and the deviations
-that the model holds. A recording of any other equations is read with the process named by an option.
+Equations of the catalogue are stored by name, with the constants that differ and the deviations that the model holds,
+and other ones as data (`stored_equations`). Effects of a user's code are neither: a recording of a process that has
+some is read with the process named by an option.
 """
 
 from collections.abc import Iterable
@@ -9,13 +10,11 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 
 import msgspec
-import numpy as np
 
 from reactorwatch.description.process import KnownParameter, Process, Signal, describe_model
 from reactorwatch.errors import InputError
-from reactorwatch.process import MODELS
-from reactorwatch.process.extended_model import extended_model_of, parse_extended_model
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process import EFFECTS_OF, MODELS
+from reactorwatch.process.extended_model import ExtendedModel, extended_model_of, is_complete, parse_extended_model
 from reactorwatch.records.record import Record
 from recorder.storage.mcap_types import Metadata
 
@@ -65,16 +64,15 @@ def processes_in(records: Iterable[Metadata]) -> dict[str, Process]:
 
 
 def _equations_metadata(process: Process) -> dict[str, str]:
-    """Metadata of the equations and their given constants; empty for equations that are not of the catalogue."""
+    """Metadata of the equations and their given constants; empty if its effects are code of the user."""
     model = process.equations
     if model is None or model.breakpoints:  # times of deviations count from a zero that is not known here
         return {}
     extended = extended_model_of(model)
-    try:
-        if not _are_equal(model, extended.build()):
+    if not (is_complete(extended, model) and process.effects == EFFECTS_OF.get(model.name, ())):
+        if process.effects:
             return {}
-    except InputError:
-        return {}
+        extended = ExtendedModel(model.name, equations=model, uncertain=model.uncertain)
     given = {
         name: item if isinstance(item, KnownParameter) else KnownParameter(*item)
         for name, item in process.parameters.items()
@@ -98,23 +96,3 @@ def _with_equations(process: Process, metadata: dict[str, str]) -> Process:
     return replace(
         named, name=process.name, signals=process.signals, parameters=parameters, file_format=process.file_format
     )
-
-
-def _are_equal(one: ProcessModel, other: ProcessModel) -> bool:
-    """True if two models have the same names and values, and equal balances and outputs at some points."""
-    names = [(item.state_names, item.units, item.parameter_names) for item in (one, other)]
-    if names[0] != names[1] or not np.array_equal(one.values(), other.values()):
-        return False
-    functions = [item.function() for item in (one, other)]
-    for share in (0.2, 0.5, 0.7):
-        states, inputs = (
-            np.array([item.lower + share * (item.upper - item.lower) for item in items])
-            for items in (one.states, one.inputs)
-        )
-        results = [
-            np.concatenate([np.array(part) for part in function(states, inputs, one.values(), 0.0, 0.0)])
-            for function in functions
-        ]
-        if not np.array_equal(results[0], results[1], equal_nan=True):
-            return False
-    return True

@@ -25,7 +25,7 @@ from recorder.storage.mcap_types import Attachment, Metadata
 from recorder.storage.mcap_writer import METADATA, RecordingWriter
 from recorder.tools.overlap import group_overlapping
 
-LATCHED_KINDS = frozenset({keys.MODEL, keys.ALARM, keys.BASELINE, keys.FAULT})
+LATCHED_KINDS = frozenset({keys.MODEL, keys.ALARM, keys.BASELINE, keys.PROMISE, keys.FAULT})
 """Kinds of messages that are latched."""
 
 

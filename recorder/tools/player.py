@@ -16,7 +16,7 @@ from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication,
 from reactorwatch.contract.commands import decode_command
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
-from reactorwatch.records.record import NEVER_NS, Record, to_time_ns
+from reactorwatch.records.record import MINUTE_NS, NEVER_NS, Record, to_time_ns
 from recorder.columns.run_splitter import ContinuousTime
 from recorder.message import RecordedMessage
 
@@ -37,6 +37,7 @@ EVERYTHING = frozenset(
         keys.ALARM_KPIS,
         keys.RECONSTRUCTION,
         keys.BASELINE,
+        keys.PROMISE,
         keys.FAULT,
     }
 )
@@ -141,16 +142,19 @@ class Player:
         loop: True to restart at the end, one row after the last row.
 
     Attributes:
+        paused: True while it waits to be resumed or stepped.
+        rate: plant time over clock time.
         published: number of published messages.
     """
 
     def __init__(self, open_tape: Callable[[], Iterator[Publication]], rate: float, *, loop: bool = False) -> None:
         self._open_tape = open_tape
         self._tape = _schedule(open_tape())
-        self._rate = rate
+        self.rate = rate
         self._loop = loop
-        self._paused = False
+        self.paused = False
         self._next = next(self._tape, None)
+        self._first_ns = self._next.time_ns if self._next is not None else 0
         self._spacing_ns = 0  # between the last two rows
         self._anchor: tuple[int, int] | None = None  # (clock time, plant time) of one moment
         self.published = 0
@@ -167,12 +171,12 @@ class Player:
 
     def next_tick_ns(self) -> int:
         """Time at which the next message is due."""
-        if self._paused:
+        if self.paused:
             return NEVER_NS
         if self._anchor is None or self._next is None:
             return 0
         clock_ns, plant_ns = self._anchor
-        return clock_ns + round((self._next.time_ns - plant_ns) / self._rate)
+        return clock_ns + round((self._next.time_ns - plant_ns) / self.rate)
 
     @property
     def finished(self) -> bool:
@@ -186,41 +190,74 @@ class Player:
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """Execute a command: pause, resume, step or set the rate. A refusal is a reply with the reason."""
         try:
-            text, publications = self._execute(question, now_ns)
+            name, command = decode_command(question, COMMANDS)
+            assert isinstance(command, messages.ReplayCommand), "the catalogue holds no others"
+            publications: list[Publication] = []
+            if name == "step":
+                publications = self.step(command.rows or 1, now_ns)
+            elif name == "set_rate":
+                self.set_rate(command.rate, now_ns)
+            elif name == "pause":
+                self.pause(now_ns)
+            else:
+                self.resume(now_ns)
         except (InputError, DecodeError) as error:
             return CommandReply(accepted=False, text=str(error)), []
-        self.published += len(publications)
-        return CommandReply(accepted=True, text=text), publications
+        return CommandReply(accepted=True, text=self.status), publications
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish nothing."""
         return []
 
-    def _execute(self, question: Encoded, now_ns: int) -> tuple[str, list[Publication]]:
-        name, command = decode_command(question, COMMANDS)
-        assert isinstance(command, messages.ReplayCommand), "the catalogue holds no others"
-        if name == "set_rate" and not command.rate > 0.0:
-            raise InputError(f"rate must be positive, got {command.rate:g}")
-        if name == "step" and not self._paused:
+    def pause(self, now_ns: int) -> None:
+        """Publish nothing until it is resumed or stepped."""
+        self._hold_position(now_ns)
+        self.paused = True
+
+    def resume(self, now_ns: int) -> None:
+        """Go on, after the rest of the time to the next message."""
+        self._hold_position(now_ns)
+        self.paused = False
+
+    def set_rate(self, rate: float, now_ns: int) -> None:
+        """Change the rate.
+
+        Raises:
+            InputError: the rate is not positive.
+        """
+        if not rate > 0.0:
+            raise InputError(f"rate must be positive, got {rate:g}")
+        self._hold_position(now_ns)
+        self.rate = rate
+
+    def step(self, rows: int, now_ns: int) -> list[Publication]:
+        """Publish the next rows.
+
+        Raises:
+            InputError: the replay is not paused.
+        """
+        if not self.paused:
             raise InputError("the replay is not paused; pause it before a step")
+        stepped = [publication for _ in range(rows) for publication in self._play_row(now_ns)]
+        self.published += len(stepped)
+        return stepped
+
+    @property
+    def status(self) -> str:
+        """State and rate, for people."""
+        state = "at the end" if self._next is None else "paused" if self.paused else "playing"
+        return f"{state} at {self.rate:g} times the plant's pace"
+
+    def position_min(self, now_ns: int) -> float:
+        """Plant time since the first message (min); NaN before the start and at the end."""
+        plant_ns = self._plant_time_ns(now_ns)
+        return math.nan if plant_ns is None else (plant_ns - self._first_ns) / MINUTE_NS
+
+    def _hold_position(self, now_ns: int) -> None:
+        """Let a new rate or pause count from the current plant time."""
         plant_ns = self._plant_time_ns(now_ns)
         if plant_ns is not None:
             self._anchor = now_ns, plant_ns
-        stepped: list[Publication] = []
-        if name == "step":
-            for _ in range(command.rows or 1):
-                stepped += self._play_row(now_ns)
-        elif name == "set_rate":
-            self._rate = command.rate
-        else:
-            self._paused = name == "pause"
-        return f"{self._status} at {self._rate:g} times the plant's pace", stepped
-
-    @property
-    def _status(self) -> str:
-        if self._next is None:
-            return "at the end"
-        return "paused" if self._paused else "playing"
 
     def _plant_time_ns(self, now_ns: int) -> int | None:
         """Current plant time, at most that of the next message; None before the start."""
@@ -228,9 +265,9 @@ class Player:
             return None
         clock_ns, plant_ns = self._anchor
         next_ns = self._next.time_ns
-        if self._paused or math.isinf(self._rate):
-            return plant_ns if self._paused else next_ns
-        return min(next_ns, plant_ns + round((now_ns - clock_ns) * self._rate))
+        if self.paused or math.isinf(self.rate):
+            return plant_ns if self.paused else next_ns
+        return min(next_ns, plant_ns + round((now_ns - clock_ns) * self.rate))
 
     def _play_row(self, now_ns: int) -> list[Publication]:
         """Publish all messages of the next time."""

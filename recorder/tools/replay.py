@@ -32,6 +32,7 @@ from recorder.tools.player import (
     filter_time,
     samples_of,
 )
+from recorder.tools.replay_keys import control_by_keys
 
 __all__ = ["Player", "ReplayConfig", "replay", "run_replay", "samples_of"]
 
@@ -76,7 +77,8 @@ def replay(config: ReplayConfig, bus_config: BusConfig, stop: StopSignal) -> int
             bus.declare_token(keys.key(plant, keys.ALIVE, NODE))
         loop = EventLoop(player, bus, stop)
         loop.accept_commands(*(keys.key(plant, keys.COMMAND, name) for plant in plants for name in COMMANDS))
-        loop.run()
+        with control_by_keys(player, loop):
+            loop.run()
     finally:
         bus.close()
     log.info("replayed", file=config.file, messages=player.published, to_the_end=player.finished)

@@ -104,7 +104,7 @@ def record_csv(tmp_path: Path) -> Path:
         (["identify", "RECORD"], "rows"),
         (["identify", "RECORD", "--process", "cstr", "--output", "pH"], "unknown --output 'pH' (valid: C, T)"),
         (["identify", "RECORD", "--output", "pH"], "expected a column 'pH'"),
-        (["identify", "RECORD", "--model", "fir"], "unknown model 'fir' (valid: arx, oe, armax, bj, narx)"),
+        (["identify", "RECORD", "--model", "fir"], "unknown model 'fir' (valid: arx, oe, armax, bj, narx, noe)"),
         (["linearise", "900"], "qc must be in [0, 500]"),
         (["diagnose"], "Missing argument"),
         (["diagnose", "nowhere.csv", "-o", "out"], "nowhere.csv: there is no such file"),

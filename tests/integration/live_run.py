@@ -30,6 +30,8 @@ PLANT = "cstr"
 PERIOD_MIN = 0.1
 
 SILENCE = "silence/plant"
+USUAL: dict[str, Any] = {"training_min": 15.0, "health_period_s": 0.5, "diagnose_training": False}
+"""Settings of the monitor. A diagnosis takes as long as the rest of the run, and once more for the expected alarms."""
 
 
 class Change(NamedTuple):
@@ -63,7 +65,7 @@ class LiveRun:
         self.folder, self.recording = folder, folder / "run.mcap"
         self._duration_min = duration_min
         self.config = BusConfig(endpoint=free_endpoint())
-        self.monitor = MonitorConfig(**{"training_min": 15.0, "health_period_s": 0.5} | monitor)
+        self.monitor = MonitorConfig(**USUAL | monitor)
         self.plant = PlantConfig(
             period_min=PERIOD_MIN,
             speed=speed,

@@ -3,6 +3,7 @@
 import datetime
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import msgspec
@@ -69,10 +70,12 @@ class Site:
         self._joined.append(bus)
         return bus
 
-    def leave(self, bus: ZenohBus) -> None:
-        """End a session, once all that it sent has been let in or not."""
-        self._joined.remove(bus)
-        bus.close()
+    def leave(self, *buses: ZenohBus) -> None:
+        """End sessions, once all that they sent has been let in or not; each takes a second, so all at once."""
+        for bus in buses:
+            self._joined.remove(bus)
+        with ThreadPoolExecutor(len(buses)) as closing:
+            list(closing.map(ZenohBus.close, buses))
 
     def heard_until(self, is_last: Callable[[Encoded], bool]) -> list[Encoded]:
         """What was let in, up to a message."""

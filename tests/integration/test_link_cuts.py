@@ -50,7 +50,7 @@ def router() -> Iterator[Router]:
     [
         ("recorder", "closed", 1.0),
         ("publisher", "stalled", 1.0),
-        ("publisher", "closed", 5.0),
+        ("publisher", "closed", 2.0),
         ("recorder", "stalled", 5.0),
     ],
 )
@@ -106,14 +106,14 @@ def test_what_could_not_be_recovered_is_counted_and_named_in_the_file_and_by_inf
 def test_who_begins_to_listen_late_hears_what_was_before(tmp_path: Path, router: Router) -> None:
     bus, heard, enough = connect_client(router.config), list[int](), threading.Event()
     publisher = Publisher(bus, RATE_PER_S)
-    publisher.wait(1000)
+    publisher.wait(300)
     late = connect_client(router.config)
 
     def hear(message: Encoded) -> None:
         sample = decode(message.payload, message.encoding)
         assert isinstance(sample, Sample)
         heard.append(sample.sequence)
-        if len(heard) >= 2000 * SIGNALS:
+        if len(heard) >= 600 * SIGNALS:
             enough.set()
 
     late.subscribe(keys.all_keys("cstr", keys.SAMPLE), hear, history_s=60.0)
@@ -136,9 +136,9 @@ def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
             wait_for_a_flush(tmp_path, publisher)
             if killed:
                 first.kill()
-        publisher.wait(publisher.sequence + 500)
+        publisher.wait(publisher.sequence + 200)
         with recorder_process(tmp_path, router.config.endpoint, tokens):
-            publisher.wait(publisher.sequence + 500)
+            publisher.wait(publisher.sequence + 200)
             publisher.close()
             assert heard.wait(publisher.sequence * SIGNALS), "the recorder does not keep up"
     finally:
@@ -177,7 +177,7 @@ def test_a_handler_that_blocks_holds_up_neither_the_publisher_nor_another_listen
     everything = keys.all_keys("cstr", keys.SAMPLE)
     stuck.subscribe(everything, hear_and_block)
     quick.subscribe(everything, lambda message: hear("quick", message))
-    publisher = Publisher(bus, RATE_PER_S)
+    publisher = Publisher(bus, 5 * RATE_PER_S)
     try:
         publisher.wait(rows)
         assert complete["quick"].wait(PATIENCE_S)

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -15,6 +16,7 @@ from recorder.tools.mcap_file import read_messages
 from .live_run import LiveRun
 
 ENDLESS_MIN = 100_000.0
+DIAGNOSED: dict[str, Any] = {"training_min": 25.0, "diagnose_training": True}
 
 
 class WarmRun(LiveRun):
@@ -27,7 +29,7 @@ def test_a_live_training_is_diagnosed_and_the_change_of_the_model_is_recorded_an
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     changes: list[Encoded] = []
-    with WarmRun(tmp_path, ENDLESS_MIN, 600.0, training_min=25.0) as live:
+    with WarmRun(tmp_path, ENDLESS_MIN, 600.0, **DIAGNOSED) as live:
         live.bus.subscribe(keys.key("cstr", keys.BASELINE, "monitor"), changes.append)
         _, plant = live.start_all()
         live.wait(lambda: bool(changes))
@@ -47,7 +49,7 @@ def test_a_live_training_is_diagnosed_and_the_change_of_the_model_is_recorded_an
 
 def test_a_monitor_that_was_stopped_before_the_diagnosis_was_done_makes_it_after_its_restart(tmp_path: Path) -> None:
     changes: list[Encoded] = []
-    with WarmRun(tmp_path, ENDLESS_MIN, 600.0, training_min=25.0, state_file=str(tmp_path / "monitor.state")) as live:
+    with WarmRun(tmp_path, ENDLESS_MIN, 600.0, state_file=str(tmp_path / "monitor.state"), **DIAGNOSED) as live:
         live.bus.subscribe(keys.key("cstr", keys.BASELINE, "monitor"), changes.append)
         live.start_all()
         live.wait(lambda: live.health.phase == "watching")

@@ -10,13 +10,14 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("reactorwatch", "plant_node", "monitor_node", "recorder", "diagnosis_node", "benchmarks", "tests")
-FOLDERS = (*PACKAGES, "docs", "deploy")
+FOLDERS = (".github", *PACKAGES, "docs", "deploy")
 DOCUMENTS = sorted(
     [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "tests" / "README.md", *(ROOT / "docs").rglob("*.md")]
 )
 
 FILE = re.compile(r"(?<![\w./-])[\w./-]*\w\.(?:py|md|proto|service|yml)\b(?!\.)")
 """Endings of files of this repository; settings and recordings are the users'."""
+LEADING = re.compile(r"^(?:\.{0,2}/)+")
 QUOTED = re.compile(r"(?<!`)`([a-z_][a-z0-9_]*(?:\.[a-z_][a-z0-9_]*)*)`(?!`)")
 COMMENT = re.compile(r"(?:^|\s)#\s(.*)$", re.MULTILINE)
 WORD = re.compile(r"\w+")
@@ -26,7 +27,7 @@ MADE = {"summary.md"}.union(*(WRITTEN.findall(path.read_text(encoding="utf-8")) 
 """Files that the commands write, and those that a page shows for the reader to write."""
 PREFIXES = ("reactorwatch_", "process_", "keep_", "_total")
 """Parts of names that the code puts together: metrics (tests/end_to_end/test_metrics.py has them all) and settings."""
-ELSEWHERE = ("xdist_group", "nohup", "openssl", "trustme", "uv", "zenohd")
+ELSEWHERE = ("nohup", "openssl", "trustme", "uv", "zenohd")
 """Names of other programs, that no code of this repository has."""
 
 
@@ -73,7 +74,7 @@ def texts() -> Iterator[tuple[Path, str]]:
 
 def missing_files(text: str) -> list[str]:
     """Files that a text names and that do not exist."""
-    named = (name.lstrip("./") for name in FILE.findall(text) if "://" not in name)
+    named = (LEADING.sub("", name) for name in FILE.findall(text) if "://" not in name)
     return [name for name in named if name not in MADE and name not in files()]
 
 

@@ -16,6 +16,7 @@ from monitor_node.alarms.alarms import AlarmMemory
 from monitor_node.alarms.annunciator import Annunciator, AnnunciatorState
 from monitor_node.alarms.incidents import Incident
 from monitor_node.alarms.kpis import KpiState
+from monitor_node.baseline.promise import NUMBERS, PromiseState
 from monitor_node.baseline.references import ProcessReferenceState
 from monitor_node.baseline.training import TrainingState
 from monitor_node.chart_stage import ChartsState, alarm_names
@@ -151,6 +152,8 @@ class Conversion:
         state = monitor.state
         watched, alignment = state.watch.watched, state.alignment
         board = msgspec.msgpack.decode(state.board, type=AnnunciatorState)
+        if any(item is not None and item.usual is not None for item in state.watch.signals.spikes):
+            return None
         if watched is None or watched.baseline or not isinstance(watched.reference, ProcessReferenceState):
             return None
         if board.kpis_changed or board.told is None or board.kpi_minute is None:
@@ -177,6 +180,7 @@ class Conversion:
         p["spacing_ns"], p["reach"] = sampling.spacing_ns, reference.reach
         p["noise"] = [*reference.noise.measurement_sd, *reference.noise.process_sd]
         p["typical_sd"] = reference.typical_sd
+        p["promise"] = np.zeros(NUMBERS) if watched.promise is None else watched.promise.numbers
         looked = watched.suspicion
         rest = Rest(
             None if self._never_came_up(board) else monitor.alarms,
@@ -272,6 +276,7 @@ class Conversion:
             [False] * len(outputs),
             int(p["rows_watched"]),
             rest.until_drift,
+            promise=PromiseState.from_numbers(p["promise"].tolist()) if p["promise"].any() else None,
         )
         watch = PipelineState(
             SamplingState(last_ns, [], float(numbers["period_ns"]), int(p["spacing_ns"])),

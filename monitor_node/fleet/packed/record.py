@@ -5,6 +5,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from monitor_node.baseline.promise import NUMBERS
 from monitor_node.ingest.sampling import SPACING
 from monitor_node.signal_checks.timeout import RECEIPTS
 
@@ -62,6 +63,7 @@ def record_type(outputs: int, states: int) -> np.dtype[Any]:
         # constants of the plant
         ("arl0", f, ()),
         ("width", f, (outputs,)),
+        ("promise", f, (NUMBERS,)),  # see `PromiseState`; 0: there is none
         ("reach", f, (1,)),  # see `references.input_reach`
         ("noise", f, (noise,)),  # standard deviations, of sensors and process
         ("typical_sd", f, (outputs,)),

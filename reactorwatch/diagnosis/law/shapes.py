@@ -24,6 +24,9 @@ HINGES = (-0.7, 0.0, 0.7)
 QUICK = 3.0
 """Sharpness of the direction in which an output moves, in spreads of its rate."""
 
+LARGEST = 1e12
+"""Largest size of a coefficient."""
+
 _BOUND = 1e6
 
 
@@ -42,7 +45,7 @@ class Shape:
     Attributes:
         place: the place.
         model: model with corrections, whose coefficients are parameters.
-        effects: one for each coefficient, which shifts it from zero.
+        parameters: names of the coefficients among the model's parameters.
         functions: functions of the correction as text, one for each coefficient.
         unit_size: correction at a unit coefficient of the constant function, the first one.
         terms: functions of the correction in the place itself as expressions.
@@ -51,7 +54,7 @@ class Shape:
 
     place: Place
     model: ProcessModel
-    effects: tuple[Effect, ...]
+    parameters: tuple[str, ...]
     functions: tuple[str, ...]
     unit_size: float
     terms: tuple[ca.SX, ...]
@@ -125,8 +128,8 @@ def make_shape(model: ProcessModel, place: Place, scales: Mapping[str, Scale]) -
         coefficients.append(lag)
         names.append("logarithm of the lag's ratio")
     extended = replace(extended, parameters=(*extended.parameters, *parameters, *coefficients))
-    effects = tuple(coefficient_effect(item.name) for item in coefficients)
-    return Shape(place, extended, effects, tuple(names), _typical(model, place, scales), tuple(terms), tuple(apart))
+    chosen = tuple(item.name for item in coefficients)
+    return Shape(place, extended, chosen, tuple(names), _typical(model, place, scales), tuple(terms), tuple(apart))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +181,7 @@ def _typical(model: ProcessModel, place: Place, scales: Mapping[str, Scale]) -> 
 
 
 def _constant(name: str) -> Parameter:
-    return Parameter(name, 0.0, "1", -1e12, 1e12, "", ca.SX.sym(name))
+    return Parameter(name, 0.0, "1", -LARGEST, LARGEST, "", ca.SX.sym(name))
 
 
 def coefficient_effect(name: str) -> Effect:

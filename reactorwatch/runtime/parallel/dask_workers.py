@@ -7,7 +7,7 @@ that worker, so a job that it gives up gets a last run when it has the cluster t
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -45,7 +45,7 @@ class DaskExecutor:
 
     def map_unordered(
         self, work: Callable[[Job], Result], jobs: Sequence[Job]
-    ) -> Iterator[tuple[int, Result | Failed]]:
+    ) -> Generator[tuple[int, Result | Failed]]:
         """See `Executor`.
 
         Raises:

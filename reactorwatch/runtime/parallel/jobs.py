@@ -10,7 +10,7 @@ the jobs: in this process (`SerialExecutor`), in processes of this machine (`pro
 """
 
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -42,7 +42,7 @@ class Executor(Protocol):
 
     def map_unordered(
         self, work: Callable[[Job], Result], jobs: Sequence[Job]
-    ) -> Iterator[tuple[int, Result | Failed]]:
+    ) -> Generator[tuple[int, Result | Failed]]:
         """Yield each result with the index of its job, as jobs end; closing the iterator stops the work.
 
         Args:
@@ -56,7 +56,7 @@ class SerialExecutor:
 
     def map_unordered(
         self, work: Callable[[Job], Result], jobs: Sequence[Job]
-    ) -> Iterator[tuple[int, Result | Failed]]:
+    ) -> Generator[tuple[int, Result | Failed]]:
         """See `Executor`."""
         for number, job in enumerate(jobs):
             yield number, run_job(work, job)

@@ -12,7 +12,7 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import get_context, resource_tracker
@@ -72,7 +72,7 @@ class ProcessExecutor:
 
     def map_unordered(
         self, work: Callable[[Job], Result], jobs: Sequence[Job]
-    ) -> Iterator[tuple[int, Result | Failed]]:
+    ) -> Generator[tuple[int, Result | Failed]]:
         """See `Executor`."""
         queue = deque(range(len(jobs)))
         deaths = [0] * len(jobs)

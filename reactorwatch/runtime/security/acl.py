@@ -74,6 +74,7 @@ ROLES = (
             *(f"{kind}/**" for kind in (keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.RECONSTRUCTION)),
             f"{keys.ALARM_KPIS}/monitor",
             f"{keys.BASELINE}/monitor",
+            f"{keys.PROMISE}/monitor",
         ),
         answers=(*PLANT_ALARM_COMMANDS, *ALARM_ENGINEERING, *BASELINE_COMMANDS, "list_alarms"),
     ),

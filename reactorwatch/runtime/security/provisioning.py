@@ -89,7 +89,7 @@ def make_site(
     there = _find_plants(folder)
     plants = tuple(sorted({*there, *plants}))
     if not plants and not (folder / AUTHORITY).is_dir():
-        plants = ("cstr",)
+        plants = (keys.DEFAULT_PLANT,)
     holders = [f"{plant}/{role.name}" for plant in plants for role in ROLES]
     for holder in revoke:
         if holder not in holders:

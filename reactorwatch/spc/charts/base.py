@@ -7,14 +7,18 @@ restart by itself after a point that is out: its owner calls `restart` when the 
 
 from abc import ABC, abstractmethod
 from math import isfinite
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtri
 
 from reactorwatch.errors import InputError
 from reactorwatch.spc.baseline import Baseline
 from reactorwatch.stored_state import StoredState
+
+if TYPE_CHECKING:
+    from reactorwatch.spc.training_errors import TrainingErrors
 
 Array = NDArray[np.float64]
 
@@ -144,6 +148,25 @@ class SignalChart(Chart):
     @abstractmethod
     def design(cls, baseline: Baseline) -> Self:
         """The chart for a training of one signal, whose residual has the mean 0 and the standard deviation 1."""
+
+    @classmethod
+    def relative_rates(cls, baseline: Baseline, errors: "TrainingErrors") -> Array:
+        """Rate of false alarms by the errors of the training, relative to the intended one, shape (draws,).
+
+        Of a chart without memory it is that of its single points. A chart that does not define it counts as one of
+        individual values.
+
+        Args:
+            baseline: training of one signal, as for `design`.
+            errors: errors of this signal.
+        """
+        from reactorwatch.spc.training_errors import (
+            relative_rate,
+        )  # which needs the run lengths, which need this module
+
+        (learned,) = baseline.learned
+        share = 1.0 / baseline.arl0 if cls.has_memory else baseline.point_probability
+        return relative_rate(float(-ndtri(0.5 * share)), 1.0, learned, errors)
 
     def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """The text of an alarm, and each signal's share of it.

@@ -9,10 +9,11 @@ from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.charts.pca import PcaSpe, PcaT2
+from reactorwatch.spc.charts.residual_space import ResidualSpace
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.charts.t2 import T2
 
-CHARTS: tuple[type[Chart], ...] = (Shewhart, Ewma, Cusum, T2, Mewma, PcaT2, PcaSpe, ParameterT2)
+CHARTS: tuple[type[Chart], ...] = (Shewhart, Ewma, Cusum, T2, Mewma, PcaT2, PcaSpe, ResidualSpace, ParameterT2)
 
 
 def chart(name: str) -> type[Chart]:

@@ -36,6 +36,7 @@ from reactorwatch.spc.compiled_chart import (
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.run_length.cusum import check_parameters
 from reactorwatch.spc.run_length.design import cusum_limit
+from reactorwatch.spc.training_errors import TrainingErrors
 
 CEILING = 2.0
 """Times the limit: the sums stop there, so that after a large change they are soon back. Run lengths are untouched."""
@@ -97,6 +98,15 @@ class Cusum(CompiledChart):
         """See `SignalChart`; `cusum_allowance` is k."""
         (learned,), (sd,), k = baseline.learned, baseline.memory_sd, baseline.settings["cusum_allowance"]
         return cls(0.0, sd, k, designed_limit(baseline.arl0, k, learned))
+
+    @classmethod
+    def relative_rates(cls, baseline: Baseline, errors: TrainingErrors) -> Array:
+        """See `SignalChart`; after Siegmund, as for the limit."""
+        (learned,), k = baseline.learned, baseline.settings["cusum_allowance"]
+        known, h = cusum_limit(baseline.arl0, k), designed_limit(baseline.arl0, k, learned)
+        scale = errors.true_scale(0, learned, 0.0)
+        rate = _cusum_rate(errors.mean[:, 0] / sqrt(learned.rows), k / scale, h / scale)
+        return rate / _cusum_rate(np.zeros(1), np.full(1, k), np.full(1, known))
 
     def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`."""

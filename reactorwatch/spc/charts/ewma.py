@@ -33,6 +33,7 @@ from reactorwatch.spc.compiled_chart import (
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.run_length.design import ewma_limit
 from reactorwatch.spc.run_length.ewma import check_parameters
+from reactorwatch.spc.training_errors import TrainingErrors, relative_rate
 
 _MEMORIES = 2
 _MEAN, _WEIGHT, _LIMIT, _START = range(SETTINGS, SETTINGS + 4)
@@ -95,6 +96,12 @@ class Ewma(CompiledChart):
         """See `SignalChart`; `ewma_weight` is the weight of the newest row."""
         (learned,), (sd,), weight = baseline.learned, baseline.memory_sd, baseline.settings["ewma_weight"]
         return cls(0.0, sd, weight, designed_limit(baseline.arl0, weight, learned))
+
+    @classmethod
+    def relative_rates(cls, baseline: Baseline, errors: TrainingErrors) -> Array:
+        """See `SignalChart`."""
+        (learned,), weight = baseline.learned, baseline.settings["ewma_weight"]
+        return relative_rate(ewma_limit(baseline.arl0, weight), weight, learned, errors)
 
     def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`: as the lasting shift of the signal that would look like this."""

@@ -18,7 +18,8 @@ from reactorwatch.errors import InputError
 from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Setting, positive, vector
 from reactorwatch.spc.charts.t2 import Whitening
-from reactorwatch.spc.joint_chart import JointChart, correlation, joint_limit
+from reactorwatch.spc.joint_chart import JointChart, correlation, joint_limit, joint_rates
+from reactorwatch.spc.training_errors import TrainingErrors
 
 
 @jit
@@ -97,6 +98,11 @@ class Mewma(JointChart):
         weight, sd = baseline.settings["mewma_weight"], np.array(baseline.memory_sd)
         limit = joint_limit(baseline.arl0, weight, baseline.learned, len(baseline.e))
         return cls(np.zeros(sd.size), correlation(baseline.e) * np.outer(sd, sd), weight, limit)
+
+    @classmethod
+    def relative_rates(cls, baseline: Baseline, errors: TrainingErrors) -> Array:
+        """See `JointChart`."""
+        return joint_rates(1.0 / baseline.arl0, baseline.settings["mewma_weight"], baseline, errors)
 
     @classmethod
     def from_state(cls, state: MewmaState) -> "Mewma":

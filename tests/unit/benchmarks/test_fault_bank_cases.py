@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.faults.bank import AFTER_MIN, BANK, GRADES, ONSET_MIN, TWINS, Case, Fault, cases
 from benchmarks.faults.runs import NOISE_SD, fault_free, record_of, truth_of
-from monitor_node.isolation.causes import CAUSES
+from monitor_node.isolation.causes import causes_of
 from plant_node.initial_state import start_state
 from reactorwatch.arrays import Array
 from reactorwatch.process.fault import parse_fault
@@ -15,6 +15,8 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
+
+CAUSES = causes_of(cstr())
 
 RAMP = Fault("temperature_bias", "ramp", (0.2, 1.0, 8.0))
 

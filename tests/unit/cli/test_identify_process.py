@@ -63,7 +63,7 @@ def test_the_outputs_named_are_identified_in_their_order(words: list[str]) -> No
     assert [found["output"] for found in identified("--process", "exchanger.toml", *words)] == ["tc", "th"]
 
 
-@pytest.mark.parametrize("model", ["arx", "oe", "armax", "bj", "narx"])
+@pytest.mark.parametrize("model", ["arx", "oe", "armax", "bj", "narx", "noe"])
 def test_columns_describe_the_same_process_as_a_file(model: str) -> None:
     named = identified("--process", "exchanger.toml", "--output", "th", "--model", model)
     columns = identified("--time", "ts", "--input", "q1,q2", "--output", "th", "--model", model)
@@ -111,12 +111,15 @@ def test_a_catalogue_process_is_identified_by_name(folder: Path) -> None:
         (["--process", "exchanger.toml", "--input", "q1"], "leave one of the two out"),
         (["--input", "q1"], "--input needs an --output"),
         (["--input", "q1", "--output", "q1"], "each signal must have a name of its own"),
-        (["--model", "exchanger.toml"], "unknown model 'exchanger.toml' (valid: arx, oe, armax, bj, narx)"),
+        (["--model", "exchanger.toml"], "unknown model 'exchanger.toml' (valid: arx, oe, armax, bj, narx, noe)"),
         (["--input", "q1", "--output", "th", "--compare", "--settle", "5"], "leave --validate and --settle out"),
         (["--input", "q1", "--output", "th", "--validate", "gone.csv"], "gone.csv: there is no such file"),
         (["--input", "q1", "--output", "th", "--settle", "200"], "needs more rows than the 200 that set the state"),
         (["--input", "q1", "--output", "th", "--order", "150"], "needs more than 451 rows to fit"),
-        (["--input", "q1", "--output", "th", "--model", "bj", "--recursive"], "only arx and oe can be recursive"),
+        (
+            ["--input", "q1", "--output", "th", "--model", "narx", "--recursive"],
+            "only arx, oe, armax, bj can be recursive",
+        ),
     ],
 )
 def test_bad_input_gets_one_line(

@@ -1,7 +1,8 @@
 """Ctrl-C ends a command, also where the compiler drops what is raised, and interrupts no cleaning up."""
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import closing
 
 import pytest
 from llvmlite.binding import ExecutionEngine
@@ -73,6 +74,26 @@ def test_nothing_is_raised_while_an_interrupt_is_cleaned_up_after() -> None:
     with pytest.raises(KeyboardInterrupt):
         command()
     assert is_cleaned
+
+
+def test_nothing_is_raised_while_a_generator_is_closed_for_an_interrupt() -> None:
+    is_closed = []
+
+    def work() -> Generator[int]:
+        try:
+            yield from range(2)
+        finally:
+            signal.pause()  # until the next time that it would be raised
+            is_closed.append(True)
+
+    def command() -> None:
+        with closing(work()) as results:
+            next(results)
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        command()
+    assert is_closed
 
 
 def test_the_compiler_s_callbacks_have_the_names_that_are_looked_for() -> None:

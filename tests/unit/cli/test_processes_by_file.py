@@ -55,6 +55,8 @@ def test_a_rig_with_names_and_units_of_its_own_is_diagnosed_and_simulated(rig: P
     assert run.exit_code == 0, run.output
     rmse_cm = json.loads(run.stdout)["rmse"]["h1"]["value"]
     assert found["gain"]["held_out"]["h1"]["rmse_after"] < 0.2 < 1.0 < rmse_cm
+    rig.with_suffix(".toml").unlink()
+    watch_and_simulate(rig, out / "extended.json")
 
 
 def test_a_process_without_equations_is_refused_with_the_cure(rig: Path) -> None:
@@ -63,3 +65,55 @@ def test_a_process_without_equations_is_refused_with_the_cure(rig: Path) -> None
     run = CliRunner().invoke(app, ["diagnose", str(rig), "--process", str(rig.with_suffix(".toml"))])
     assert run.exit_code != 0
     assert "process 'rig': must have equations for this, got none" in str(run.exception)
+
+
+CODE = """
+from dataclasses import replace
+
+import reactorwatch as rw
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.records.file_format import FileFormat
+
+
+class Clog(Effect):
+    \"\"\"The pipe between tanks 1 and 3 is clogged.\"\"\"
+
+    name, label, location, unit = "pipe", "clogged pipe", "pipe13", "1"
+    lower, upper, typical = 0.0, 0.99, 0.05
+
+    def apply(self, model, size):
+        opening = model.parameter("a1").symbol
+        return model.substitute(opening, opening * (1 - size))
+
+
+def process():
+    columns = {"Q1": ("P101 flow", "l/h"), "Q2": ("P102 flow", "cm3/s"), "h1": ("L1", "mm"), "h2": ("L2", "cm"),
+               "h3": ("L3", "cm")}
+    signals = tuple(
+        rw.Signal(name, unit, "input" if name[0] == "Q" else "output", column)
+        for name, (column, unit) in columns.items()
+    )
+    model = replace(three_tanks(), name="code", places=())
+    return rw.Process("code", signals, model, (Clog(),), file_format=FileFormat(time="sample", time_unit="s"))
+"""
+
+
+def watch_and_simulate(rig: Path, process: Path) -> None:
+    """A rig with this process, and no other description, is sound."""
+    arguments = ["simulate", str(rig), "--process", str(process), "-o", str(rig.parent / "again.csv"), "--json"]
+    run = CliRunner().invoke(app, arguments)
+    assert run.exit_code == 0, run.output
+    assert all(item["value"] < 0.2 for item in json.loads(run.stdout)["rmse"].values())
+    run = CliRunner().invoke(app, ["backtest", str(rig), "--process", str(process), "--json"])
+    assert run.exit_code == 0, run.output
+    assert json.loads(run.stdout)["alarms"] == []
+
+
+def test_the_extended_model_of_code_is_read_without_the_code(rig: Path) -> None:
+    described, out = rig.with_suffix(".py"), rig.parent / "report"
+    described.write_text(CODE, encoding="utf-8")
+    run = CliRunner().invoke(app, ["diagnose", str(rig), "--process", str(described), "-o", str(out)])
+    assert run.exit_code == 0, run.output
+    described.unlink()
+    watch_and_simulate(rig, out / "extended.json")

@@ -1,15 +1,19 @@
 """A process is described once, and what is wrong with a description is said in one line."""
 
+from collections.abc import Callable
 from typing import Any
 
+import casadi as ca
 import pytest
 
 from reactorwatch.description.find import find_process
 from reactorwatch.description.process import KnownParameter, Process, Signal, describe_model
 from reactorwatch.errors import InputError
 from reactorwatch.process import EFFECTS_OF
+from reactorwatch.process.effect import Effect, ParameterShift
 from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.model import ProcessModel
 
 Q = Signal("q", "l/s", "input")
 TH = Signal("th", "degC", "output")
@@ -129,3 +133,36 @@ def test_a_cause_is_left_out_without_its_generic_twin_and_an_unknown_one_is_refu
     assert "x2.bias" not in left
     with pytest.raises(InputError, match=r"process 'rig': unknown cause 'level_bais'; did you mean 'level_bias'"):
         process.select_causes(("level_bais",))
+
+
+def strayed() -> ProcessModel:
+    return three_tanks().add_rate("h1", ca.SX.sym("zz"))
+
+
+class Misfit(ParameterShift):
+    """An effect on a parameter that the tanks do not have."""
+
+    name = "misfit"
+    label = "misfit"
+    location = "h1"
+    unit = "1"
+    lower, upper, typical = -1.0, 1.0, 0.1
+    parameter = "K7"
+
+
+@pytest.mark.parametrize(
+    ("make", "effects", "text"),
+    [
+        (strayed, (Misfit(),), r"process 'rig': the equations have unknown symbols: zz; write them with its states"),
+        (
+            three_tanks,
+            (Misfit(),),
+            r"process 'rig', effect 'misfit': must extend the equations, got ValueError: .*'K7'",
+        ),
+    ],
+)
+def test_code_of_the_user_that_makes_no_process_is_refused_before_it_is_used(
+    make: Callable[[], ProcessModel], effects: tuple[Effect, ...], text: str
+) -> None:
+    with pytest.raises(InputError, match=text):
+        Process("rig", find_process("three_tanks").signals, make(), effects)

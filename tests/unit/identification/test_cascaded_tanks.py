@@ -24,7 +24,7 @@ def halves() -> tuple[Dataset, Dataset]:
     return Dataset.of(time, u, level, ("u",), "x2").split(512)
 
 
-@pytest.mark.parametrize("model", ["arx", "oe", "armax", "bj", "narx"])
+@pytest.mark.parametrize("model", ["arx", "oe", "armax", "bj", "narx", "noe"])
 def test_the_free_run_of_an_unseen_half_is_as_good_as_published_ones(
     model: str, halves: tuple[Dataset, Dataset]
 ) -> None:

@@ -104,7 +104,7 @@ def test_a_record_that_determines_nothing_is_refused_with_the_cause(noisy_plant:
 
     holed, infinite = u.copy(), y.copy()
     holed[3], infinite[7] = math.nan, math.inf
-    assert_refused(r"unknown model 'fir' \(valid: arx, oe, armax, bj, narx\)", model="fir")
+    assert_refused(r"unknown model 'fir' \(valid: arx, oe, armax, bj, narx, noe\)", model="fir")
     assert_refused("order must be at least 1, got 0", order=0)
     assert_refused(r"delay \(samples\) must be at least 1, got -1", delay=-1)
     assert_refused(

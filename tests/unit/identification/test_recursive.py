@@ -1,19 +1,21 @@
-"""The output-error model that learns row by row, against the batch one."""
+"""Models that learn row by row, against those of all rows at once."""
 
 import numpy as np
 import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.output_error import fit_oe, is_stable
-from reactorwatch.identification.recursive_output_error import RecursiveOutputError
+from reactorwatch.identification.prediction_error import Kind, PredictionErrorModel, fit_armax, fit_box_jenkins
+from reactorwatch.identification.recursive_prediction_error import RecursivePredictionError
 from reactorwatch.identification.structure import Scaling, Structure
+from tests.unit.identification.systems import ARMA, ARMAX, BOX_JENKINS, System
 from tests.unit.identification.truth import NoisyPlant, oscillating_plant
 
 
-def test_recursive_output_error_reaches_the_batch_model(noisy_plant: NoisyPlant) -> None:
+def test_recursive_prediction_error_reaches_the_batch_model(noisy_plant: NoisyPlant) -> None:
     """One pass over 4,000 rows from zero parameters: within one standard deviation of the batch minimum."""
     structure = Structure.of_order(2)
-    running = RecursiveOutputError(structure, Scaling.of(noisy_plant.inputs, noisy_plant.measured))
+    running = RecursivePredictionError(structure, Scaling.of(noisy_plant.inputs, noisy_plant.measured))
     for u, y in zip(noisy_plant.inputs, noisy_plant.measured, strict=True):
         running.update([u], y)
     batch, model = fit_oe(structure, noisy_plant.inputs, noisy_plant.measured), running.model
@@ -22,11 +24,26 @@ def test_recursive_output_error_reaches_the_batch_model(noisy_plant: NoisyPlant)
     assert np.max(np.abs(model.parameters[0] - noisy_plant.parameters) / model.standard_deviations[0]) < 4.0
 
 
+@pytest.mark.parametrize(("system", "kind"), [(ARMAX, "armax"), (ARMA, "armax"), (BOX_JENKINS, "bj")])
+def test_recursive_models_of_the_disturbance_reach_the_batch_models(system: System, kind: Kind) -> None:
+    """One pass over 4,000 rows from zero parameters: within one standard deviation of the batch minimum."""
+    u, y = system.simulate(4000, 1)
+    structure = Structure.of_order(2, inputs=system.inputs)
+    running = RecursivePredictionError(structure, Scaling.of(u, y), kind=kind)
+    for inputs, output in zip(u, y, strict=True):
+        running.update(inputs, float(output))
+    batch, model = (fit_armax if kind == "armax" else fit_box_jenkins)(structure, u, y), running.model
+    assert isinstance(model, PredictionErrorModel)
+    assert np.max(np.abs(model.parameters - batch.parameters) / batch.standard_deviations) < 1.0
+    np.testing.assert_allclose(model.standard_deviations, batch.standard_deviations, rtol=0.2)
+    assert model.noise_sd == pytest.approx(batch.noise_sd, rel=0.02)
+
+
 def test_it_follows_a_plant_that_changes() -> None:
     """The gain doubles in the middle; with forgetting 0.99 the last parameters are those of the new plant."""
     plant = oscillating_plant(6000, noise_sd=0.1)
     u = plant.inputs
-    running = RecursiveOutputError(Structure.of_order(2), forgetting=0.99)
+    running = RecursivePredictionError(Structure.of_order(2), forgetting=0.99)
     y = np.zeros(2)
     for k in range(2, 6000):
         gain = 1.0 if k < 3000 else 2.0
@@ -39,7 +56,7 @@ def test_it_follows_a_plant_that_changes() -> None:
 def test_its_poles_stay_inside_the_unit_circle_whatever_comes() -> None:
     """An unstable plant's record, and noise: at every row the model is stable and everything finite."""
     rng = np.random.default_rng(2)
-    running = RecursiveOutputError(Structure.of_order(2), forgetting=0.95)
+    running = RecursivePredictionError(Structure.of_order(2), forgetting=0.95)
     y = 0.0
     for k in range(400):
         u = rng.standard_normal()
@@ -51,7 +68,7 @@ def test_its_poles_stay_inside_the_unit_circle_whatever_comes() -> None:
 
 
 def test_a_row_that_is_not_complete_is_refused_and_changes_nothing() -> None:
-    running, untouched = RecursiveOutputError(Structure.of_order(1)), RecursiveOutputError(Structure.of_order(1))
+    running, untouched = (RecursivePredictionError(Structure.of_order(1)) for _ in range(2))
     rng = np.random.default_rng(3)
     for u, y in rng.standard_normal((20, 2)):
         running.update([u], y)
@@ -67,5 +84,5 @@ def test_a_row_that_is_not_complete_is_refused_and_changes_nothing() -> None:
 
 
 def test_several_outputs_are_refused() -> None:
-    with pytest.raises(InputError, match="an output-error model has one output, got 2"):
-        RecursiveOutputError(Structure.of_order(1, outputs=2))
+    with pytest.raises(InputError, match="a recursive model has one output, got 2"):
+        RecursivePredictionError(Structure.of_order(1, outputs=2))

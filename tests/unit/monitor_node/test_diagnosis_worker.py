@@ -2,7 +2,7 @@
 
 import errno
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
 from monitor_node.__main__ import MonitorNode
@@ -52,7 +52,7 @@ def test_a_training_that_cannot_be_diagnosed_is_a_finding_and_the_next_is_diagno
 class NoProcess(SerialExecutor):
     """An executor on a machine that has no room for another process."""
 
-    def map_unordered(self, work: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+    def map_unordered(self, work: Callable[[Any], Any], jobs: Sequence[Any]) -> Generator[tuple[int, Any]]:
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
 
 

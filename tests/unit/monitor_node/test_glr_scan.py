@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor_node.isolation.causes import CAUSES
+from monitor_node.isolation.causes import causes_of
 from monitor_node.isolation.glr_scan import GlrScan, Scan
 from monitor_node.isolation.window import Window, window_of
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
@@ -14,6 +14,8 @@ from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
+
+CAUSES = causes_of(cstr())
 
 NOISY = NoiseLevels((0.002, 0.3), (0.002, 0.5))
 

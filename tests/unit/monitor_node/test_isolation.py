@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from monitor_node.isolation.causes import CAUSES
+from monitor_node.isolation.causes import causes_of
 from monitor_node.isolation.isolation import PROCESS, SENSOR, UNKNOWN, Isolation, Suspect
 from monitor_node.isolation.window import Row
 from reactorwatch.kalman.ekf import NoiseLevels
@@ -15,6 +15,8 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel, variable
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
+
+CAUSES = causes_of(cstr())
 
 GROSS = (
     ("feed_temperature", 4.0),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monitor_node.isolation.candidate import Candidate, scan_candidates
-from monitor_node.isolation.causes import CAUSES
+from monitor_node.isolation.causes import causes_of
 from monitor_node.isolation.fit import Fitter
 from monitor_node.isolation.glr_scan import GlrScan
 from monitor_node.isolation.window import Window, window_of
@@ -15,6 +15,8 @@ from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.step_budget import BudgetExceededError, StepBudget
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
+
+CAUSES = causes_of(cstr())
 
 
 def window_with(fault: str, seed: int = 1, after_min: float = 5.0) -> Window:

@@ -1,6 +1,6 @@
 """Plants with no, one or several inputs: watched, resumed, replayed and back-tested alike, whatever is missing."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -227,9 +227,20 @@ def test_equations_with_two_inputs_judge_a_plant_in_closed_loop(missing: float) 
     assert [live(other, [m]) for other in [Monitor(swapped, START_NS, model=model)] for m in messages] == published
 
 
-@pytest.mark.parametrize(("cause", "size", "kind"), [("clog13", 0.3, "process"), ("h3.bias", 2.0, "sensor")])
+OF_CODE = replace(three_tanks(), name="code", effects=EFFECTS_OF["three_tanks"])
+"""A model that no catalogue has, with effects of its own."""
+
+
+@pytest.mark.parametrize(
+    ("cause", "size", "kind", "equations"),
+    [
+        ("clog13", 0.3, "process", three_tanks()),
+        ("h3.bias", 2.0, "sensor", three_tanks()),
+        ("clog13", 0.3, "process", OF_CODE),
+    ],
+)
 def test_the_cause_of_an_alarm_is_sought_among_the_effects_of_a_process_with_two_inputs(
-    cause: str, size: float, kind: str
+    cause: str, size: float, kind: str, equations: ProcessModel
 ) -> None:
     """And a monitor that was stopped in the search names the same suspects."""
     effect = next(item for item in EFFECTS_OF["three_tanks"] if item.name == cause)
@@ -239,10 +250,10 @@ def test_the_cause_of_an_alarm_is_sought_among_the_effects_of_a_process_with_two
     if kind == "sensor":
         plant.values[FAULT_ROW:, 4] += size
     config, messages = plant.config(diagnose_training=False, isolation=True), plant.messages()
-    monitor = Monitor(config, START_NS, model=three_tanks())
+    monitor = Monitor(config, START_NS, model=equations)
     last = 5 * (FAULT_ROW + 8)
     live(monitor, messages[:last])
-    resumed = Monitor(config, START_NS, model=three_tanks())
+    resumed = Monitor(config, START_NS, model=equations)
     resumed.from_bytes(monitor.to_bytes())
     resumed.on_history_end()
     told = live(monitor, messages[last:])

@@ -60,8 +60,15 @@ def test_the_cause_is_named_with_its_size_its_onset_and_its_kind(
     assert sum(item.probability for item in told[-1].suspects) <= 1.0 + 1e-9
 
 
-def test_suspects_come_after_ten_rows_and_again_as_data_come_and_alarms_that_come_later_have_them() -> None:
-    run, _ = run_of("coolant_flow:step:-0.05", seed=2)
+@pytest.fixture(scope="module")
+def leaking() -> Watched:
+    return run_of("coolant_flow:step:-0.05", seed=2)[0]
+
+
+def test_suspects_come_after_ten_rows_and_again_as_data_come_and_alarms_that_come_later_have_them(
+    leaking: Watched,
+) -> None:
+    run = leaking
     first = min(alarm.time_ns for alarm in run.alarms if alarm.event == "raised")
     looks = sorted({alarm.time_ns for alarm in run.alarms if alarm.event == "suspected"})
     assert [round((look - first) / 6e9) for look in looks] == [9, 29, 99, 299]
@@ -72,18 +79,13 @@ def test_suspects_come_after_ten_rows_and_again_as_data_come_and_alarms_that_com
 @pytest.mark.parametrize(
     "specification",
     [
-        "coolant_temperature:step:4",
         "coolant_temperature:step:-40",
-        "activation_energy:step:-0.004",
         "activation_energy:step:0.02",
         "coolant_flow:step:0.5",
-        "coolant_flow:step:-0.6",
         "feed_flow:step:-0.5",
-        "feed_temperature:step:-30",
         "reaction_rate:step:-0.5",
         "reaction_heat:step:0.3",
         "heat_transfer:step:-0.9",
-        "concentration_gain:step:0.5",
         "temperature_bias:step:-25",
     ],
 )
@@ -97,9 +99,9 @@ def test_whatever_happens_to_the_plant_the_monitor_goes_on_and_says_what_it_know
     assert run.monitor.last_ns == round(SPAN_MIN * 10 - 1) * 6_000_000_000
 
 
-def test_a_replay_names_the_same_causes_bit_for_bit() -> None:
-    first, second = (run_of("coolant_flow:step:-0.05", seed=3)[0] for _ in range(2))
-    assert [item.SerializeToString() for item in first.alarms] == [item.SerializeToString() for item in second.alarms]
+def test_a_replay_names_the_same_causes_bit_for_bit(leaking: Watched) -> None:
+    again, _ = run_of("coolant_flow:step:-0.05", seed=2)
+    assert [item.SerializeToString() for item in again.alarms] == [item.SerializeToString() for item in leaking.alarms]
 
 
 def test_what_a_biased_thermometer_should_read_is_told_and_is_right() -> None:

@@ -15,7 +15,7 @@ from recorder.tools.player import samples_of
 
 from .samples import leaking_run
 
-CONFIG = MonitorConfig(training_min=20.0, isolation=False)
+CONFIG = MonitorConfig(training_min=20.0, isolation=False, diagnose_training=False)
 ONSET_MIN = 35.0
 
 

@@ -22,7 +22,7 @@ from reactorwatch.records.record import to_time_ns
 
 from .samples import leaking_run, sample
 
-CONFIG = MonitorConfig(training_min=60.0)
+CONFIG = MonitorConfig(training_min=60.0, isolation=False)
 SIGNALS = ("qc", "C", "T")
 ROWS = 1101
 EVENT = 800  # the row at which something happens to the time

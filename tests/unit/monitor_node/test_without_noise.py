@@ -14,5 +14,5 @@ from recorder.tools.replay import samples_of
 def test_a_leak_is_seen_without_noise_and_without_a_smallest_level(noise_sd: dict[str, float]) -> None:
     plant = PlantConfig(seed=5, noise_sd=noise_sd, faults=("coolant_flow:step:-0.05@50min",))
     messages = (encode(item) for item in samples_of(simulate_record(plant, 600), plant.name))
-    result = run(messages, MonitorConfig(smallest_sd={}, training_min=40, isolation=False))
+    result = run(messages, MonitorConfig(smallest_sd={}, training_min=40, isolation=False, diagnose_training=False))
     assert min(alarm.raised_ns for alarm, _ in result.raised_alarms) / 60e9 == pytest.approx(50.0, abs=2.0)

@@ -38,9 +38,20 @@ class Watched:
         ]
 
 
-def watched(time_min: Rows, columns: dict[str, Rows], config: MonitorConfig | None = None) -> Watched:
-    """Run a monitor over a record."""
+def watched(
+    time_min: Rows, columns: dict[str, Rows], config: MonitorConfig | None = None, *, compiled: bool = True
+) -> Watched:
+    """Run a monitor over a record.
+
+    Args:
+        time_min: times, in minutes.
+        columns: values of the signals.
+        config: settings; None: the default without isolation.
+        compiled: normal rows take one compiled step; False: every row passes the stages one by one.
+    """
     run = Watched(Monitor(config or MonitorConfig(isolation=False), 0))
+    if not compiled:
+        run.monitor.pipeline._find_normal = lambda time_ns: False  # type: ignore[method-assign]
     for message in samples(time_min, columns):
         run.said += run.monitor.on_message(message, 0)
     run.said += run.monitor.finish()

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import reactorwatch as rw
-from plant_node.examples import BOILING_FROM_K, EXAMPLES, make_example
+from plant_node.examples import EXAMPLES, make_example
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.operation import NOISE_SD
+from reactorwatch.process import OPERATIONS
+from reactorwatch.process.library.cstr.examples import BOILING_FROM_K
 
 SEED = 3
 
@@ -25,8 +26,10 @@ def faults_of(truth: dict[str, Any], end_min: float) -> list[str]:
 @pytest.mark.parametrize("name", [name for name, example in EXAMPLES.items() if example.law is None])
 def test_a_simulation_with_the_stated_causes_leaves_the_noise(name: str) -> None:
     record, truth = make_example(name, SEED)
-    simulated = rw.simulate(record, faults=faults_of(truth, float(record.time_min[-1])))
-    for signal, sd in (("C", NOISE_SD["C"]), ("T", NOISE_SD["T"])):
+    simulated = rw.simulate(record, truth["process"], faults=faults_of(truth, float(record.time_min[-1])))
+    noise_sd = OPERATIONS[truth["process"]].noise_sd
+    assert noise_sd
+    for signal, sd in ((signal, sd) for signal, sd in noise_sd.items() if sd):
         rmse = np.sqrt(np.mean((record.columns[signal] - simulated.columns[signal]) ** 2))
         assert 0.9 * sd < rmse < 1.2 * sd, f"{signal}: {rmse:g}"
 

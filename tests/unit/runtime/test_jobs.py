@@ -103,7 +103,7 @@ def test_who_stops_asking_leaves_no_process_behind() -> None:
     next(outcomes)
     own = {child for child in set(multiprocessing.active_children()) - before if "Dask" not in child.name}
     assert own
-    outcomes.close()  # type: ignore[attr-defined] # it is a generator
+    outcomes.close()
     assert not own & set(multiprocessing.active_children())
 
 

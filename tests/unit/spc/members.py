@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.charts.pca import PcaModel, PcaSpe, PcaT2
+from reactorwatch.spc.charts.residual_space import ResidualSpace
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.charts.t2 import T2
 
@@ -81,4 +83,9 @@ MEMBERS: dict[type, Member] = {
     ),
     PcaT2: Member(lambda: PcaT2(MODEL), related, 20.0),
     PcaSpe: Member(lambda: PcaSpe(MODEL), related, 20.0),
+    ResidualSpace: Member(  # of one signal, whose average it is
+        lambda: ResidualSpace(["T"], [MEAN], [[sqrt(1.9 / 0.1) / SIGMA]], weight=0.1, limit=2.8),
+        lambda rng, rows: value(rng, rows)[:, None],
+        run_length.ewma(SHIFT, 0.1, 2.8),
+    ),
 }

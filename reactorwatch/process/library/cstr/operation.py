@@ -17,7 +17,8 @@ The sizes move the operating point by several standard deviations of the thermom
 operating branch.
 """
 
-from reactorwatch.process.operation import InputLevels, Operation, Preset
+from reactorwatch.process.library.cstr.examples import EXAMPLES
+from reactorwatch.process.operation import InputLevels, Operation, Preset, WatchDefaults
 
 ONSET_MIN = 220.0
 DURATION_MIN = 400.0
@@ -44,4 +45,12 @@ OPERATION = Operation(
         _preset("heat-transfer", "half of the heat transfer is gone", "heat_transfer:step:-0.5"),
         _preset("reaction-rate", "the reaction is a tenth slower", "reaction_rate:step:-0.1"),
     ),
+    examples=EXAMPLES,
+)
+
+WATCH_DEFAULTS = WatchDefaults(
+    training_min=100.0,
+    smallest_sd={"C": 2e-4, "T": 0.05},
+    priorities={"T": "high"},
+    identified=("T",),
 )

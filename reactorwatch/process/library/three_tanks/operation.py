@@ -7,7 +7,7 @@ about them, so that a record in closed loop informs about the plant.
 """
 
 from reactorwatch.process.controller import Controller
-from reactorwatch.process.operation import InputLevels, Operation
+from reactorwatch.process.operation import Example, InputLevels, Operation
 
 SET_POINTS_CM = {"h1": 40.0, "h2": 20.0}
 BASE_FLOWS_CM3_S = {"Q1": 31.86, "Q2": 27.56}
@@ -32,4 +32,9 @@ OPERATION = Operation(
     },
     noise_sd={"h1": 0.05, "h2": 0.05, "h3": 0.05},
     fault="leak1:step:0.05",
+    examples={
+        "three_tanks": Example(
+            "the pipe between tanks 1 and 3 is clogged by 20 % from minute 150 on", ("clog13:step:0.2@150min",)
+        )
+    },
 )

@@ -40,19 +40,33 @@ def leak() -> list[Encoded]:
     return list(samples(*leaking_run(-0.1, 130.0, END_MIN, seed=1)))
 
 
+@pytest.fixture(scope="module")
+def alarmed(leak: list[Encoded]) -> bytes:
+    """State of a monitor of that run."""
+    node = MonitorNode(CONFIG, 0)
+    for message in leak:
+        node.on_message(message, 0)
+    return node.to_bytes()
+
+
 class Room:
     """A monitor on a bus within the process, and an operator beside it.
+
+    Args:
+        config: settings of the monitor.
+        state: state that the monitor resumes from; empty: it starts without one.
 
     Attributes:
         said: what the monitor published because of commands.
     """
 
-    def __init__(self, config: MonitorConfig, messages: list[Encoded]) -> None:
+    def __init__(self, config: MonitorConfig, state: bytes = b"") -> None:
         self.node = MonitorNode(config, 0)
+        if state:
+            self.node.from_bytes(state)
         self.said: list[Publication] = []
         self._operator = MemoryBus(Exchange())
         self._operator.declare_queryable(f"reactor/{PLANT}/command/*", self._answer)
-        self.hear(messages)
 
     def hear(self, messages: list[Encoded]) -> list[Publication]:
         """Samples come."""
@@ -74,8 +88,8 @@ class Room:
 
 
 @pytest.fixture
-def room(leak: list[Encoded]) -> Room:
-    return Room(CONFIG, leak)
+def room(alarmed: bytes) -> Room:
+    return Room(CONFIG, alarmed)
 
 
 def listed(room: Room) -> dict[str, Alarm]:
@@ -128,7 +142,7 @@ def test_a_comment_changes_nothing_but_the_comment(room: Room) -> None:
 def test_the_list_has_every_alarm_and_publishes_nothing(room: Room) -> None:
     reply = room.ask("list_alarms", ListAlarms())
     assert [alarm.alarm for alarm in reply.alarms][:5] == ["shewhart/C", "shewhart/T", "ewma/C", "ewma/T", "mewma/all"]
-    assert {alarm.alarm.split("/")[0] for alarm in reply.alarms[5:]} == {"silence", "stuck", "range", "spike"}
+    assert {alarm.alarm.split("/")[0] for alarm in reply.alarms[5:]} == {"silence", "stuck", "range", "spike", "shift"}
     assert room.said == []
 
 
@@ -145,11 +159,11 @@ def test_one_command_acknowledges_every_alarm_of_an_incident(room: Room) -> None
     assert all(after[name].state == before[name].state for name in after.keys() - set(raised))
 
 
-def test_an_incident_is_published_as_single_acknowledgements_of_its_alarms(room: Room, leak: list[Encoded]) -> None:
+def test_an_incident_is_published_as_single_acknowledgements_of_its_alarms(room: Room, alarmed: bytes) -> None:
     """So a recording of it is replayed from the alarms alone."""
     room.ask("acknowledge", AlarmCommand(incident=1, by="Anna"))
     names = [item.message.alarm for item in room.said if isinstance(item.message, Alarm)]
-    singly = Room(CONFIG, leak)
+    singly = Room(CONFIG, alarmed)
     published = []
     for name in names:
         singly.ask("acknowledge", by_anna(name))
@@ -209,10 +223,10 @@ def test_what_cannot_be_done_is_refused_in_one_line_and_changes_nothing(
 
 
 def test_a_flood_of_commands_is_refused_counted_and_written_nowhere(
-    tmp_path: Path, leak: list[Encoded], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, alarmed: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three thousand at once: as many writes to the disk as commands that are obeyed, and the next second is served."""
-    room = Room(replace(CONFIG, alarm_state_file=str(tmp_path / "alarms.state")), leak)
+    room = Room(replace(CONFIG, alarm_state_file=str(tmp_path / "alarms.state")), alarmed)
     stored: list[int] = []
     monkeypatch.setattr("os.fsync", stored.append)
     replies = [room.ask("comment", by_anna(comment=f"number {number}")) for number in range(3000)]
@@ -240,7 +254,7 @@ def test_another_monitor_of_the_plant_is_reported(room: Room, capsys: pytest.Cap
 
 
 def test_before_the_first_sample_nothing_can_be_acknowledged() -> None:
-    reply = Room(CONFIG, []).ask("acknowledge", by_anna())
+    reply = Room(CONFIG).ask("acknowledge", by_anna())
     assert not reply.accepted
     assert reply.text.startswith("no sample has come yet")
 
@@ -252,12 +266,13 @@ def test_the_plant_and_the_monitor_share_no_command() -> None:
 def test_what_was_said_survives_a_restart(tmp_path: Path, leak: list[Encoded]) -> None:
     """The first monitor is gone without a word: only what it had stored by then is left."""
     config = replace(CONFIG, alarm_state_file=str(tmp_path / "alarms.state"))
-    first = Room(config, leak)
+    first = Room(config)
+    first.hear(leak)
     first.ask("acknowledge", by_anna(comment="seen"))
     first.ask("shelve", ShelveAlarm(alarm="shewhart/C", by="Ben", minutes=5.0))
     del first
 
-    second = Room(config, [])
+    second = Room(config)
     c, t = (listed(second)[name] for name in ("shewhart/C", "shewhart/T"))
     assert (t.state, t.by, t.comment, t.incident) == (AlarmState.ALARM_STATE_ACKNOWLEDGED, "Anna", "seen", 1)
     assert (c.state, c.shelved_until_ns) == (AlarmState.ALARM_STATE_SHELVED, to_time_ns(END_MIN + 5))
@@ -283,11 +298,11 @@ def test_a_file_in_no_folder_is_refused_at_the_start(tmp_path: Path) -> None:
 
 
 def test_a_file_that_can_no_longer_be_written_stops_no_watch(
-    tmp_path: Path, leak: list[Encoded], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, alarmed: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "gone"
     folder.mkdir()
-    room = Room(replace(CONFIG, alarm_state_file=str(folder / "alarms.state")), leak)
+    room = Room(replace(CONFIG, alarm_state_file=str(folder / "alarms.state")), alarmed)
     (folder / "alarms.state").unlink()
     folder.rmdir()
     assert room.ask("acknowledge", by_anna()).accepted

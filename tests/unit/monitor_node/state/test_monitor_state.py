@@ -1,7 +1,6 @@
 """A monitor that was stopped and goes on from its stored state says what it would have said, value for value."""
 
 import random
-from collections.abc import Callable
 from itertools import chain
 from typing import Any, Literal
 
@@ -75,9 +74,9 @@ def stopped_at(
 
 
 @pytest.mark.parametrize("points", [True, False], ids=["with points", "without"])
-@pytest.mark.parametrize("reference", ["process", "black-box", "arx", "auto"])
+@pytest.mark.parametrize("reference", ["process", "black-box", "arx"])
 def test_who_was_stopped_at_any_samples_says_the_same(
-    reference: Literal["process", "black-box", "arx", "auto"], points: bool, leak: list[Encoded]
+    reference: Literal["process", "black-box", "arx"], points: bool, leak: list[Encoded]
 ) -> None:
     """In training and watching, in an alarm, acknowledged and shelved, in the middle of a row."""
     config = msgspec.structs.replace(CONFIG, reference=reference)
@@ -132,25 +131,21 @@ def to_version_2(fields: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("place", "reference"), [(0, "auto"), (20, "auto"), (1500, "auto"), (2400, "auto"), (2400, "arx")]
 )
-@pytest.mark.parametrize(("version", "convert"), [(2, to_version_2), (3, to_version_3)])
-def test_a_state_of_the_layout_before_is_read_without_loss(
-    version: int,
-    convert: Callable[[dict[str, Any]], None],
-    place: int,
-    reference: Literal["auto", "arx"],
-    leak: list[Encoded],
+def test_a_state_of_a_layout_before_is_read_without_loss(
+    place: int, reference: Literal["auto", "arx"], leak: list[Encoded]
 ) -> None:
     """Before the first sample, with runs that are not known yet, in training and while a sample is held."""
     config = msgspec.structs.replace(CONFIG, reference=reference)
-    monitor, again = Monitor(config, 0), Monitor(config, 0)
+    monitor = Monitor(config, 0)
     run(monitor, leak, 0, place)
     if place:
         monitor.on_message(sample("T", 10**6, 1e6, 440.0), 0)  # out of place, so that it is held
     stored = monitor.to_bytes()
-    fields = msgspec.msgpack.decode(SEAL.open(stored))
-    convert(fields)
-    again.from_bytes(SEAL._replace(version=version).close(msgspec.msgpack.encode(fields)))
-    assert again.to_bytes() == stored
+    for version, convert in ((2, to_version_2), (3, to_version_3)):
+        fields, again = msgspec.msgpack.decode(SEAL.open(stored)), Monitor(config, 0)
+        convert(fields)
+        again.from_bytes(SEAL._replace(version=version).close(msgspec.msgpack.encode(fields)))
+        assert again.to_bytes() == stored
 
 
 def test_a_monitor_that_heard_nothing_yet_is_stored_and_restored() -> None:

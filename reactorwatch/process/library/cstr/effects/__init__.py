@@ -1,4 +1,11 @@
-"""The catalogue of the reactor's effects. A new one: a file here, and a line below."""
+"""The catalogue of the reactor's effects. A new one: a file here, and a line below.
+
+The monitor compares causes within tenths of a second at a few rows after an alarm, so it traces (`Effect.is_traced`)
+those that occur on a running plant and act at once: the flows, temperatures and concentrations of the feeds, the
+reaction, the cooling, and the sensors. Lags, delays and a wrong volume, order or timing act from the first row on, so
+the filter of the training has adapted to them; and each cause that another imitates takes probability from it. Those
+are left to a diagnosis of the record.
+"""
 
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects.activation_energy import ActivationEnergy

@@ -23,6 +23,7 @@ class Bypass(Effect):
     lower = 0.0
     upper = 0.9
     typical = 0.02
+    is_traced = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.

@@ -16,3 +16,4 @@ class ConcentrationDelay(OutputDelay):
     larger = "analyser shows what was there {} min before"
     output = delays_output = "C"
     scale = 0.1
+    is_traced = False

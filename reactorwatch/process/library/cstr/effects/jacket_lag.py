@@ -25,6 +25,7 @@ class JacketLag(Effect):
     upper = 10.0
     typical = 0.1
     start_values = (0.05, 0.5)
+    is_traced = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.

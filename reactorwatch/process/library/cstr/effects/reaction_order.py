@@ -24,6 +24,7 @@ class ReactionOrder(Effect):
     lower = -0.9
     upper = 2.0
     typical = 0.05
+    is_traced = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.

@@ -39,6 +39,7 @@ class SampleTiming(Effect):
     lower = 0.0
     upper = 0.5
     typical = 0.05
+    is_traced = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`."""

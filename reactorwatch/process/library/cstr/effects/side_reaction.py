@@ -31,6 +31,7 @@ class SideReaction(Effect):
     upper = 20.0
     typical = 0.1
     start_values = (0.02, 0.5)
+    is_traced = False
     constants = (
         EffectConstant("E2", ACTIVATION_K, 4e3, "K", 0.0, 1e5, "activation energy over R, of A -> D", (9e3, 19e3)),
         EffectConstant("heat", HEAT_K_L_MOL, 100.0, "K l/mol", -1e3, 1e3, "heat over rho cp, of A -> D", (0.0, 220.0)),

@@ -12,3 +12,4 @@ class TemperatureLag(OutputLag):
     larger = "thermometer follows with a time constant of {} min"
     output = "T"
     scale = 10.0
+    is_traced = False

@@ -11,3 +11,4 @@ class ValveLag(InputLag):
     location = "coolant"
     larger = "coolant flow follows its command with a time constant of {} min"
     input = "qc"
+    is_traced = False

@@ -15,3 +15,4 @@ class ValveStiction(InputStiction):
     typical = 2.0
     start_values = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
     input = "qc"
+    is_traced = False

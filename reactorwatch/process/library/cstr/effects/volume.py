@@ -21,6 +21,7 @@ class Volume(Effect):
     lower = -0.9
     upper = 4.0
     typical = 0.03
+    is_traced = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.

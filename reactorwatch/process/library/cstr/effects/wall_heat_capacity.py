@@ -27,6 +27,7 @@ class WallHeatCapacity(Effect):
     upper = 10.0
     typical = 0.05
     constants = (EffectConstant("exchange", EXCHANGE_PER_MIN, 1.0, "1/min", 0.01, 20.0, "how fast the wall follows"),)
+    is_traced = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.

@@ -1,0 +1,283 @@
+"""The residual space of many signals: how far each one is from what all others say in the same row.
+
+With the scaled signals x of a row and their covariance S, the residual of signal i, given all others, is
+
+    w_i = (S^-1 x)_i / sqrt((S^-1)_ii)
+
+(Hawkins 1991, Multivariate quality control based on regression-adjusted variables, Technometrics 33). The inverse
+weighs the directions that vary least, which are the residual space of PCA; signals of a controlled plant fill it, and a
+fault leaves it. The chart takes the exponentially weighted average of each w_i in units of its standard deviation, and
+its statistic is the largest of them in size. Its square is the reconstruction-based contribution of Alcala & Qin
+(2009), Reconstruction-based contribution for process monitoring, Automatica 45: the signal with the largest one is the
+likeliest entry of a disturbance.
+
+Neither S nor the averages' standard deviations are known. In-sample residuals are too small where signals are many, and
+the signals of a plant remember for hundreds of rows. So the training is cut into blocks, each is judged by the
+covariance of the others, and the averages of these residuals give
+
+- the ratio v_i of their mean square to that of white noise, at least 1: autocorrelation, errors of S and of the means
+  are in it;
+- the degrees of freedom of v_i, from the autocorrelation of the averages: n / (1 + 2 sum r_k^2) with n rows (Bartlett
+  1946), the r_k averaged over the signals;
+- a prior of the true ratios, from the spread of the v_i (Smyth 2004, Linear models and empirical Bayes methods,
+  Statist. Appl. Genet. Mol. Biol. 3), which moderates each and adds degrees of freedom.
+
+The limit is that of an EWMA of known variance for the run length of one signal's alarm, at the same tail of Student's
+distribution with the degrees of freedom; and it is not below the largest of the averages of the training.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import special
+
+from reactorwatch.codegen.numba_kernel import Entry, jit
+from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Setting, positive, vector
+from reactorwatch.spc.run_length.design import ewma_limit
+from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
+from reactorwatch.stored_state import pack_numbers, unpack_numbers
+
+BLOCKS = 5
+"""Blocks of the cross-validation."""
+
+SHRINKAGE = 0.01
+"""Share by which correlations are reduced: without it, signals that follow from others have no inverse."""
+
+LONGEST_LAG = 10.0
+"""Longest lag of the averages' autocorrelation, in units of their memory (rows divided by weight)."""
+
+MOST_FREEDOM = 1e4
+"""Degrees of freedom of the prior where the variances do not differ more than by chance."""
+
+MOST_MISSING = 0.5
+"""Share of missing signals of a row beyond which it is skipped."""
+
+NAMED = 3
+"""Signals that the text of an alarm names."""
+
+
+@jit
+def move(numbers: Array, x: Array, weight: float) -> float:
+    """Take a row into the averages; returns the largest one in size, -1 if the row cannot be taken.
+
+    Args:
+        numbers: see `ResidualSpace.numbers`.
+        x: shape (p,).
+        weight: lambda.
+    """
+    for value in x:
+        if not abs(value) < LARGEST_VALUE:
+            return -1.0
+    p, largest = x.size, 0.0
+    for i in range(p):
+        residual = 0.0
+        for j in range(p):
+            residual += numbers[1 + 2 * p + i * p + j] * (x[j] - numbers[1 + j])
+        average = (1.0 - weight) * numbers[1 + p + i] + weight * residual
+        numbers[1 + p + i] = average
+        largest = max(largest, abs(average))
+    return float(largest)
+
+
+_MOVE = Entry(move)
+
+
+class ResidualSpaceState(ChartState, frozen=True):
+    """State of the chart: its names, weight and limit, and centre, matrix and averages as doubles."""
+
+    names: list[str]
+    weight: float
+    limit: float
+    centre: bytes
+    matrix: bytes
+    averages: bytes
+
+
+class ResidualSpace(ValueChart):
+    """The largest average residual of a signal, given all others.
+
+    >>> chart = ResidualSpace(["a", "b"], [0.0, 0.0], [[1.0, -0.9], [-0.9, 1.0]], weight=0.5, limit=1.0)
+    >>> [chart.update(x).out for x in ([3.0, 3.0], [3.0, 0.0])]
+    [False, True]
+
+    Args:
+        names: names of the signals.
+        centre: mean of each signal, shape (p,).
+        matrix: matrix from deviations of the signals to residuals whose averages have the standard deviation 1, shape
+            (p, p).
+        weight: lambda, of the newest row, in (0, 1].
+        limit: limit of the averages.
+
+    Raises:
+        InputError: an argument is out of its range, or the shapes differ.
+    """
+
+    name = "residual_space"
+    State = ResidualSpaceState
+    settings = (Setting("residual_space_weight", 0.1, 0.01, 1.0),)
+
+    def __init__(self, names: Sequence[str], centre: ArrayLike, matrix: ArrayLike, weight: float, limit: float) -> None:
+        if not 0.0 < weight <= 1.0:
+            raise InputError(f"weight (lambda) must be in (0, 1], got {weight}")
+        self.names, self.weight, self.limit = tuple(names), float(weight), positive("limit", limit)
+        p, middle, given = len(self.names), np.asarray(centre, np.float64), np.asarray(matrix, np.float64)
+        if middle.shape != (p,) or given.shape != (p, p) or not np.all(np.isfinite(given)):
+            raise InputError(f"centre and matrix must have {p} finite rows, got {middle.shape} and {given.shape}")
+        self.numbers: Array = np.concatenate([[self.limit], middle, np.zeros(p), given.ravel()])
+        """Limit, centre, averages and matrix, as `move` takes them."""
+        self._centre, self._averages = self.numbers[1 : 1 + p], self.numbers[1 + p : 1 + 2 * p]
+        self._matrix = self.numbers[1 + 2 * p :].reshape(p, p)
+
+    @classmethod
+    def design(cls, baseline: ValueBaseline) -> Self:
+        """See `ValueChart`; `residual_space_weight` is the weight of the newest row."""
+        weight, scale = baseline.settings["residual_space_weight"], baseline.values.std(axis=0, ddof=1)
+        scaled = baseline.values / scale
+        held_out = held_out_residuals(scaled)
+        averages = average_rows(held_out, weight)
+        white = np.mean(held_out**2, axis=0) * weight / (2.0 - weight)
+        ratios, freedom = moderate(np.mean(averages**2, axis=0) / white, degrees_of_freedom(averages, weight))
+        sds = np.sqrt(white * np.maximum(ratios, 1.0))
+        centre, matrix = adjustment(scaled)
+        tail = float(special.ndtr(-ewma_limit(baseline.arl0, weight)))
+        limit = max(-float(special.stdtrit(freedom, tail)), float(np.max(np.abs(averages) / sds)))
+        return cls(baseline.names, centre * scale, matrix / sds[:, None] / scale, weight, limit)
+
+    @classmethod
+    def from_state(cls, state: ResidualSpaceState) -> Self:
+        """Resume a chart, bit for bit, from its state.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        p = len(state.names)
+        centre, averages = (unpack_numbers(item, 1)[:, 0] for item in (state.centre, state.averages))
+        chart = cls(state.names, centre, unpack_numbers(state.matrix, max(p, 1)), state.weight, state.limit)
+        if averages.shape != (p,) or not np.all(np.isfinite(averages)):
+            raise ValueError(f"averages must be {p} finite numbers, got {averages.tolist()}")
+        chart._averages[:] = averages
+        return chart
+
+    @property
+    def state(self) -> ResidualSpaceState:
+        """A copy of the full state."""
+        parts = (pack_numbers(item) for item in (self._centre, self._matrix, self._averages))
+        return ResidualSpaceState(list(self.names), self.weight, self.limit, *parts)
+
+    def update(self, x: ArrayLike) -> Judgement:
+        """See `Chart`; x has shape (p,)."""
+        values = np.ascontiguousarray(x, dtype=np.float64)
+        if values.shape != self._averages.shape:
+            raise ValueError(f"a sample must have shape {self._averages.shape}, got {values.shape}")
+        statistic = _MOVE.call(self.numbers, values, self.weight)
+        if statistic < 0.0:
+            vector(x, self._averages.size)  # says which value it is
+        return Judgement(statistic, 0.0, 0.0, self.limit, statistic > self.limit)
+
+    def fill(self, x: Array) -> Array | None:
+        """See `ValueChart`: a missing signal gets its mean given the others, so its residual is 0."""
+        missing = ~np.isfinite(x)
+        count = int(np.count_nonzero(missing))
+        if not count:
+            return x
+        if count > MOST_MISSING * x.size:
+            return None
+        off = np.where(missing, 0.0, x - self._centre)
+        off[missing] = -np.linalg.solve(self._matrix[np.ix_(missing, missing)], self._matrix[missing] @ off)
+        return np.asarray(np.where(missing, self._centre + off, x))
+
+    def explain(self) -> tuple[str, dict[str, float]]:
+        """See `ValueChart`: shares of the squared averages."""
+        squares = self._averages**2
+        order = np.argsort(-squares, kind="stable").tolist()
+        parts = [f"{self.names[i]} ({self._averages[i]:+.1f} sd)" for i in order[:NAMED]]
+        text = (
+            f"the disturbance enters at {self.names[order[0]]}: on average {parts[0]} is unlike what the other signals "
+            f"say (allowed: {self.limit:.1f} sd)"
+        )
+        if parts[1:]:
+            text += f"; next {' and '.join(parts[1:])}"
+        return text, {self.names[i]: float(squares[i] / squares.sum()) for i in order}
+
+    def restart(self) -> None:
+        """Forget the rows seen."""
+        self._averages[:] = 0.0
+
+
+def adjustment(rows: Array) -> tuple[Array, Array]:
+    """Means of signals, and the matrix from their deviations to the residuals w.
+
+    Args:
+        rows: scaled signals, shape (rows, p).
+    """
+    centre = rows.mean(axis=0)
+    covariance = np.atleast_2d(np.cov(rows, rowvar=False))
+    covariance *= 1.0 - SHRINKAGE
+    covariance[np.diag_indices_from(covariance)] /= 1.0 - SHRINKAGE
+    inverse = np.linalg.inv(covariance)
+    return np.asarray(centre), np.asarray(inverse / np.sqrt(np.diag(inverse))[:, None])
+
+
+def held_out_residuals(rows: Array) -> Array:
+    """Residuals of each block of a training by the covariance of the other blocks, shape (rows, p).
+
+    Args:
+        rows: scaled signals, shape (rows, p).
+    """
+    residuals = np.empty_like(rows)
+    for first, end in pairwise(np.linspace(0, len(rows), BLOCKS + 1).astype(int).tolist()):
+        centre, matrix = adjustment(np.concatenate([rows[:first], rows[end:]]))
+        residuals[first:end] = (rows[first:end] - centre) @ matrix.T
+    return residuals
+
+
+def average_rows(residuals: Array, weight: float) -> Array:
+    """Exponentially weighted averages of residuals from 0 on, without the first ones, shape (rows, p).
+
+    Args:
+        residuals: held-out residuals, shape (rows, p).
+        weight: lambda.
+    """
+    averages, average = np.empty_like(residuals), np.zeros(residuals.shape[1])
+    for row, residual in enumerate(residuals):
+        average = average + weight * (residual - average)
+        averages[row] = average
+    return averages[min(int(2.0 / weight), len(averages) // 2) :]
+
+
+def degrees_of_freedom(averages: Array, weight: float) -> float:
+    """Degrees of freedom of the mean square of each average.
+
+    Args:
+        averages: averages, shape (rows, p).
+        weight: lambda.
+    """
+    rows, sums = len(averages), np.sum(averages**2, axis=0)
+    lags = range(1, min(int(LONGEST_LAG / weight), rows // 2))
+    squares = [float(np.mean(np.sum(averages[k:] * averages[:-k], axis=0) / sums)) ** 2 for k in lags]
+    return rows / (1.0 + 2.0 * sum(squares))
+
+
+def moderate(ratios: Array, freedom: float) -> tuple[Array, float]:
+    """Ratios moderated by their common prior, shape (p,), and their degrees of freedom with those of the prior.
+
+    The logarithm of a mean square with d degrees of freedom has the variance trigamma(d / 2); what it varies more over
+    the signals is that of the true ratios, whose prior is an inverse chi-square.
+
+    Args:
+        ratios: mean squares, shape (p,).
+        freedom: degrees of freedom of each.
+    """
+    from scipy import optimize  # takes a fifth of a second, which a monitor's start does not need
+
+    logs = np.log(ratios) - special.digamma(freedom / 2) + np.log(freedom / 2)
+    excess = float(np.var(logs, ddof=1)) - float(special.polygamma(1, freedom / 2))
+    prior, least = MOST_FREEDOM, float(special.polygamma(1, MOST_FREEDOM / 2))
+    if excess > least:
+        prior = 2.0 * float(optimize.brentq(lambda x: float(special.polygamma(1, x)) - excess, 1e-3, MOST_FREEDOM))
+    centre = float(np.exp(logs.mean() + special.digamma(prior / 2) - np.log(prior / 2)))
+    return np.asarray((prior * centre + freedom * ratios) / (prior + freedom)), prior + freedom

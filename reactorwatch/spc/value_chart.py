@@ -1,0 +1,81 @@
+"""Charts of the measured values themselves, of all signals of a plant together, inputs too."""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Self
+
+from numpy.typing import ArrayLike
+
+from reactorwatch.spc.charts.base import Array, Chart, Judgement
+
+FEWEST_SIGNALS = 8
+"""Least number of signals: with fewer the others say too little of each one."""
+
+ROWS_A_SIGNAL = 2
+"""Least number of training rows for each signal: with fewer their relations are hardly known."""
+
+FEWEST_ROWS = 100
+"""Least number of training rows, of which a part is held out."""
+
+
+class ValueBaseline(NamedTuple):
+    """A training as charts of values are designed from it.
+
+    Attributes:
+        names: names of the signals.
+        values: rows in which no signal is missing, shape (rows, signals); each varies.
+        arl0: run length of the alarm of a single signal without a fault, in rows.
+        settings: settings of the charts, by key.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    arl0: float
+    settings: Mapping[str, float]
+
+
+class ValueChart(Chart):
+    """A chart of the values of all signals; a sample is a vector.
+
+    It has the false alarms of one alarm for each of its signals.
+
+    Attributes:
+        names: names of its signals, in the order of a sample.
+    """
+
+    names: tuple[str, ...]
+
+    @classmethod
+    @abstractmethod
+    def design(cls, baseline: ValueBaseline) -> Self:
+        """The chart for a training; there must be no obstacle to it."""
+
+    @abstractmethod
+    def update(self, x: ArrayLike) -> Judgement:
+        """See `Chart`; x has shape (signals,)."""
+
+    @abstractmethod
+    def fill(self, x: Array) -> Array | None:
+        """The sample with expected values in place of missing ones, NaN; None if too many are missing."""
+
+    @abstractmethod
+    def explain(self) -> tuple[str, dict[str, float]]:
+        """The text of an alarm at the newest sample, and each signal's share of it, the largest first."""
+
+    @classmethod
+    def obstacle(cls, values: Array, names: Sequence[str]) -> str:
+        """The reason why there can be no chart after a training; empty if there can.
+
+        Args:
+            values: rows in which no signal is missing, shape (rows, signals); each varies.
+            names: names of the signals.
+        """
+        if len(names) < FEWEST_SIGNALS:
+            return f"it needs {FEWEST_SIGNALS} signals or more that vary, got {len(names)}"
+        needed = max(ROWS_A_SIGNAL * len(names), FEWEST_ROWS)
+        if len(values) < needed:
+            return (
+                f"the training has {len(values)} rows in which all {len(names)} signals could be learned from, "
+                f"{needed} are needed"
+            )
+        return ""

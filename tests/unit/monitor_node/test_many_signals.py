@@ -1,0 +1,118 @@
+"""Plants of many signals without equations: the residual space is their chart, and names where a disturbance enters."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from monitor_node.config import CHARTS_OF_MANY, USUAL_CHARTS, MonitorConfig
+from monitor_node.core import Monitor
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Alarm
+
+from .samples import Rows
+from .test_many_outputs import watch
+
+TRAINING, SIGNALS = 200, 10
+NAMES = tuple(f"y{i}" for i in range(SIGNALS))
+
+
+def settings(signals: int = SIGNALS, **changed: object) -> MonitorConfig:
+    config = MonitorConfig(
+        process="",
+        inputs=(),
+        outputs=NAMES[:signals],
+        training_rows=TRAINING,
+        priorities={},
+        smallest_sd={},
+    )
+    return msgspec.structs.replace(config, **changed)
+
+
+def plant(rows: int, fault_at: int | None = None, faulty: int = 0, seed: int = 1) -> Rows:
+    """Signals driven by two slow factors, with noise; a shift of one of them by its standard deviation."""
+    rng = np.random.default_rng(seed)
+    load, factor = rng.standard_normal((SIGNALS, 2)), np.zeros(2)
+    values = np.empty((SIGNALS, rows))
+    for row in range(rows):
+        factor = 0.9 * factor + rng.standard_normal(2)
+        values[:, row] = load @ factor + 0.3 * rng.standard_normal(SIGNALS)
+    if fault_at is not None:
+        values[faulty, fault_at:] += values[faulty, :TRAINING].std()
+    return values
+
+
+def raised(said: list[Publication]) -> list[Alarm]:
+    return [item.message for item in said if isinstance(item.message, Alarm) and item.message.event == "raised"]
+
+
+@pytest.mark.parametrize(
+    ("config", "charts"),
+    [
+        (settings(), CHARTS_OF_MANY),
+        (settings(7), USUAL_CHARTS),
+        (settings(7, inputs=("u",)), CHARTS_OF_MANY),
+        (settings(process="plant.toml"), USUAL_CHARTS),
+        (settings(process="plant.toml", reference="arx"), CHARTS_OF_MANY),
+        (settings(charts=("cusum",)), ("cusum",)),
+        (MonitorConfig(), USUAL_CHARTS),
+        (msgspec.structs.replace(settings(), outputs=("a", "b")), USUAL_CHARTS),
+    ],
+)
+def test_many_signals_without_equations_have_charts_of_their_own_where_none_are_named(
+    config: MonitorConfig, charts: tuple[str, ...]
+) -> None:
+    assert config.charts == charts
+
+
+@pytest.mark.parametrize("faulty", [0, 6])
+def test_the_alarm_names_the_signal_at_which_the_disturbance_enters(faulty: int) -> None:
+    """In text, contributions and suspects, which other alarms of the incident get, too."""
+    monitor = Monitor(settings(), 0, points=False)
+    said = watch(monitor, plant(TRAINING + 140, TRAINING + 100, faulty))
+    (alarm,) = raised(said)
+    assert alarm.alarm == "residual_space/all"
+    assert alarm.text.startswith(f"the disturbance enters at y{faulty}: ")
+    assert alarm.contributions[0].signal == f"y{faulty}"
+    assert sum(item.share for item in alarm.contributions) == pytest.approx(1.0)
+    suspected = [item.message for item in said if isinstance(item.message, Alarm) and item.message.event == "suspected"]
+    assert suspected[-1].suspects[0].cause == f"y{faulty}"
+    assert len(suspected[-1].suspects) == 3
+
+
+def test_a_monitor_that_resumes_says_the_same_bit_for_bit() -> None:
+    """Stored before and in the alarm."""
+    values = plant(TRAINING + 140, TRAINING + 100)
+    whole = Monitor(settings(), 0)
+    said = watch(whole, values)
+    for stop in (TRAINING + 50, TRAINING + 130):
+        first, second = Monitor(settings(), 0), Monitor(settings(), 0)
+        before = watch(first, values[:, :stop])
+        second.from_bytes(first.to_bytes())
+        assert second.expected_false_alarms == first.expected_false_alarms > 0.0
+        assert before + watch(second, values, stop) == said
+
+
+def test_missing_values_neither_blind_the_chart_nor_raise_it() -> None:
+    """A third of the rows lack a signal, at times two."""
+    values = plant(TRAINING + 240, TRAINING + 200, 3)
+    rng = np.random.default_rng(2)
+    for row in range(TRAINING, TRAINING + 240):
+        if rng.random() < 1 / 3:
+            values[rng.integers(4, SIGNALS, 2), row] = np.nan
+    alarms = raised(watch(Monitor(settings(), 0, points=False), values, 0))
+    joint = [alarm for alarm in alarms if alarm.alarm == "residual_space/all"]
+    assert [alarm.contributions[0].signal for alarm in joint] == ["y3"]
+    assert joint[0].time_ns > (TRAINING + 200) * 6 * 10**9
+
+
+def test_after_a_training_too_short_for_the_chart_each_output_has_its_own() -> None:
+    """The reason is in the notes, and a stored state knows which charts there are."""
+    values = plant(90 + 130)
+    values[4, 90 + 100 :] += 20.0
+    monitor, resumed = (Monitor(settings(training_rows=90), 0, points=False) for _ in range(2))
+    watch(monitor, values[:, :120])
+    (note,) = (item for item in monitor.notes if "residual_space/all is left out" in item)
+    assert note.endswith("90 rows in which all 10 signals could be learned from, 100 are needed")
+    resumed.from_bytes(monitor.to_bytes())
+    assert "ewma/y4" in {alarm.alarm for alarm in raised(watch(resumed, values, 120))}
+    assert resumed.expected_false_alarms > 0.0

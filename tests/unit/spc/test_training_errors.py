@@ -1,0 +1,90 @@
+"""The rate of false alarms of one plant is bounded with the stated confidence, from the errors of its training."""
+
+import numpy as np
+import pytest
+from scipy import special
+from scipy.signal import lfilter
+from scipy.stats import chi2
+
+from reactorwatch.spc.baseline import Baseline
+from reactorwatch.spc.charts.ewma import Ewma, designed_limit
+from reactorwatch.spc.charts.mewma import Mewma
+from reactorwatch.spc.charts.shewhart import Shewhart, designed_width
+from reactorwatch.spc.prewhitening import Prewhitening, learn
+from reactorwatch.spc.run_length.ewma import ewma
+from reactorwatch.spc.training_errors import CONFIDENCE, TrainingErrors, weighted_chi2_tail
+
+ARL0, WEIGHT = 20_000.0, 0.1
+SETTINGS = {"ewma_weight": WEIGHT, "mewma_weight": 0.02}
+
+
+def trained(rows: int, phi: float, generator: np.random.Generator) -> Prewhitening:
+    """A training on autoregressive noise of unit innovations."""
+    z = lfilter([1.0], [1.0, -phi], generator.normal(size=rows + 100))[100:]
+    return learn(z, 1e-9)
+
+
+def baseline_of(*learned: Prewhitening) -> Baseline:
+    e = np.zeros((learned[0].rows, len(learned)))
+    return Baseline(learned, e, (1.0,) * len(learned), ARL0, 1.0 / ARL0, SETTINGS)
+
+
+def true_rates(learned: Prewhitening, phi: float) -> tuple[float, float]:
+    """Rates of a Shewhart and an EWMA chart after a training, relative to the intended one, from the true process."""
+    response = lfilter([1.0, *(-a for a in learned.coefficients)], [1.0, -phi], np.eye(1, 400)[0]) / learned.sd
+    mean = -learned.constant / learned.sd
+    sd, width = float(np.sqrt(response @ response)), designed_width(1.0 / ARL0, learned)
+    point = special.ndtr(-(width - mean) / sd) + special.ndtr(-(width + mean) / sd)
+    averaged = lfilter([WEIGHT], [1.0, WEIGHT - 1.0], response)
+    spread = float(np.sqrt(averaged @ averaged * (2.0 - WEIGHT) / WEIGHT))
+    limit = min(designed_limit(ARL0, WEIGHT, learned) / spread, 6.0)  # beyond, the rate is nothing
+    return float(point) * ARL0, ARL0 / ewma(abs(mean) / spread, WEIGHT, limit)
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.5])
+@pytest.mark.parametrize("rows", [100, 1000, 5000])
+def test_at_most_a_tenth_of_the_plants_is_worse_than_its_bound(rows: int, phi: float) -> None:
+    """Of 60 trainings: three standard errors are 0.12. Of an average promise far more plants are worse."""
+    generator, errors = np.random.default_rng(rows), TrainingErrors.draw(1)
+    worse, worse_than_average = [], []
+    for _ in range(60):
+        learned = trained(rows, phi, generator)
+        baseline, true = baseline_of(learned), sum(true_rates(learned, phi))
+        draws = Shewhart.relative_rates(baseline, errors) + Ewma.relative_rates(baseline, errors)
+        worse.append(true > float(np.quantile(draws, CONFIDENCE)))
+        worse_than_average.append(true > 2.0)
+    assert np.mean(worse) < 0.22
+    assert np.mean(worse) < np.mean(worse_than_average)
+
+
+@pytest.mark.parametrize("chart", [Shewhart, Ewma])
+def test_on_average_over_the_errors_a_chart_has_the_intended_rate(chart: type[Shewhart] | type[Ewma]) -> None:
+    learned = Prewhitening(0.1, (0.3,), 1.0, 2000, 0.5 / 2000, 1.0 / 2000)
+    rates = chart.relative_rates(baseline_of(learned), TrainingErrors.draw(1))
+    assert np.mean(rates) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_chart_of_all_outputs_has_the_intended_rate_on_average_too() -> None:
+    learned = Prewhitening(0.1, (0.3,), 1.0, 5000, 0.5 / 5000, 1.0 / 5000)
+    rates = Mewma.relative_rates(baseline_of(learned, learned), TrainingErrors.draw(2))
+    assert np.mean(rates) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("limit", [20.0, 40.0, 80.0])
+def test_the_tail_of_a_weighted_sum_is_that_of_the_sum_it_is(limit: float) -> None:
+    """Of equal weights chi-square; of weights 2, 2, 1, 1 the convolution of two exponentials."""
+    equal = weighted_chi2_tail(np.full((1, 6), 2.0), np.zeros((1, 6)), limit)[0]
+    assert equal == pytest.approx(chi2.sf(limit / 2.0, 6), rel=0.05)
+    mixed = weighted_chi2_tail(np.array([[2.0, 2.0, 1.0, 1.0]]), np.zeros((1, 4)), limit)[0]
+    assert mixed == pytest.approx(2.0 * np.exp(-limit / 4.0) - np.exp(-limit / 2.0), rel=0.05)
+
+
+def test_a_mean_that_is_off_makes_the_tail_that_of_the_noncentral_distribution() -> None:
+    tail = weighted_chi2_tail(np.ones((1, 2)), np.array([[4.0, 0.0]]), 30.0)[0]
+    assert tail == pytest.approx(float(1.0 - special.chndtr(30.0, 2, 4.0)), rel=0.05)
+
+
+def test_the_errors_are_the_same_at_each_call() -> None:
+    assert all(
+        np.array_equal(one, other) for one, other in zip(TrainingErrors.draw(3), TrainingErrors.draw(3), strict=True)
+    )
