@@ -406,7 +406,7 @@ class PlantPipeline:
         """
         time_ns = row.time_ns
         if self._update.changes:
-            self._change_model(time_ns, publications)
+            self._change_baseline(time_ns, publications)
         interval = self._sampling.update(time_ns)
         if self.is_normal and not row.restarted and self._step_row(row, units, interval, publications):
             return
@@ -677,19 +677,23 @@ class PlantPipeline:
             if self.promise.has_drifted(self.rows_watched) and not had_drifted:
                 self.notes.append(f"promise: {self.promise.text(self.rows_watched)}")
 
-    def _change_model(self, time_ns: int, publications: list[Publication]) -> bool:
-        """Change the baseline, by a command or with the model of a diagnosis, if that is due; returns True if so."""
-        change = self._update.pop_due(time_ns)
-        if change is None:
-            return False
-        self._leave_normal()
-        if is_command(change):
+    def _change_baseline(self, time_ns: int, publications: list[Publication]) -> None:
+        """Execute the change that holds from a row on, if there is one."""
+        if not is_command(self._update.changes[0].baseline):
+            self._change_model(time_ns, publications)
+        elif (change := self._update.pop_due(time_ns)) is not None:
+            self._leave_normal()
             self._execute_change(change)
             publications.append(Publication(self._baseline_key, change))
-            return True
-        rows = self._update.rows
-        if rows is None:
+
+    def _change_model(self, time_ns: int, publications: list[Publication]) -> bool:
+        """Learn the baseline again with the model of a change, if one holds from this row on; returns True if so."""
+        if self._update.changes and is_command(self._update.changes[0].baseline):
             return False
+        rows, change = self._update.rows, self._update.pop_due(time_ns)
+        if change is None or rows is None:
+            return False
+        self._leave_normal()
         try:
             trained = self._update.relearn(change, self._predictors)
         except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
@@ -832,7 +836,6 @@ class PlantPipeline:
             for predictor in self._predictors:
                 predictor.start_judging()
         self._charts.start(trained.learned, trained.e, trained.values, self._arl0)
-        responses = trained.responses if self._shift.is_active else None
         responses = trained.responses if self._shift.is_active else None
         self._shift.start(responses, trained.z, trained.learned, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
