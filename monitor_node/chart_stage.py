@@ -28,6 +28,7 @@ from reactorwatch.spc.charts.catalogue import chart
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.shewhart import designed_width
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalState
+from reactorwatch.spc.detection import Detector
 from reactorwatch.spc.joint_chart import JointChart
 from reactorwatch.spc.m_of_n import false_alarm_rate
 from reactorwatch.spc.prewhitening import Prewhitening
@@ -435,11 +436,26 @@ class ChartWatch:
                 total += rates if kind.has_memory else self._rule_rates(baseline, rates)
         return total
 
+    def detectors(self, learned: list[Prewhitening], e: Array, arl0: float) -> list[Detector]:
+        """The charts as moving averages, as far as they are; arguments as for `start`."""
+        baseline, evaluated, found = self._baseline(learned, e, arl0), np.flatnonzero(self._evaluated).tolist(), []
+        for name in self._chosen:
+            kind = chart(name)
+            if issubclass(kind, ValueChart):
+                continue
+            for group in [[index] for index in evaluated] if issubclass(kind, SignalChart) else [evaluated]:
+                average = kind.detector(baseline.of(group))
+                if average is not None:
+                    weight, level, matrix = average
+                    rule = (1, 1) if kind.has_memory else (self._config.raise_count, self._config.window)
+                    found.append(Detector(tuple(group), matrix, weight, level, rule))
+        return found
+
     def _rule_rates(self, baseline: Baseline, rates: Array) -> Array:
         """Relative rate of an alarm that takes several points, from that of single points."""
         count, window, p = self._config.raise_count, self._config.window, baseline.point_probability
-        nodes = np.geomspace(1e-3 * p, 1.0, 40)
-        of_rule = [false_alarm_rate(count, window, float(node)) * baseline.arl0 for node in nodes]
+        nodes = np.geomspace(0.1 * p, 1.0, 40)  # rates of far rarer points are rounding errors, and nothing
+        of_rule = [max(false_alarm_rate(count, window, float(node)) * baseline.arl0, 1e-9) for node in nodes]
         return np.asarray(np.exp(np.interp(np.log(np.maximum(rates * p, nodes[0])), np.log(nodes), np.log(of_rule))))
 
     @property
@@ -484,6 +500,12 @@ class ChartWatch:
             return _OfAll(kind.from_state(kind.State.from_bytes(data)), self._evaluated)
 
         self._watch(restore_charts)
+
+    def restart(self) -> None:
+        """Forget the rows seen, in all charts."""
+        for watched in self._watched.values():
+            for index in range(len(watched.alarms)):
+                watched.charts.restart(index)
 
     def _watch(self, made: Callable[[type[Chart]], _Charts]) -> None:
         """Give the charts of each name their alarms and keys."""

@@ -42,8 +42,8 @@ DEFAULT = find_process()
 DEFAULT_TRAINING_ROWS = 1000
 """Training where nothing is stated, of a process that has no duration of its own."""
 
-LARGEST_FALSE_ALARMS = 1e6
-"""Most false alarms in 30 days that can be asked for."""
+LEAST_FALSE_ALARMS, LARGEST_FALSE_ALARMS = 1e-3, 1e6
+"""Fewest and most false alarms in 30 days that can be asked for."""
 
 
 class DefaultCharts(tuple[str, ...]):
@@ -158,7 +158,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     reference: ReferenceName | Literal["process"] = "auto"
     process: str | None = None
     charts: tuple[ChartName, ...] = USUAL_CHARTS
-    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=LARGEST_FALSE_ALARMS)] | None = None
+    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=LEAST_FALSE_ALARMS, le=LARGEST_FALSE_ALARMS)] | None = (
+        None
+    )
     smallest_sd: dict[str, float] = msgspec.field(default_factory=lambda: dict(DEFAULT.watch.smallest_sd))
     isolation: bool = True
     isolation_rows: Annotated[int, msgspec.Meta(ge=50, le=10_000)] = 600

@@ -6,7 +6,8 @@ import numpy as np
 
 import reactorwatch as rw
 from benchmarks.hidden.classes import NEARLY, find_class
-from monitor_node.isolation.causes import NAMES
+from monitor_node.isolation.causes import causes_of
+from reactorwatch.description.find import find_process
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import CannotHideError, Hidden, draw
 
@@ -53,7 +54,10 @@ def judge_suspects(number: int, nearly: bool, first_seed: int) -> SuspectsJudged
 
 def _draw(number: int, nearly: bool, first_seed: int) -> Hidden:
     """A record with a step of a cause that the monitor compares, after the training."""
-    effects = [effect for effect in named() if effect.name in NAMES and "step" in effect.courses]
+    reactor = find_process().model
+    assert reactor is not None
+    traced = {effect.name for effect in causes_of(reactor)}
+    effects = [effect for effect in named() if effect.name in traced and "step" in effect.courses]
     effect = effects[number % len(effects)]
     circumstances = replace(find_class(NEARLY if nearly else "medium").circumstances(number), span_min=SPAN_MIN)
     for turn in range(TRIES):

@@ -1,12 +1,13 @@
 """Reference that predicts rows; residuals are taken against it.
 
 `ProcessReference` is the extended Kalman filter of the process model: it is nonlinear, so inputs beyond the training
-and irregular rows are no problem. `ArxReference` is the identified linear model, frozen when the training ends: it
+and irregular rows are no problem. `ArxReference` is the recursive ARX model, which learns while nothing is wrong: it
 serves any plant, but only within the inputs of its training; other rows are not evaluated. A black box of few signals:
 `black_box_reference`.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import isfinite, nan, sqrt
 from typing import Any, NamedTuple, Protocol
 
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 from monitor_node.ingest.sampling import missing_in_intervals
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
-from reactorwatch.kalman.noise_estimation import estimate_noise
+from reactorwatch.kalman.noise_estimation import NoiseFit, fit_noise
+from reactorwatch.kalman.uncertain_model import is_disturbance, learned_parameters, noise_starts, widen_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import StoredState
@@ -63,6 +65,8 @@ class ProcessReferenceState(StoredState, frozen=True, tag="process"):
         typical_sd: see `ProcessReference`.
         held_rows: number of rows since then, which the filter did not use.
         reach: see `input_reach`, one an input.
+        learned: see `ProcessReference`.
+        plant_noise: see `ProcessReference`; None: `noise`.
     """
 
     noise: NoiseLevels
@@ -72,6 +76,8 @@ class ProcessReferenceState(StoredState, frozen=True, tag="process"):
     typical_sd: list[float]
     held_rows: int
     reach: list[float]
+    learned: tuple[float, ...] = ()
+    plant_noise: NoiseLevels | None = None
 
 
 class ArxReferenceState(StoredState, frozen=True, tag="arx"):
@@ -124,16 +130,35 @@ class ProcessReference:
     Args:
         model: process model.
         outputs: names of the monitored outputs, in order.
-        noise: noise of the plant and its sensors.
+        noise: noise of the plant and its sensors, of all states of the filter.
+        learned: values of the parameters of what the filter estimates beside the states of the model
+            (`kalman.uncertain_model.learned_parameters`).
+        plant_noise: noise with which the equations alone, without disturbances, are likeliest; None: that given.
 
     Raises:
         InputError: the model lacks an output.
+
+    Attributes:
+        equations: the process model.
+        model: model of the filter: the process model with the added states.
+        noise: noise of the plant and its sensors, of all states of the filter.
+        plant_noise: noise of a filter of the equations alone.
     """
 
     kind = "equations"
 
-    def __init__(self, model: ProcessModel, outputs: tuple[str, ...], noise: NoiseLevels) -> None:
-        self.model, self.noise = model, noise
+    def __init__(
+        self,
+        model: ProcessModel,
+        outputs: tuple[str, ...],
+        noise: NoiseLevels,
+        learned: tuple[float, ...] = (),
+        plant_noise: NoiseLevels | None = None,
+    ) -> None:
+        self.equations, self.noise, self._learned = model, noise, learned
+        of_states = NoiseLevels(noise.measurement_sd, noise.process_sd[: len(model.states)])
+        self.plant_noise = of_states if plant_noise is None else plant_noise
+        self.model = model = widen_model(model, model.uncertain, learned)
         self._filter = Filter(model, noise)
         self._indices = output_indices(model, outputs)
         self._count = len(model.outputs)
@@ -145,6 +170,24 @@ class ProcessReference:
         """Median standard deviation of each residual in the last `run`, in the outputs' units."""
 
     @classmethod
+    def fit(
+        cls,
+        model: ProcessModel,
+        outputs: tuple[str, ...],
+        time_min: Array,
+        inputs: Array,
+        measured: Array,
+        smallest_sd: list[float],
+    ) -> "ProcessReference":
+        """Make a reference with the noise that is fitted to a training; arguments as for `fit_training_noise`."""
+        found = fit_training_noise(model, outputs, time_min, inputs, measured, smallest_sd)
+        learned = tuple(found.parameters[name] for name in learned_parameters(model.uncertain))
+        if not any(map(is_disturbance, model.uncertain)):
+            return cls(model, outputs, found.levels, learned)
+        alone = fit_training_noise(replace(model, uncertain=()), outputs, time_min, inputs, measured, smallest_sd)
+        return cls(model, outputs, found.levels, learned, alone.levels)
+
+    @classmethod
     def from_state(
         cls, state: ProcessReferenceState, model: ProcessModel, outputs: tuple[str, ...]
     ) -> "ProcessReference":
@@ -153,7 +196,7 @@ class ProcessReference:
         Raises:
             ValueError: the state is of another model.
         """
-        reference = cls(model, outputs, state.noise)
+        reference = cls(model, outputs, state.noise, state.learned, state.plant_noise)
         if len(state.filter.inputs) not in (0, len(model.inputs)):
             raise ValueError(f"the filter's state must have {len(model.inputs)} inputs, got {state.filter.inputs}")
         reference._filter.state = state.filter
@@ -165,9 +208,10 @@ class ProcessReference:
     @property
     def noise_levels(self) -> dict[str, dict[str, float]]:
         """Standard deviations by name: of each sensor in its unit, of each state in its unit per square root minute."""
+        states, constant = enumerate(self.model.state_names), self.model.constant_states
         return {
             "sensors": dict(zip(self.model.output_names, self.noise.measurement_sd, strict=True)),
-            "states": dict(zip((item.name for item in self.model.states), self.noise.process_sd, strict=True)),
+            "states": {name: self.noise.process_sd[i] for i, name in states if i not in constant},
         }
 
     @property
@@ -181,6 +225,8 @@ class ProcessReference:
             list(self.typical_sd),
             self._held_rows,
             list(self._reach),
+            self._learned,
+            self.plant_noise if any(map(is_disturbance, self.equations.uncertain)) else None,
         )
 
     def update(
@@ -196,7 +242,7 @@ class ProcessReference:
         unknown = any(self._guessed) + self._held_rows + missing
         if all(map(isfinite, inputs)):
             if unknown > MOST_UNKNOWN:
-                self._filter.restart()
+                self._filter.interrupt()
             elif unknown:
                 between = self._unknown_inputs(time_min, tuple(inputs))
             self.last_inputs, self._guessed, self._held_rows = tuple(inputs), self._all_known, 0
@@ -269,8 +315,8 @@ class ProcessReference:
         )
 
     def restart(self) -> None:
-        """See `Reference`."""
-        self._filter.restart()
+        """See `Reference`; what is known about the constants is kept."""
+        self._filter.interrupt()
         self._guessed, self._held_rows = self._all_known, 0
 
     def run(self, time_min: Array, inputs: Array, measured: Array) -> tuple[Array, Array]:
@@ -405,15 +451,15 @@ def _mask_before_missing(time_min: Array, inputs: Array) -> Array:
     return np.where((np.append(missing_in_intervals(time_min), 0) > 0)[:, None], nan, inputs)
 
 
-def estimate_training_noise(
+def fit_training_noise(
     model: ProcessModel,
     outputs: tuple[str, ...],
     time_min: Array,
     inputs: Array,
     measured: Array,
     smallest_sd: list[float],
-) -> NoiseLevels:
-    """Estimate the noise of a plant and its sensors from its training.
+) -> NoiseFit:
+    """Fit the noise of a plant and its sensors to its training.
 
     Args:
         model: process model.
@@ -427,4 +473,13 @@ def estimate_training_noise(
     smallest = [1e-6] * len(model.outputs)
     for i, column, sd in zip(output_indices(model, outputs), measured.T, smallest_sd, strict=True):
         columns[:, i], smallest[i] = column, sd
-    return estimate_noise(model, time_min, _mask_before_missing(time_min, inputs), columns, smallest)
+    inputs = _mask_before_missing(time_min, inputs)
+    return fit_noise(
+        widen_model(model, model.uncertain),
+        time_min,
+        inputs,
+        columns,
+        smallest,
+        learned_parameters(model.uncertain),
+        noise_starts(model, columns, smallest),
+    )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
 from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_structure, fewest_rows
-from monitor_node.baseline.references import ArxReference, ProcessReference, Reference, estimate_training_noise
+from monitor_node.baseline.references import ArxReference, ProcessReference, Reference
 from monitor_node.baseline.resolution import resolution_sd
 from monitor_node.baseline.signal_range import possible_ranges
 from monitor_node.config import MonitorConfig
@@ -86,6 +86,7 @@ class TrainingResult(NamedTuple):
         left_out: signals that cannot be monitored, with the reason.
         responses: response of each residual to a lasting step of one unit of its output, shape (outputs, rows); NaN
             where there is no model; None for equations.
+        outliers: number of single values of each output that were left out.
     """
 
     reference: Reference
@@ -98,6 +99,7 @@ class TrainingResult(NamedTuple):
     refused: str
     left_out: dict[str, str]
     responses: Array | None
+    outliers: list[int]
 
 
 MOST_OUT_OF_RANGE = 1.0 / 3.0
@@ -251,8 +253,10 @@ class Training:
         inputs = np.where([name not in left_out for name in self._config.inputs], inputs, np.nan)
         values = np.hstack([inputs, np.where(disturbed, np.nan, measured)])
         measured = np.where(usable, measured, np.nan)
-        responses = self._step_responses(reference)
-        return TrainingResult(reference, learned, z, e, measured, values, checks, refused, left_out, responses)
+        responses, outliers = self._step_responses(reference), [item.outliers for item in screenings]
+        return TrainingResult(
+            reference, learned, z, e, measured, values, checks, refused, left_out, responses, outliers
+        )
 
     def _step_responses(self, reference: Reference) -> Array | None:
         if isinstance(reference, BlackBoxReference):
@@ -367,8 +371,7 @@ class Training:
     ) -> ProcessReference:
         outputs = self._config.outputs
         assert self._model is not None
-        noise = estimate_training_noise(self._model, outputs, time_min, inputs, measured, smallest)
-        return ProcessReference(self._model, outputs, noise)
+        return ProcessReference.fit(self._model, outputs, time_min, inputs, measured, smallest)
 
 
 def _refit_without_outliers(residuals: Callable[[Array], Residuals], measured: Array) -> tuple[Array, list[Screening]]:

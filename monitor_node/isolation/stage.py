@@ -108,9 +108,9 @@ class Suspicion:
 
     def __init__(self, config: MonitorConfig, board: Annunciator, reference: ProcessReference) -> None:
         self._config, self._board, self._reference = config, board, reference
-        self._indices = output_indices(reference.model, config.outputs)
-        self._all_watched = self._indices == list(range(len(reference.model.outputs)))
-        self._effects = {effect.name: effect for effect in causes_of(reference.model)}
+        self._indices = output_indices(reference.equations, config.outputs)
+        self._all_watched = self._indices == list(range(len(reference.equations.outputs)))
+        self._effects = {effect.name: effect for effect in causes_of(reference.equations)}
         self._isolation: Isolation | None = None
         # Flat, as most of the memory of a plant: time in minutes, inputs, outputs of the model.
         self._rows: deque[tuple[float, ...]] = deque(maxlen=config.isolation_rows)
@@ -139,7 +139,7 @@ class Suspicion:
         Raises:
             ValueError: the state is damaged.
         """
-        model = self._reference.model
+        model = self._reference.equations
         self._incident = state.incident
         self._set_since(state.since)
         self._rows.extend(map(tuple, unpack_numbers(state.rows, 1 + len(model.inputs) + len(model.outputs)).tolist()))
@@ -210,7 +210,7 @@ class Suspicion:
         return self._split_rows()[-max(usual, min(usual, ROWS_BEFORE) + since) :]
 
     def _split_rows(self) -> list[Row]:
-        inputs = 1 + len(self._reference.model.inputs)
+        inputs = 1 + len(self._reference.equations.inputs)
         return [(row[0], row[1:inputs], row[inputs:]) for row in self._rows]
 
     def _look(self, time_ns: int, since: int) -> list[Publication]:
@@ -221,7 +221,7 @@ class Suspicion:
         self._follow(suspects[0])
         return publications
 
-    def add(self, time_min: float, inputs: Sequence[float], values: list[float]) -> list[float]:
+    def add(self, time_min: float, inputs: Sequence[float], values: Sequence[float]) -> Sequence[float]:
         """Add a row; returns its outputs of the model."""
         measured = self._model_outputs(values)
         if self._rows and time_min <= self._rows[-1][0]:  # the plant's clock was set back
@@ -234,14 +234,14 @@ class Suspicion:
         """Make the isolation at the first alarm: few of thousands of plants ever have one."""
         if self._isolation is None:
             reference = self._reference
-            self._isolation = Isolation(reference.model, reference.noise, self._config.isolation_rows)
+            self._isolation = Isolation(reference.equations, reference.plant_noise, self._config.isolation_rows)
         return self._isolation
 
-    def _model_outputs(self, values: list[float]) -> list[float]:
+    def _model_outputs(self, values: Sequence[float]) -> Sequence[float]:
         """Outputs of the model; NaN for those that are not monitored."""
         if self._all_watched:
             return values
-        measured = [float("nan")] * len(self._reference.model.outputs)
+        measured = [float("nan")] * len(self._reference.equations.outputs)
         for index, value in zip(self._indices, values, strict=True):
             measured[index] = value
         return measured
@@ -258,13 +258,13 @@ class Suspicion:
     def _reconstruct(self, output: str, cause: str, onset_min: float, rows: Iterable[Row]) -> None:
         """Start to reconstruct the sensor of an output after these rows, unless that is done already."""
         if self._reconstruction is None or (output, cause) != (self._output, self._cause):
-            model, noise = self._reference.model, self._reference.noise
+            model, noise = self._reference.equations, self._reference.plant_noise
             index = model.output_names.index(output)
             self._reconstruction = Reconstruction(model, noise, index, rows, onset_min)
         self._output, self._cause = output, cause
 
     def _publish_reconstruction(
-        self, time_ns: int, inputs: Sequence[float], measured: list[float], values: list[float], units: list[str]
+        self, time_ns: int, inputs: Sequence[float], measured: Sequence[float], values: list[float], units: list[str]
     ) -> list[Publication]:
         if self._reconstruction is None:
             return []

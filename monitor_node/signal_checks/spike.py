@@ -25,8 +25,9 @@ their threshold by an exponential excess (Pickands 1975, Statistical inference u
 of Statistics 3(1), with shape 0), whose mean is estimated with its largest quarter known only as larger (Epstein &
 Sobel 1953, Life testing, Journal of the American Statistical Association 48), and given one standard error on top. So
 up to one value in a hundred may be a spike in the training, whatever its size, and hardly moves the limit; if more
-are, that is how this signal is, and the limit rises until they are none. For tails heavier than exponential there are
-more false spikes than promised; but isolated far values are then what the signal has.
+are, that is how this signal is, and the limit rises until they are none. Of outliers that a training has, only a change
+of their rate is an alarm (`spike_rate`). For tails heavier than exponential there are more false spikes than promised;
+but isolated far values are then what the signal has.
 """
 
 from collections import deque
@@ -36,6 +37,7 @@ from statistics import median
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
 
@@ -48,6 +50,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, format_quantity, positive
 from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.spike_rate import SpikeRate, UsualSpikes, of_trainings
 from reactorwatch.spc.training_errors import TrainingErrors, two_sided_tail
 from reactorwatch.stored_state import StoredState
 
@@ -100,12 +103,14 @@ class SpikeState(StoredState, frozen=True):
             change.
         held: quarantined value; 0 if there is none.
         recent: newest values since an alarm is active, oldest first; empty without one.
+        usual: spikes at a steady rate; None: there were none in the training.
     """
 
     limit: float
     phase: Phase
     held: float
     recent: list[float]
+    usual: UsualSpikes | None = None
 
 
 class Spike:
@@ -264,6 +269,7 @@ class SpikeCheck(SignalCheck):
             for name in self.outputs
         ]
         self._spikes: list[Spike | None] = []
+        self._rates: list[SpikeRate | None] = [None] * len(self.outputs)
         self.limits = np.full(len(self.outputs), np.inf)
         """Limit of each output, within which a residual is no spike; infinite without a check."""
         self._none = (False,) * len(self.outputs)
@@ -273,12 +279,28 @@ class SpikeCheck(SignalCheck):
     @property
     def state(self) -> list[SpikeState | None]:
         """State of each output; None for an output without the check; empty before the training ends."""
-        return [None if spike is None else spike.state for spike in self._spikes]
+        return [
+            None if spike is None else replace(spike.state, usual=None if rate is None else rate.state)
+            for spike, rate in zip(self._spikes, self._rates, strict=False)
+        ]
 
     def restore(self, state: list[SpikeState | None]) -> None:
         """See `SignalCheck`."""
         self._spikes = [None if item is None else Spike.from_state(item) for item in state]
+        usual = [None if item is None else item.usual for item in state] or [None] * len(self.outputs)
+        self._rates = [None if item is None else SpikeRate(item) for item in usual]
         self._set_limits()
+
+    def learn_rates(self, counts: Sequence[int], rows: int, period_ns: float, arl0: float) -> None:
+        """Learn how often spikes are usual; after `start`.
+
+        Args:
+            counts: number of outliers of each output in the training.
+            rows: number of rows of the training.
+            period_ns: sampling period.
+            arl0: run length of each alarm without a fault, in rows.
+        """
+        self._rates = of_trainings(counts, rows, period_ns, arl0)
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """See `SignalCheck`."""
@@ -324,12 +346,18 @@ class SpikeCheck(SignalCheck):
             alarm, verdict = self._alarms[index], spike.update(e[index], is_moved=is_moved)
             if verdict.quarantine:
                 flags = (*flags[:index], True, *flags[index + 1 :])
-            if verdict.spike or alarm.memory.rule.standing or alarm.memory.rule.recent:
+            rate, count = self._rates[index], 1
+            if verdict.spike and rate is not None:
+                count = rate.add(time_ns)
+            is_alarm = verdict.spike and count > 0
+            if is_alarm or alarm.memory.rule.standing or alarm.memory.rule.recent:
                 name = self.outputs[index]
-                size = verdict.size if verdict.spike else 0.0
-                judgement = Judgement(size, 0.0, -spike.limit, spike.limit, verdict.spike)
+                size = verdict.size if is_alarm else 0.0
+                judgement = Judgement(size, 0.0, -spike.limit, spike.limit, is_alarm)
                 spiked = format_quantity(size * scales[index], units[index], "+.3g")
                 text = f"{name} had a spike of {spiked} one row before; it was left out"
+                if rate is not None:
+                    text += f"; {count} spikes in {rate.window_min:.3g} min, where {rate.usual:.2g} are usual"
                 publications += self.judge(alarm, time_ns, judgement, "sd", text, name, cause=self.name)
         self._note_quiet()
         return flags

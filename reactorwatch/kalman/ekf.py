@@ -176,6 +176,10 @@ class Filter:
         """Forget everything and start with the next row."""
         self._time_min, self._learned = None, False
 
+    def interrupt(self) -> None:
+        """Start again with the next row; estimates of constant states are kept."""
+        self._time_min = None
+
     @property
     def state(self) -> FilterState:
         """The filter's full state."""

@@ -77,6 +77,22 @@ _MEDIAN_THIRD_DIFFERENCE = 0.6745 * sqrt(20.0)  # their median size, for white n
 _CUT_MEAN_SQUARE = erf(CLIP / sqrt(2)) - CLIP * sqrt(2 / pi) * exp(-(CLIP**2) / 2)  # of w where |w| < CLIP, else 0
 
 
+class NoiseFit(NamedTuple):
+    """Result of a search for noise levels.
+
+    Attributes:
+        levels: noise levels.
+        parameters: values of the parameters that were estimated with them, by name.
+        loss: minus the log likelihood.
+        w: normalised innovations, shape (rows, n_y); 0 where there are none and where the filter converges.
+    """
+
+    levels: NoiseLevels
+    parameters: dict[str, float]
+    loss: float
+    w: Array
+
+
 class _Trial(NamedTuple):
     """Noise levels, and the innovations that they give.
 
@@ -139,7 +155,26 @@ def estimate_noise_and_parameters(
     """
     smallest = np.asarray(smallest_sd, dtype=float)
     search = _NoiseSearch(model, time_min, inputs, measured, smallest, learned, first_sd, uncertainty)
-    return search.run(nearby, lacking)
+    found = search.run(nearby, lacking)
+    return found.levels, found.parameters
+
+
+def fit_noise(
+    model: ProcessModel,
+    time_min: Array,
+    inputs: Array,
+    measured: Array,
+    smallest_sd: Sequence[float],
+    learned: Sequence[str] = (),
+    nearby: Sequence[NoiseLevels] = (),
+) -> NoiseFit:
+    """Maximum-likelihood noise levels and positive parameters, with their likelihood.
+
+    Arguments as for `estimate_noise_and_parameters`.
+    """
+    smallest = np.asarray(smallest_sd, dtype=float)
+    search = _NoiseSearch(model, time_min, inputs, measured, smallest, learned, {}, None)
+    return search.run(nearby, lacking=False)
 
 
 class _NoiseSearch:
@@ -176,7 +211,7 @@ class _NoiseSearch:
         one = Filter(model, first)
         self._filters = [one, *(one.clone() for _ in range(LANES - 1))]
 
-    def run(self, nearby: Sequence[NoiseLevels], lacking: bool) -> tuple[NoiseLevels, dict[str, float]]:
+    def run(self, nearby: Sequence[NoiseLevels], lacking: bool) -> NoiseFit:
         """Best noise levels and parameter values."""
         best = self._climb(self._drop_outliers(self._start()))
         if self._rows > FIRST_ROWS:
@@ -194,7 +229,7 @@ class _NoiseSearch:
                 best = without
         if best is not climbed:  # the sensors' noise now has to account for more
             best, _ = self._step(best, range(self._n_y))
-        return self._levels(best.theta), self._changes(best.theta)
+        return NoiseFit(self._levels(best.theta), self._changes(best.theta), best.loss, best.w)
 
     def _with_noise(self, levels: NoiseLevels) -> Array:
         """Theta of these levels, with noise in every state: no step leads out of none."""

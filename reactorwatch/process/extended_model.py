@@ -10,7 +10,8 @@
 
 An effect is stored as the text that injects it into the plant as a fault (`fault`), to full precision, so a model that
 is read equals the one that was written. `parameters` are those of the model that differ from its nominal values, in its
-units. Laws of what was unknown (`law`) are items of a list `laws`, which is left out where it is empty. Times are
+units. Laws of what was unknown (`law`) are items of a list `laws`, and what a filter of the model estimates beside its
+states (`kalman.uncertain_model`) of a list `uncertain`; both are left out where they are empty. Times are
 minutes of the record in which the deviations were found, counted from `zero_ns`, nanoseconds since 1970-01-01 UTC; 0
 where that is unknown, as for a .csv.
 
@@ -69,6 +70,7 @@ class _ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     laws: tuple[_LawFile, ...] = ()
     equations: dict[str, Any] | None = None
     process: dict[str, Any] | None = None
+    uncertain: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ class ExtendedModel:
         equations: the model with all of these in it, where the catalogue lacks the model; None: the catalogue has it.
         description: description of the process, as in its file (`reactorwatch.description.toml_file`); None: it has
             the signals of the equations.
+        uncertain: see `ProcessModel`.
     """
 
     name: str
@@ -93,6 +96,7 @@ class ExtendedModel:
     laws: tuple[ExtendedLaw, ...] = ()
     equations: ProcessModel | None = None
     description: Mapping[str, Any] | None = None
+    uncertain: tuple[str, ...] = ()
 
     def build(self, models: Sequence[Callable[[], ProcessModel]] = MODELS) -> ProcessModel:
         """Build the model; its clock is that of the record.
@@ -103,8 +107,10 @@ class ExtendedModel:
         Raises:
             InputError: there is no such model, or it cannot have these parameters or effects.
         """
-        if self.equations is not None:
-            return self.equations
+        model = self._build_from(models) if self.equations is None else self.equations
+        return replace(model, uncertain=self.uncertain) if self.uncertain else model
+
+    def _build_from(self, models: Sequence[Callable[[], ProcessModel]]) -> ProcessModel:
         nominal = {item.name: item for item in (make() for make in models)}
         if self.name not in nominal:
             raise InputError(f"unknown model {self.name!r} (valid: {', '.join(nominal)})")
@@ -133,6 +139,7 @@ class ExtendedModel:
             **({"laws": [_law_object(item) for item in self.laws]} if self.laws else {}),
             **({} if self.equations is None else {"equations": store_equations(self.equations)}),
             **({} if self.description is None else {"process": dict(self.description)}),
+            **({"uncertain": list(self.uncertain)} if self.uncertain else {}),
         }
 
 
@@ -195,7 +202,9 @@ def parse_extended_model(
         raise InputError(f"format must be {FORMAT!r}, got {file.format!r}")
     if file.equations is not None:
         equations = build_equations(file.model, file.equations)
-        return ExtendedModel(file.model, zero_ns=file.zero_ns, equations=equations, description=file.process)
+        return ExtendedModel(
+            file.model, zero_ns=file.zero_ns, equations=equations, description=file.process, uncertain=file.uncertain
+        )
     if effects is None:
         effects = named_effects(ExtendedModel(file.model).build(models))
     extended = ExtendedModel(
@@ -205,6 +214,7 @@ def parse_extended_model(
         file.zero_ns,
         tuple(item.law() for item in file.laws),
         description=file.process,
+        uncertain=file.uncertain,
     )
     extended.build(models)  # reports invalid combinations now
     return extended
@@ -238,7 +248,7 @@ def extended_model_of(
         for item in (nominal.parameters if nominal else ())
         if values[item.name] != item.value
     }
-    return ExtendedModel(model.name, tuple(found), differing, zero_ns, model.laws)
+    return ExtendedModel(model.name, tuple(found), differing, zero_ns, model.laws, uncertain=model.uncertain)
 
 
 def are_named(extended: ExtendedModel) -> bool:

@@ -144,6 +144,8 @@ class ProcessModel:
         places: where something unknown may act; empty: they follow from the equations (`process.places`).
         laws: laws of what was unknown, which are part of the equations already.
         effects: effects of its own; None: those of the catalogue under its name.
+        uncertain: what a filter of this model estimates beside the states, see `kalman.uncertain_model`; no part of
+            the equations.
     """
 
     name: str
@@ -161,6 +163,7 @@ class ProcessModel:
     places: tuple[Place, ...] = ()
     laws: tuple["ExtendedLaw", ...] = ()
     effects: tuple["Effect", ...] | None = None
+    uncertain: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.rhs) != len(self.states):

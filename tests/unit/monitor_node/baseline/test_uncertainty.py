@@ -1,0 +1,97 @@
+"""A training shows what a filter has to estimate beside the states of the equations."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
+from monitor_node.baseline.uncertainty import describe_uncertain, find_uncertain
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from monitor_node.diagnosis_worker import find_deviations
+from monitor_node.replay import backtest
+from reactorwatch.kalman.uncertain_model import is_disturbance
+from reactorwatch.process.library.cstr.model import cstr
+
+from ..samples import samples
+from ..warm_plant import changes, publish
+
+WIDE, RARE, LITTLE = INPUTS.values()
+KIND = {item.name: item for item in KINDS}
+EXACT = Kind("as the model")
+TRAINING_MIN = 100.0
+
+
+@cache
+def uncertain(kind: Kind, moves: int, seed: int = 11) -> tuple[str, ...]:
+    record = simulate(kind, (WIDE, RARE, LITTLE)[moves], seed)
+    rows = record.time_min < TRAINING_MIN
+    measured = np.column_stack([record.columns[name][rows] for name in ("C", "T")])
+    return find_uncertain(cstr(), ("C", "T"), record.time_min[rows], record.columns["qc"][rows, None], measured)
+
+
+def disturbances(kind: Kind, moves: int) -> set[str]:
+    return {item for item in uncertain(kind, moves) if is_disturbance(item)}
+
+
+def test_a_plant_as_the_model_whose_input_moved_over_its_range_needs_nothing() -> None:
+    assert uncertain(EXACT, 0) == ()
+
+
+@pytest.mark.parametrize("moves", [1, 2])
+def test_a_training_with_few_or_small_moves_leaves_constants_open(moves: int) -> None:
+    found = uncertain(EXACT, moves)
+    assert "constant valve_lag" in found
+    assert not any(map(is_disturbance, found))
+
+
+def test_a_feed_that_wanders_is_a_disturbance_that_wanders() -> None:
+    assert disturbances(KIND["feed that wanders"], 0) == {"wander T"}
+
+
+@pytest.mark.parametrize("memory", [(0.9, 0.15), (0.7, 0.2)])
+def test_noise_with_memory_is_coloured_noise(memory: tuple[float, float]) -> None:
+    assert disturbances(Kind("noise with memory", noise_memory=memory), 0) == {"noise T"}
+
+
+def test_a_training_of_few_rows_is_left_as_it_is() -> None:
+    nothing = np.zeros((20, 1))
+    assert find_uncertain(cstr(), ("C", "T"), np.arange(20.0), nothing, np.zeros((20, 2))) == ()
+
+
+def test_what_is_uncertain_is_said_in_words() -> None:
+    assert describe_uncertain(("constant volume", "wander T", "noise C")) == (
+        "a disturbance of the balance of T wanders, the noise of C has memory, limits allow for what the training "
+        "leaves open of the constants"
+    )
+
+
+def test_a_valve_lag_that_the_training_could_not_show_raises_no_alarm() -> None:
+    record = simulate(KIND["valve lag of 0.12 min"], RARE, 111)
+    rows = record.time_min < 240.0
+    messages = list(samples(record.time_min[rows], {name: item[rows] for name, item in record.columns.items()}))
+    config = MonitorConfig(isolation=False)
+    found = backtest.run(messages, config)
+    assert found.baseline is not None
+    assert '"uncertain":["constant' in found.baseline.model
+    assert found.raised_alarms == []
+    given = backtest.run(messages, MonitorConfig(isolation=False, diagnose_training=False))
+    assert len(given.raised_alarms) >= 2
+
+
+def test_a_monitor_with_uncertain_constants_resumes_bit_for_bit() -> None:
+    record = simulate(KIND["feed that wanders"], LITTLE, 12)
+    rows = record.time_min < 130.0
+    messages = list(samples(record.time_min[rows], {name: item[rows] for name, item in record.columns.items()}))
+    config, half = MonitorConfig(isolation=False), 3 * 1150
+    monitor = Monitor(config, 0)
+    publish(monitor, messages[: 3 * 1002])
+    assert monitor.diagnosis_job is not None
+    monitor.on_finding(find_deviations(monitor.diagnosis_job))
+    first = publish(monitor, messages[3 * 1002 : half])
+    (change,) = changes(first)
+    assert "wander T" in change.model
+    resumed = Monitor(config, 0)
+    resumed.from_bytes(monitor.to_bytes())
+    assert publish(resumed, messages[half:]) == publish(monitor, messages[half:])
