@@ -312,7 +312,7 @@ class PlantPipeline:
         self, state: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
     ) -> Reference:
         if isinstance(state, ArxReferenceState):
-            for predictor in self._predictors:
+            for predictor in () if has_values_only(self._config) else self._predictors:
                 if not predictor.judges:  # in a state of an earlier version, where the reference judged
                     predictor.start_judging()
             return ArxReference(state)
@@ -832,7 +832,7 @@ class PlantPipeline:
         self._whiteners = [
             Prewhitener(item, self._numbers["whiteners"][0, i : i + 1]) for i, item in enumerate(trained.learned)
         ]
-        if isinstance(trained.reference, ArxReference):
+        if isinstance(trained.reference, ArxReference) and self._bank is None:
             for predictor in self._predictors:
                 predictor.start_judging()
         self._charts.start(trained.learned, trained.e, trained.values, self._arl0)
@@ -1079,7 +1079,7 @@ class PlantPipeline:
         """Let a reference that learns do so while no alarm without a known cause is active."""
         if isinstance(self._reference, BlackBoxReference):
             self._reference.set_learning(not self._board.has_unexplained)
-        elif isinstance(self._reference, ArxReference):
+        elif isinstance(self._reference, ArxReference) and self._bank is None:
             for predictor in self._predictors:
                 predictor.set_learning(not self._board.has_unexplained)
 
