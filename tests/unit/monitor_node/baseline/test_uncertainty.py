@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
-from monitor_node.baseline.uncertainty import describe_uncertain, find_uncertain
+from monitor_node.baseline.uncertainty import Uncertain, describe_uncertain, find_uncertain
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
@@ -28,7 +28,7 @@ def uncertain(kind: Kind, moves: int, seed: int = 11) -> tuple[str, ...]:
     record = simulate(kind, (WIDE, RARE, LITTLE)[moves], seed)
     rows = record.time_min < TRAINING_MIN
     measured = np.column_stack([record.columns[name][rows] for name in ("C", "T")])
-    return find_uncertain(cstr(), ("C", "T"), record.time_min[rows], record.columns["qc"][rows, None], measured)
+    return find_uncertain(cstr(), ("C", "T"), record.time_min[rows], record.columns["qc"][rows, None], measured).names
 
 
 def disturbances(kind: Kind, moves: int) -> set[str]:
@@ -57,7 +57,7 @@ def test_noise_with_memory_is_coloured_noise(memory: tuple[float, float]) -> Non
 
 def test_a_training_of_few_rows_is_left_as_it_is() -> None:
     nothing = np.zeros((20, 1))
-    assert find_uncertain(cstr(), ("C", "T"), np.arange(20.0), nothing, np.zeros((20, 2))) == ()
+    assert find_uncertain(cstr(), ("C", "T"), np.arange(20.0), nothing, np.zeros((20, 2))) == Uncertain()
 
 
 def test_what_is_uncertain_is_said_in_words() -> None:
