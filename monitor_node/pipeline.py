@@ -1,9 +1,10 @@
 """Pipeline of a plant's rows: training, then monitoring.
 
 The identified models predict each row and are updated with it. During training the row is kept. Afterwards the
-reference predicts it, its residuals are prewhitened, and the charts evaluate them. The reference is frozen: a model
-that keeps adapting would learn a fault as normal. The identified models keep adapting beside it; their distance from
-the reference is charted as drift.
+reference predicts it, its residuals are prewhitened, and the charts evaluate them. A reference that learns does so
+while nothing is wrong: otherwise it would learn a fault as normal. Where the identified models do not judge, they keep
+adapting beside the reference, and their predictions are published beside its own. Their distance from what they were
+after the training is charted as drift.
 """
 
 from collections import deque
@@ -11,12 +12,15 @@ from collections.abc import Callable, Iterator, Sequence
 from math import isfinite, nan
 from typing import TypeAlias
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.alarms.states import Event
+from monitor_node.baseline.arx_bank import ArxBank
 from monitor_node.baseline.black_box_reference import BlackBoxReference, BlackBoxReferenceState
+from monitor_node.baseline.commands import ACCEPT, RESTORE, TRAINED, check_command, is_command
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.predictor import ArxPredictor, arx_structure
 from monitor_node.baseline.promise import PlantPromise, PromiseState, TrainingCheck
@@ -30,13 +34,13 @@ from monitor_node.baseline.references import (
 from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
-from monitor_node.chart_stage import ChartWatch, alarm_names, count_chance_alarms
+from monitor_node.chart_stage import ChartWatch, alarm_names, count_chance_alarms, has_values_only
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.health import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
-from monitor_node.ingest.sampling import SamplingPeriod, SamplingState
+from monitor_node.ingest.sampling import Interval, SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.operation import Operation
 from monitor_node.power import Watch, state_power
@@ -45,19 +49,32 @@ from monitor_node.shift_stage import NAME as SHIFT
 from monitor_node.shift_stage import ShiftWatch
 from monitor_node.signal_checks.stage import SignalChecks
 from monitor_node.state.monitor_state import equations_text
-from monitor_node.state.pipeline_state import PipelineState, TrainedState
+from monitor_node.state.pipeline_state import KeptBaseline, PipelineState, TrainedState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Check, Estimate, ModelSnapshot, Parameter, Promise
+from reactorwatch.contract.messages_pb2 import (
+    Alarm,
+    Baseline,
+    BaselineCommand,
+    Check,
+    Estimate,
+    ModelSnapshot,
+    Parameter,
+    Promise,
+)
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
+from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening, innovations
 from reactorwatch.spc.training_errors import QUANTILE, TrainingErrors
+from reactorwatch.stored_state import unpack_numbers, unpack_times
 
 RAISED = Event.RAISED.value
+
+MOST_KEPT = 3
+"""Baselines that can be restored; memory stays bounded."""
 
 TIMES_FEWEST = 2
 """Times the fewest rows of a training that a part of it needs to judge the rest: with fewer it is too rough."""
@@ -80,6 +97,10 @@ def check_promise(config: MonitorConfig, period_min: float) -> None:
     of_drift = outputs if ParameterT2.name in config.charts else 0
     alarms = count_chance_alarms(config) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
     false_alarm_budget.promise_per_30_days(config.false_alarms_per_30_days, alarms, period_min)
+
+
+STEPPED = (ProcessReference, BlackBoxReference)
+"""References whose rows the compiled step takes."""
 
 
 class PlantPipeline:
@@ -158,6 +179,7 @@ class PlantPipeline:
         self._drift = DriftWatch(config, board, publish=points)
         self._shift = ShiftWatch(config, board)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
+        self._arx_keys = [f"{key}/{ArxReference.kind}" for key in self._estimate_keys]
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
         self._refusals = 0
@@ -171,11 +193,14 @@ class PlantPipeline:
         self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
+        self._bank: ArxBank | None = None
         self._quarantined = (False,) * len(config.outputs)
         self._evaluated = [True] * len(config.outputs)
         self._start_training(None)
         self._promise_checked = False
         self._is_training_open = False
+        self._kept: list[KeptBaseline] = []
+        self._incident: Training | None = None
         self.notes: list[str] = []
         self.rows_watched = 0
         self.is_normal = False
@@ -199,6 +224,9 @@ class PlantPipeline:
             self._update.rows or self._training.state,
             None if self._reference is None else self._trained_state(self._reference),
             self.operation.state,
+            list(self._kept),
+            b"" if self._reference is not None or self.baseline is None else self.baseline.SerializeToString(),
+            None if self._incident is None else self._incident.state,
         )
 
     def _trained_state(self, reference: Reference) -> TrainedState:
@@ -216,6 +244,7 @@ class PlantPipeline:
             b"" if self.baseline is None else self.baseline.SerializeToString(),
             self._shift.state,
             None if self.promise is None else self.promise.state,
+            None if self._bank is None else self._bank.state,
             b"" if self.promise is None else Promise(power=self.promise.power).SerializeToString(),
         )
 
@@ -235,12 +264,22 @@ class PlantPipeline:
         for predictor, of_predictor in zip(self._predictors, state.predictors, strict=True):
             predictor.restore(of_predictor)
         self._refusals, self._began_ns = state.refusals, state.began_ns
+        self._kept = list(state.kept)
+        if state.change:
+            self._update.baseline = Baseline.FromString(state.change)
+        if state.incident is not None:
+            self._incident = self._new_incident()
+            self._incident.restore(state.incident)
         watched = state.watched
         if watched is None:
             self._training.restore(state.training)
             return
         if state.training.times_ns and self._config.diagnose_training:
             self._update.rows = state.training
+        self._restore_training(watched)
+
+    def _restore_training(self, watched: TrainedState) -> None:
+        """Resume from the state after a training; the identified models are restored before."""
         if watched.baseline:
             self._update.baseline = Baseline.FromString(watched.baseline)
         self._drift.until_next = watched.until_drift
@@ -258,6 +297,10 @@ class PlantPipeline:
             for i, item in enumerate(watched.whiteners)
         ]
         self._charts.restore(watched.charts, self._evaluated)
+        if self._bank is not None:
+            if watched.bank is None:
+                raise ValueError("the state of a plant of many signals must have that of its models")
+            self._bank.restore(watched.bank)
         self._shift.restore(watched.shift)
         if (watched.suspicion is None) != (self._suspicion is None):
             raise ValueError("the state must tell of the search for causes as it is set")
@@ -269,6 +312,9 @@ class PlantPipeline:
         self, state: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
     ) -> Reference:
         if isinstance(state, ArxReferenceState):
+            for predictor in self._predictors:
+                if not predictor.judges:  # in a state of an earlier version, where the reference judged
+                    predictor.start_judging()
             return ArxReference(state)
         if isinstance(state, BlackBoxReferenceState):
             return BlackBoxReference.from_state(state)
@@ -279,7 +325,7 @@ class PlantPipeline:
     @property
     def equations(self) -> ProcessModel | None:
         """Process model in force: as given, or as the change of the baseline has it; None: there is none."""
-        return self.model if self.baseline is None else read_equations(self.baseline.model)
+        return self.model if self.baseline is None or not self.baseline.model else read_equations(self.baseline.model)
 
     @property
     def awaits_diagnosis(self) -> bool:
@@ -362,16 +408,14 @@ class PlantPipeline:
         if self._update.changes:
             self._change_model(time_ns, publications)
         interval = self._sampling.update(time_ns)
-        inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
-        follows = interval.follows and not row.restarted
-        measured = MeasuredRow(time_ns, inputs, values, units, interval, follows, publications)
-        if self.is_normal and not row.restarted and self._step_row(measured, row.values):
+        if self.is_normal and not row.restarted and self._step_row(row, units, interval, publications):
             return
         self._leave_normal()
         self._units = units
         if row.restarted:
             self.operation.on_restart()
-        self.operation.inputs = inputs
+        measured = self._split_row(row, units, interval, publications)
+        self.operation.inputs = measured.inputs
         publications.extend(self.signals.check_row(time_ns, row.values))
         if self._is_process or self._config.bounds:
             usable = self.signals.mask_values(time_ns, row.values, publications)
@@ -390,7 +434,7 @@ class PlantPipeline:
     def snapshots(self, time_ns: int) -> list[Publication]:
         """Snapshots of the promise and of each output's models: adaptive, fitted to the training, and the reference.
 
-        With another reference than `arx`, the fitted model is only compared with the adaptive one.
+        The fitted model is only compared with the adaptive one, which is the reference if that is `arx`.
         """
         if not self._points:
             return []
@@ -402,8 +446,10 @@ class PlantPipeline:
             if isinstance(reference, BlackBoxReference):
                 judging = reference.snapshot(index, self._config.inputs, self._config.outputs)
             if fitted is not None:
-                fitted.held, fitted.reference = True, isinstance(reference, ArxReference)
-            for snapshot in (fitted, judging):
+                fitted.held = True
+            if adaptive is not None:
+                adaptive.reference = isinstance(reference, ArxReference)
+            for snapshot in (adaptive if predictor.judges else fitted, judging):
                 if snapshot is not None:
                     snapshot.checks.extend(self._checks)
             for snapshot in (adaptive, fitted, judging):
@@ -483,10 +529,12 @@ class PlantPipeline:
     def _start_training(self, time_ns: int | None) -> None:
         config = self._config
         self._began_ns = time_ns
-        self._predictors: list[ArxPredictor] = [
-            ArxPredictor(arx_structure(config), config.forgetting, with_snapshots=self._points) for _ in config.outputs
-        ]
+        self._predictors: list[ArxPredictor] = self._new_predictors()
         self._training: Training = Training(config, self.model, self._predictors)
+
+    def _new_predictors(self) -> list[ArxPredictor]:
+        structure, forgetting = arx_structure(self._config), self._config.forgetting
+        return [ArxPredictor(structure, forgetting, with_snapshots=self._points) for _ in self._config.outputs]
 
     def _train(self, row: MeasuredRow) -> None:
         config, time_ns, values, publications = self._config, row.time_ns, row.values, row.publications
@@ -530,6 +578,23 @@ class PlantPipeline:
             predictor.update(row.time_ns, row.inputs, value, follows=row.follows)
             for predictor, value in zip(self._predictors, row.values, strict=True)
         ]
+
+    def _predict_by_bank(self, row: MeasuredRow) -> list[float]:
+        """Predict each output by its fitted model, for plants of many signals."""
+        assert self._bank is not None
+        if self._drift.wanted:
+            self._buffer(row)
+        return self._bank.predict(row.inputs, row.values, follows=row.follows)
+
+    def _update_beside(self, row: MeasuredRow) -> None:
+        """Update the identified models beside the reference; publish their predictions."""
+        if not self._points:
+            self._buffer(row)
+            return
+        for key, prediction, value, unit in zip(self._arx_keys, self._predict(row), row.values, row.units, strict=True):
+            residual = value - prediction
+            if isfinite(residual):
+                row.publications.append(Publication(key, _estimate(row.time_ns, prediction, residual, unit)))
 
     def _buffer(self, row: MeasuredRow) -> None:
         """Buffer a row for the identified models, whose predictions nothing needs now."""
@@ -613,11 +678,18 @@ class PlantPipeline:
                 self.notes.append(f"promise: {self.promise.text(self.rows_watched)}")
 
     def _change_model(self, time_ns: int, publications: list[Publication]) -> bool:
-        """Learn the baseline again with the model of a change, if one holds from this row on; returns True if so."""
-        rows, change = self._update.rows, self._update.pop_due(time_ns)
-        if change is None or rows is None:
+        """Change the baseline, by a command or with the model of a diagnosis, if that is due; returns True if so."""
+        change = self._update.pop_due(time_ns)
+        if change is None:
             return False
         self._leave_normal()
+        if is_command(change):
+            self._execute_change(change)
+            publications.append(Publication(self._baseline_key, change))
+            return True
+        rows = self._update.rows
+        if rows is None:
+            return False
         try:
             trained = self._update.relearn(change, self._predictors)
         except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
@@ -636,6 +708,98 @@ class PlantPipeline:
             publications.extend(self._promise_messages(time_ns))
         return True
 
+    # --- commands --------------------------------------------------------------------------------------------
+
+    @property
+    def baselines(self) -> list[Baseline]:
+        """Baselines that can be restored, the oldest first, then the one in force."""
+        return [*(Baseline.FromString(item.change) for item in self._kept), self._in_force]
+
+    @property
+    def _in_force(self) -> Baseline:
+        return Baseline(what=TRAINED, by=NODE) if self.baseline is None else self.baseline
+
+    def schedule_command(self, command: BaselineCommand) -> Baseline:
+        """Schedule a command on the baseline for the next row; returns the change.
+
+        Raises:
+            InputError: the command is refused.
+        """
+        kept = [item.id for item in self.baselines[:-1]]
+        change = check_command(command, kept, has_rows=self._began_ns is not None, has_alarm=self._incident is not None)
+        self._update.changes.append(ScheduledChange(None, change))
+        return change
+
+    def _execute_change(self, change: Baseline) -> None:
+        """Execute a command on the baseline: keep the one in force, and train again or restore another."""
+        kept = {Baseline.FromString(item.change).id: item for item in self._kept}
+        restored = kept.get(change.restored) if change.what == RESTORE else None
+        if self._reference is not None:
+            kept[self._in_force.id] = KeptBaseline(
+                self._in_force.SerializeToString(),
+                self._trained_state(self._reference),
+                [predictor.state for predictor in self._predictors],
+                self.signals.state,
+            )
+        self._kept = list(kept.values())[-MOST_KEPT:]
+        rows = self._incident.state if change.what == ACCEPT and self._incident is not None else None
+        self._incident, self._update.rows = None, None
+        if restored is not None:
+            change.model = Baseline.FromString(restored.change).model
+            self._restore_baseline(restored)
+        else:
+            self._train_again(change.time_ns, rows)
+        self._update.baseline = change
+
+    def _restore_baseline(self, kept: KeptBaseline) -> None:
+        """Judge by a baseline that was replaced; its filters and charts start with the next row."""
+        self._predictors = self._new_predictors()
+        for predictor, state in zip(self._predictors, kept.predictors, strict=True):
+            predictor.restore(state)
+            predictor.restart()
+        self.signals.restore_limits(kept.signals)
+        change, self._update.baseline = self._update.baseline, None
+        self._restore_training(msgspec.structs.replace(kept.trained, suspicion=None, baseline=b""))
+        self._update.baseline = change
+        assert self._reference is not None
+        self._reference.restart()
+        self._charts.restart()
+        self._shift.restart()
+        for whitener in self._whiteners:
+            whitener.restart()
+        self._quarantined = (False,) * len(self._config.outputs)
+        self.signals.restart()
+
+    def _train_again(self, time_ns: int, rows: TrainingState | None) -> None:
+        """Train from a row on, after the given rows."""
+        self._reference = self._step = self._kalman = self._suspicion = self._bank = self.promise = None
+        self._is_process = self._is_process_given
+        self.signals.use_ranges(self._ranges if self._is_process else self._stated)
+        self._leave_out({})
+        self._refusals = self.rows_watched = 0
+        self._start_training(time_ns)
+        if rows is None:
+            return
+        self._training.restore(rows)
+        times_ns = unpack_times(rows.times_ns)
+        self._began_ns = times_ns[0]
+        columns = unpack_numbers(rows.rows, len(self._config.signals))
+        for index, predictor in enumerate(self._predictors):
+            column = columns[:, self._inputs + index]
+            predictor.learn_again(np.array(times_ns) / MINUTE_NS, columns[:, : self._inputs], column)
+
+    def _new_incident(self) -> Training:
+        return Training(self._config, self.model, self._predictors)
+
+    def _keep_incident(self, row: MeasuredRow) -> None:
+        """Keep the rows since an alarm without a known cause is active."""
+        if not self._board.has_unexplained:
+            self._incident = None
+            return
+        if self._incident is None:
+            self._incident = self._new_incident()
+        self._incident.add(row.time_ns, row.inputs, list(row.values))
+
     def _start(self, trained: TrainingResult, *, again: bool = False) -> None:
         """Start to evaluate rows.
 
@@ -645,12 +809,12 @@ class PlantPipeline:
         """
         self._leave_out(trained.left_out)
         unmade = self._charts.choose(self._evaluated, trained.e, trained.values)
-        self._shift.is_active = trained.responses is not None
+        self._shift.is_active = trained.responses is not None and not has_values_only(self._config)
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
         )
         asked, period_min = self._config.false_alarms_per_30_days, self._sampling.period_ns / MINUTE_NS
-        promised = false_alarm_budget.promise_per_30_days(asked, self._chance_alarms, period_min)
+        promised = self._promise(asked, period_min, trained.checks)
         if asked is None and promised != false_alarm_budget.USUAL_PER_30_DAYS:
             text = (
                 f"{promised:.3g} false alarms in 30 days are promised instead of "
@@ -664,8 +828,13 @@ class PlantPipeline:
         self._whiteners = [
             Prewhitener(item, self._numbers["whiteners"][0, i : i + 1]) for i, item in enumerate(trained.learned)
         ]
+        if isinstance(trained.reference, ArxReference):
+            for predictor in self._predictors:
+                predictor.start_judging()
         self._charts.start(trained.learned, trained.e, trained.values, self._arl0)
-        self._shift.start(trained.responses, trained.z, trained.learned, self._arl0)
+        responses = trained.responses if self._shift.is_active else None
+        responses = trained.responses if self._shift.is_active else None
+        self._shift.start(responses, trained.z, trained.learned, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         self.signals.learn_spike_rates(trained.outliers, len(trained.e), self._sampling.period_ns, self._arl0)
         self._start_promise(trained, period_min)
@@ -678,7 +847,7 @@ class PlantPipeline:
     def _start_promise(self, trained: TrainingResult, period_min: float) -> None:
         """State the promise of false alarms; alarms so far go on to count."""
         errors, arl0 = TrainingErrors.draw(len(trained.learned)), self._arl0
-        rates = self._charts.relative_rates(trained.learned, trained.e, arl0, errors)
+        rates = self._charts.relative_rates(trained.learned, trained.e, trained.values, arl0, errors)
         rates += self.signals.relative_rates(trained.learned, self._evaluated, arl0, errors)
         rates += self._drift.chance_alarms(self._evaluated) + self._count_step_tests
         self.alarm_rates = rates / arl0
@@ -700,6 +869,18 @@ class PlantPipeline:
                 period_min,
             )
 
+    def _promise(self, asked: float | None, period_min: float, checks: list[Check]) -> float:
+        """False alarms in 30 days that are promised; tests of steps are left out if they would make it impossible."""
+        try:
+            return false_alarm_budget.promise_per_30_days(asked, self._chance_alarms, period_min)
+        except InputError:
+            if not self._shift.is_active:
+                raise
+            self._shift.is_active = False
+            why = f"{asked:g} false alarms in 30 days cannot be kept with more alarms"
+            checks.append(Check(name=SHIFT, result=f"lasting steps are not tested for: {why}"))
+            return false_alarm_budget.promise_per_30_days(asked, self._chance_alarms, period_min)
+
     def _set_reference(self, reference: Reference, learned: list[Prewhitening], arl0: float) -> None:
         """Set the reference for the rows to come."""
         self._reference, self._arl0 = reference, arl0
@@ -707,6 +888,9 @@ class PlantPipeline:
         self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
+        self._bank = None
+        if isinstance(reference, ArxReference) and has_values_only(self._config):
+            self._bank = ArxBank(self._predictors, self._inputs)
         self._kalman = None
         if isinstance(reference, BlackBoxReference):
             self._step = RowStep.of_black_box(self._config, reference, self._ranges)
@@ -768,20 +952,37 @@ class PlantPipeline:
             self._charts.store(self._numbers[0])
             self.is_normal = False
 
-    def _step_row(self, row: MeasuredRow, values: tuple[float, ...]) -> bool:
+    def _split_row(
+        self, row: Row, units: list[str], interval: Interval, publications: list[Publication]
+    ) -> MeasuredRow:
+        inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
+        follows = interval.follows and not row.restarted
+        return MeasuredRow(row.time_ns, inputs, values, units, interval, follows, publications)
+
+    def _step_row(self, row: Row, units: list[str], interval: Interval, publications: list[Publication]) -> bool:
         """Process a row by the compiled step; returns False if it is an event, for which nothing has changed."""
         assert self._step is not None
         assert self._kalman is not None
-        assert isinstance(self._reference, ProcessReference | BlackBoxReference)
+        reference = self._reference
+        assert isinstance(reference, STEPPED)
         time_ns, time_min = row.time_ns, row.time_ns / MINUTE_NS
-        self._row[:] = values
+        self._row[:] = values = row.values
         verdict = self._step.update(self._numbers, self._kalman, time_ns, time_min, self._row)
         if verdict == EVENT:
             return False
         if verdict == VIOLATING:
             self._charts.store_delays(self._numbers[0])
-        self._reference.accept_row(time_min, row.inputs)
+        reference.accept_row(time_min, values[: self._inputs])
         self.rows_watched += 1
+        if self._points or self._drift.wanted or self._shift.is_active:
+            self._publish_stages(self._split_row(row, units, interval, publications))
+        if self._suspicion is not None:
+            self._suspicion.add(time_min, values[: self._inputs], values[self._inputs :])
+        return True
+
+    def _publish_stages(self, row: MeasuredRow) -> None:
+        """Publish a row that the compiled step has taken, and pass it to the stages that the step does not have."""
+        assert self._step is not None
         if self._points:
             self._publish_step(row)
         before = len(row.publications)
@@ -789,15 +990,13 @@ class PlantPipeline:
             count = len(row.values)
             self._shift.update(row, self._step.work[0]["outputs"][3 * count : 4 * count].tolist(), points=self._points)
         if self._drift.wanted:
-            self._buffer(row)
-            row.publications.extend(self._drift.update(time_ns, self._predictors))
-        self._count_alarms(time_ns, row.publications, before)
+            self._update_beside(row)
+            row.publications.extend(self._drift.update(row.time_ns, self._predictors))
+        self._count_alarms(row.time_ns, row.publications, before)
         if self._board.has_unexplained:  # a lasting step
             self._leave_normal()
             self._set_learning()
-        if self._suspicion is not None:
-            self._suspicion.add(time_min, row.inputs, row.values)
-        return True
+            self._keep_incident(row)
 
     def _publish_step(self, row: MeasuredRow) -> None:
         assert self._step is not None
@@ -829,10 +1028,8 @@ class PlantPipeline:
             row.values = [nan if still else value for value, still in zip(row.values, stuck, strict=True)]
         values = row.values
         if isinstance(reference, ArxReference):
-            reference.predictions = self._predict(row)
+            reference.predictions = self._predict(row) if self._bank is None else self._predict_by_bank(row)
             reference.extrapolation_sds = [predictor.extrapolation_sd for predictor in self._predictors]
-        elif self._drift.wanted:
-            self._buffer(row)
         if row.interval.is_gap:  # the input in it is unknown
             reference.restart()
             self.signals.restart()
@@ -852,7 +1049,7 @@ class PlantPipeline:
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
             publications.extend(self._estimates(row, predictions, sds, scales, expected))
-        e = [whitener.update(residual) for whitener, residual in zip(self._whiteners, z, strict=True)]
+        e = innovations(self._numbers["whiteners"][0], z)
         self.rows_watched += 1
         self._quarantined = quarantined = self.signals.check_residuals(time_ns, e, scales, units, publications)
         if True in quarantined:
@@ -862,10 +1059,13 @@ class PlantPipeline:
         self._charts.update(row, e, quarantined, scales, points=self._points)
         self._shift.update(row, tested, points=self._points)
         if self._drift.wanted:
+            if not isinstance(reference, ArxReference):
+                self._update_beside(row)
             publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
             publications.extend(self._search_causes(row, stuck))
         self._set_learning()
+        self._keep_incident(row)
         if isinstance(reference, BlackBoxReference) and reference.unjudged and reference.kind not in self._noted:
             self._noted.add(reference.kind)
             self.notes.append(
@@ -873,9 +1073,12 @@ class PlantPipeline:
             )
 
     def _set_learning(self) -> None:
-        """Let a black box learn while no alarm without a known cause is active."""
+        """Let a reference that learns do so while no alarm without a known cause is active."""
         if isinstance(self._reference, BlackBoxReference):
             self._reference.set_learning(not self._board.has_unexplained)
+        elif isinstance(self._reference, ArxReference):
+            for predictor in self._predictors:
+                predictor.set_learning(not self._board.has_unexplained)
 
     def _note_inputs_beyond(self, indices: list[int]) -> None:
         """Note once each input that leaves its range in the training, as rows are not judged then."""

@@ -8,10 +8,9 @@ from pathlib import Path
 import msgspec
 import structlog
 
-from monitor_node.alarms.commands import COMMANDS
 from monitor_node.alarms.kpis import is_empty
 from monitor_node.config import MonitorConfig
-from monitor_node.core import Monitor
+from monitor_node.core import COMMANDS, Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker
 from monitor_node.fleet import sharding
 from monitor_node.fleet.config import FleetConfig

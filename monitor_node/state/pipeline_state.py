@@ -2,6 +2,7 @@
 
 import msgspec
 
+from monitor_node.baseline.arx_bank import ArxBankState
 from monitor_node.baseline.black_box_reference import BlackBoxReferenceState
 from monitor_node.baseline.predictor import PredictorState
 from monitor_node.baseline.promise import PromiseState
@@ -34,6 +35,7 @@ class TrainedState(StoredState, frozen=True):
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
         shift: tests for lasting steps, one an output; empty without them, and in states of earlier versions.
         promise: state of the promise of false alarms; None: it was stored by a version without one.
+        bank: state of the fitted models' bank; None if there is none.
         power: deviations that would be seen, a serialized `Promise`; empty: not stated.
     """
 
@@ -50,7 +52,24 @@ class TrainedState(StoredState, frozen=True):
     baseline: bytes = b""
     shift: list[StepTestState] = msgspec.field(default_factory=list)
     promise: PromiseState | None = None
+    bank: ArxBankState | None = None
     power: bytes = b""
+
+
+class KeptBaseline(StoredState, frozen=True):
+    """A baseline that was replaced, and can be restored.
+
+    Attributes:
+        change: change by which it came into force, a serialized `Baseline`.
+        trained: state after the training, when it was replaced.
+        predictors: identified models, one an output.
+        signals: state of the signal checks.
+    """
+
+    change: bytes
+    trained: TrainedState
+    predictors: list[PredictorState]
+    signals: SignalChecksState
 
 
 class PipelineState(StoredState, frozen=True):
@@ -65,6 +84,9 @@ class PipelineState(StoredState, frozen=True):
         training: rows of the training; after it while its diagnosis is pending, then empty.
         watched: state after the training; None before its end.
         operation: states of modes and set points, by signal.
+        kept: baselines that can be restored, the oldest first.
+        change: newest change of the baseline by a command, while the plant is trained because of it; empty else.
+        incident: rows since an alarm without a known cause is active; None: there is none.
     """
 
     sampling: SamplingState
@@ -75,3 +97,6 @@ class PipelineState(StoredState, frozen=True):
     training: TrainingState
     watched: TrainedState | None
     operation: dict[str, CarriedState] = msgspec.field(default_factory=dict)
+    kept: list[KeptBaseline] = msgspec.field(default_factory=list)
+    change: bytes = b""
+    incident: TrainingState | None = None
