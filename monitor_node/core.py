@@ -407,7 +407,7 @@ class Monitor:
         """`waiting` for the first row, `training` or `watching`."""
         if self.first_ns is None:
             return "waiting"
-        return "watching" if self.pipeline.watching else "training"
+        return "watching" if self.pipeline.watching or not self.pipeline.is_judged else "training"
 
     @property
     def model(self) -> ProcessModel | None:

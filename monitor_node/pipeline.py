@@ -42,6 +42,7 @@ from monitor_node.health import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import Interval, SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
+from monitor_node.operating_modes import OperatingModes, key_of
 from monitor_node.operation import Operation
 from monitor_node.power import Watch, state_power
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
@@ -49,7 +50,7 @@ from monitor_node.shift_stage import NAME as SHIFT
 from monitor_node.shift_stage import ShiftWatch
 from monitor_node.signal_checks.stage import SignalChecks
 from monitor_node.state.monitor_state import equations_text
-from monitor_node.state.pipeline_state import KeptBaseline, PipelineState, TrainedState
+from monitor_node.state.pipeline_state import KeptBaseline, ModeTraining, PipelineState, TrainedState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import (
@@ -200,6 +201,7 @@ class PlantPipeline:
         self._promise_checked = False
         self._is_training_open = False
         self._kept: list[KeptBaseline] = []
+        self._modes = OperatingModes(config) if config.modes else None
         self._incident: Training | None = None
         self.notes: list[str] = []
         self.rows_watched = 0
@@ -227,6 +229,7 @@ class PlantPipeline:
             list(self._kept),
             b"" if self._reference is not None or self.baseline is None else self.baseline.SerializeToString(),
             None if self._incident is None else self._incident.state,
+            None if self._modes is None else msgspec.structs.replace(self._modes.state),
         )
 
     def _trained_state(self, reference: Reference) -> TrainedState:
@@ -270,6 +273,10 @@ class PlantPipeline:
         if state.incident is not None:
             self._incident = self._new_incident()
             self._incident.restore(state.incident)
+        if self._modes is not None and state.modes is not None:
+            self._modes.state = msgspec.structs.replace(
+                state.modes, baselines=dict(state.modes.baselines), trainings=dict(state.modes.trainings)
+            )
         watched = state.watched
         if watched is None:
             self._training.restore(state.training)
@@ -359,6 +366,11 @@ class PlantPipeline:
         return self._reference is not None
 
     @property
+    def is_judged(self) -> bool:
+        """False in a mode in which signals are checked only."""
+        return self._modes is None or self._modes.state.is_judged
+
+    @property
     def reference(self) -> str:
         """Kind of the reference: `equations`, `black-box` or `arx`; empty before there is one."""
         return "" if self._reference is None else self._reference.kind
@@ -407,6 +419,8 @@ class PlantPipeline:
         time_ns = row.time_ns
         if self._update.changes:
             self._change_baseline(time_ns, publications)
+        if self._modes is not None and self._modes.is_change(self.operation.values):
+            self._change_mode(self._modes)
         interval = self._sampling.update(time_ns)
         if self.is_normal and not row.restarted and self._step_row(row, units, interval, publications):
             return
@@ -420,7 +434,10 @@ class PlantPipeline:
         if self._is_process or self._config.bounds:
             usable = self.signals.mask_values(time_ns, row.values, publications)
             measured.inputs, measured.values = usable[: self._inputs], list(usable[self._inputs :])
-        if self._reference is None:
+        if self._modes is not None and not self.is_judged:
+            if self._modes.state.is_learned:
+                publications.extend(self.signals.check_values(time_ns, measured.values, units))
+        elif self._reference is None:
             self._train(measured)
         else:
             if row.restarted:
@@ -543,7 +560,9 @@ class PlantPipeline:
             self._promise_checked = True
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
-        share = config.training_length.share((time_ns - self._began_ns) / MINUTE_NS, self._training.rows)
+        share = config.training_length.share((time_ns - self._began_ns) / MINUTE_NS, self._training_rows())
+        if self._modes is not None and self._modes.state.is_resumed:
+            share = 1.0
         timed_out = self.signals.silence.silent[len(config.inputs) :]
         if share >= 1.0 and not self._is_training_open and self._training.is_enough(timed_out):
             rows, self.training_rows = self._training.state, self._training.rows
@@ -571,6 +590,11 @@ class PlantPipeline:
                 residual = value - prediction
                 if isfinite(residual):
                     publications.append(Publication(key, _estimate(time_ns, prediction, residual, unit)))
+
+    def _training_rows(self) -> int:
+        """Rows of the training so far, those in other modes too, until one is learned."""
+        is_learned = self._modes is None or self._modes.state.is_learned
+        return self._training.rows + (0 if is_learned or self._modes is None else self._modes.rows)
 
     def _predict(self, row: MeasuredRow) -> list[float]:
         """Predict each output by its identified model, which is updated with the row."""
@@ -739,12 +763,7 @@ class PlantPipeline:
         kept = {Baseline.FromString(item.change).id: item for item in self._kept}
         restored = kept.get(change.restored) if change.what == RESTORE else None
         if self._reference is not None:
-            kept[self._in_force.id] = KeptBaseline(
-                self._in_force.SerializeToString(),
-                self._trained_state(self._reference),
-                [predictor.state for predictor in self._predictors],
-                self.signals.state,
-            )
+            kept[self._in_force.id] = self._make_kept_baseline(self._reference)
         self._kept = list(kept.values())[-MOST_KEPT:]
         rows = self._incident.state if change.what == ACCEPT and self._incident is not None else None
         self._incident, self._update.rows = None, None
@@ -754,6 +773,14 @@ class PlantPipeline:
         else:
             self._train_again(change.time_ns, rows)
         self._update.baseline = change
+
+    def _make_kept_baseline(self, reference: Reference) -> KeptBaseline:
+        return KeptBaseline(
+            self._in_force.SerializeToString(),
+            self._trained_state(reference),
+            [predictor.state for predictor in self._predictors],
+            self.signals.state,
+        )
 
     def _restore_baseline(self, kept: KeptBaseline) -> None:
         """Judge by a baseline that was replaced; its filters and charts start with the next row."""
@@ -776,11 +803,9 @@ class PlantPipeline:
 
     def _train_again(self, time_ns: int, rows: TrainingState | None) -> None:
         """Train from a row on, after the given rows."""
-        self._reference = self._step = self._kalman = self._suspicion = self._bank = self.promise = None
-        self._is_process = self._is_process_given
-        self.signals.use_ranges(self._ranges if self._is_process else self._stated)
-        self._leave_out({})
-        self._refusals = self.rows_watched = 0
+        self._stop_judging()
+        if self._modes is not None:
+            self._modes.state.is_judged, self._modes.state.is_resumed = True, False
         self._start_training(time_ns)
         if rows is None:
             return
@@ -811,6 +836,8 @@ class PlantPipeline:
             trained: result of the training.
             again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
         """
+        if self._modes is not None:
+            self._modes.state.is_learned = True
         self._leave_out(trained.left_out)
         unmade = self._charts.choose(self._evaluated, trained.e, trained.values)
         self._shift.is_active = trained.responses is not None and not has_values_only(self._config)
@@ -846,6 +873,48 @@ class PlantPipeline:
             self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
+
+    def _change_mode(self, modes: OperatingModes) -> None:
+        """Leave a mode, and judge by what was learned in the next, or go on to learn it."""
+        self._leave_normal()
+        state, old, began_ns = modes.state, key_of(modes.state.mode), self._began_ns
+        if state.is_judged and self._reference is not None:
+            state.baselines[old] = self._make_kept_baseline(self._reference)
+        elif state.is_judged and self._training.rows:
+            state.trainings[old] = ModeTraining(self._training.state, [item.state for item in self._predictors])
+        self._incident = None
+        state.mode = [self.operation.values[name] for name in self._config.modes]
+        new, change = key_of(state.mode), self._update.baseline
+        self._stop_judging()
+        state.is_judged = not modes.is_startup(state.mode)
+        if not state.is_judged:
+            return
+        if (known := state.baselines.pop(new, None)) is not None:
+            self._restore_baseline(known)
+            self._update.baseline = change
+            return
+        begun = state.trainings.pop(new, None)
+        state.is_resumed = begun is not None and state.is_learned
+        self._start_training(began_ns)
+        if begun is not None:
+            self._training.restore(begun.rows)
+            for predictor, item in zip(self._predictors, begun.predictors, strict=True):
+                predictor.restore(item)
+                predictor.restart()
+        if state.is_learned and not (begun and self._training.is_enough([False] * len(self._config.outputs))):
+            state.is_judged = False
+            self.notes.append(
+                f"{modes.describe()} was not seen in the training: its rows are watched by signal checks only; "
+                "`baseline relearn` learns them"
+            )
+
+    def _stop_judging(self) -> None:
+        self._reference = self._step = self._kalman = self._suspicion = self._bank = None
+        self._is_process = self._is_process_given
+        self.signals.use_ranges(self._ranges if self._is_process else self._stated)
+        self._leave_out({})
+        self._refusals = self.rows_watched = 0
+        self.promise = None
 
     def _start_promise(self, trained: TrainingResult, period_min: float) -> None:
         """State the promise of false alarms; alarms so far go on to count."""
