@@ -467,7 +467,7 @@ class Monitor:
     @property
     def promise(self) -> Promise | None:
         """Promise of false alarms, as it is now; None before the end of the training."""
-        promise = self.pipeline.promise
+        promise = self.pipeline.promises.promise
         return None if promise is None else promise.message(self.last_ns or 0, self.pipeline.rows_watched)
 
     @property
