@@ -42,14 +42,14 @@ DEFAULT = find_process()
 DEFAULT_TRAINING_ROWS = 1000
 """Training where nothing is stated, of a process that has no duration of its own."""
 
-LARGEST_FALSE_ALARMS = 1e6
-"""Most false alarms in 30 days that can be asked for."""
+LEAST_FALSE_ALARMS, LARGEST_FALSE_ALARMS = 1e-3, 1e6
+"""Fewest and most false alarms in 30 days that can be asked for."""
 
 USUAL_CHARTS = ("shewhart", "ewma", "mewma")
 """Charts where the settings name none."""
 
 CHARTS_OF_MANY = ("residual_space",)
-"""Charts where the settings name none, of many signals that no equations judge."""
+"""Charts where the settings name none, of many outputs that no equations judge."""
 
 WITHOUT_EQUATIONS = ""
 """Setting `process` of a plant that no equations judge."""
@@ -114,7 +114,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             inputs no black box).
         process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
             nominal reactor where its signals are watched; empty: no equations judge.
-        charts: charts of the residuals and of the values; where none are named, `residual_space` for 8 signals or more
+        charts: charts of the residuals and of the values; where none are named, `residual_space` for 8 outputs or more
             that no equations judge, else `shewhart`, `ewma` and `mewma`.
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
             nearest number that the charts can keep for the number of alarms and the sampling period.
@@ -156,7 +156,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     reference: ReferenceName | Literal["process"] = "auto"
     process: str | None = None
     charts: tuple[ChartName, ...] = USUAL_CHARTS
-    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=LARGEST_FALSE_ALARMS)] | None = None
+    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=LEAST_FALSE_ALARMS, le=LARGEST_FALSE_ALARMS)] | None = (
+        None
+    )
     smallest_sd: dict[str, float] = msgspec.field(default_factory=lambda: dict(DEFAULT.watch.smallest_sd))
     isolation: bool = True
     isolation_rows: Annotated[int, msgspec.Meta(ge=50, le=10_000)] = 600
@@ -200,7 +202,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
                 f"{self.training_rows}; leave one out"
             )
         if self.charts is USUAL_CHARTS or self.charts is CHARTS_OF_MANY:  # no others are named
-            are_many = len(self.signals) >= FEWEST_SIGNALS and not self._may_have_equations
+            are_many = len(self.outputs) >= FEWEST_SIGNALS and not self._may_have_equations
             msgspec.structs.force_setattr(self, "charts", CHARTS_OF_MANY if are_many else USUAL_CHARTS)
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")

@@ -56,6 +56,7 @@ class Monitor:
         model: process model, in minutes since 1970-01-01 UTC; None: the nominal reactor.
         diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`, and
             hands the result to `on_finding`.
+        power: True to state the deviations that would be seen; None: with points.
 
     Raises:
         InputError: the settings are inconsistent.
@@ -81,7 +82,9 @@ class Monitor:
         points: bool = True,
         model: ProcessModel | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
+        power: bool | None = None,
     ) -> None:
+        self._power = points if power is None else power
         self.config = config = order_inputs(config, model)
         self._points, self._model, self._diagnose = points, model, diagnose
         self._changes: deque[ScheduledChange] = deque()
@@ -100,7 +103,8 @@ class Monitor:
         self.alarms = Annunciator(config)
         self.pipeline = self._new_pipeline(self.alarms)
         judged_by = self.pipeline.model
-        self._sample_units = make_sample_units(config.units, None if judged_by is None else judged_by.units)
+        self._sample_units = make_sample_units(config.units, {} if judged_by is None else judged_by.units)
+        self._plain_units: dict[str, str] = {}  # newest unit by signal that needs no conversion
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -123,10 +127,9 @@ class Monitor:
         if message.received_ns and now_ns - message.received_ns > self.stats.lag_ns:
             self.stats.lag_ns = now_ns - message.received_ns
         signal = self._signal_by_key.get(message.key)
-        if signal is None and message.key in self._label_keys:
-            return []
         if signal is None:
-            self.rejects.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
+            if message.key not in self._label_keys:
+                self.rejects.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
             return []
         if len(message.payload) > LARGEST_SAMPLE:
             self.rejects.add("too_large", f"{message.key}: {len(message.payload)} bytes are no Sample")
@@ -147,12 +150,15 @@ class Monitor:
         if quality not in USABLE or not abs(value) < LARGEST_VALUE:
             self.rejects.add(*reject_reason(signal, sample))
             return []
-        if self._sample_units is not None:
+        if unit != self._plain_units.get(signal):
             try:
-                value, unit = self._sample_units.convert(signal, unit, value)
+                value, converted = self._sample_units.convert(signal, unit, value)
             except InputError as error:
                 self.rejects.add("unit", str(error))
                 return []
+            if converted == unit:
+                self._plain_units[signal] = unit
+            unit = converted
         index = self._indices.get(signal)
         if index is None:
             self.pipeline.operation.on_sample(signal, sample.time_ns, value)
@@ -565,6 +571,7 @@ class Monitor:
             changes=self._changes,
             diagnose=self._diagnose,
             check=check_training,
+            power=self._power,
         )
 
     def _contain(self, stage: str, error: Exception) -> None:

@@ -18,6 +18,7 @@ from msgspec.structs import replace
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.alarms.states import Event
+from monitor_node.baseline.arx_bank import ArxBank
 from monitor_node.baseline.black_box_reference import BlackBoxReference, BlackBoxReferenceState
 from monitor_node.baseline.commands import ACCEPT, RESTORE, TRAINED, check_command, is_command
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
@@ -33,16 +34,17 @@ from monitor_node.baseline.references import (
 from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
-from monitor_node.chart_stage import ChartWatch, alarm_names, count_chance_alarms
+from monitor_node.chart_stage import ChartWatch, alarm_names, count_chance_alarms, has_values_only
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.health import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
-from monitor_node.ingest.sampling import SamplingPeriod, SamplingState
+from monitor_node.ingest.sampling import Interval, SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.operating_modes import OperatingModes, key_of
 from monitor_node.operation import Operation
+from monitor_node.power import Watch, state_power
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.shift_stage import NAME as SHIFT
 from monitor_node.shift_stage import ShiftWatch
@@ -66,14 +68,17 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
-from reactorwatch.spc.training_errors import CONFIDENCE, TrainingErrors
+from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening, innovations
+from reactorwatch.spc.training_errors import QUANTILE, TrainingErrors
 from reactorwatch.stored_state import unpack_numbers, unpack_times
+
+RAISED = Event.RAISED.value
 
 MOST_KEPT = 3
 """Baselines that can be restored; memory stays bounded."""
 
-RAISED = Event.RAISED.value
+TIMES_FEWEST = 2
+"""Times the fewest rows of a training that a part of it needs to judge the rest: with fewer it is too rough."""
 
 CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, TrainingState, str], TrainingCheck]
 """Judges a training by itself, see `training_check`."""
@@ -95,6 +100,10 @@ def check_promise(config: MonitorConfig, period_min: float) -> None:
     false_alarm_budget.promise_per_30_days(config.false_alarms_per_30_days, alarms, period_min)
 
 
+STEPPED = (ProcessReference, BlackBoxReference)
+"""References whose rows the compiled step takes."""
+
+
 class PlantPipeline:
     """Pipeline of one plant.
 
@@ -107,6 +116,7 @@ class PlantPipeline:
         changes: changes of the baseline to come.
         diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`.
         check: judges the training by itself; None: that is not done.
+        power: True to state the deviations that would be seen.
 
     Raises:
         InputError: the settings ask for a process model that does not fit the plant's signals.
@@ -135,13 +145,21 @@ class PlantPipeline:
         changes: deque[ScheduledChange] | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
         check: CheckTraining | None = None,
+        power: bool = False,
     ) -> None:
         self._config = config
-        self._check = check
+        self._check, self._states_power = check, power
+        self._watch: Watch | None = None
         self.promise: PlantPromise | None = None
         self._promised: Promise | None = None
+        self._units = [config.units.get(name, "") for name in config.outputs]
         self.alarm_rates = np.zeros(0)
-        self._chance_names = {*(name for name, _ in alarm_names(config)), SHIFT, *SignalChecks.CHANCE_NAMES}
+        self._chance_names = {
+            *(name for name, _ in alarm_names(config)),
+            *config.charts,
+            SHIFT,
+            *SignalChecks.CHANCE_NAMES,
+        }
         self._promise_key = keys.key(config.plant, keys.PROMISE, NODE)
         self._update = ModelUpdate(config, deque() if changes is None else changes)
         self._diagnose = diagnose
@@ -176,6 +194,7 @@ class PlantPipeline:
         self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
+        self._bank: ArxBank | None = None
         self._quarantined = (False,) * len(config.outputs)
         self._evaluated = [True] * len(config.outputs)
         self._start_training(None)
@@ -228,6 +247,8 @@ class PlantPipeline:
             b"" if self.baseline is None else self.baseline.SerializeToString(),
             self._shift.state,
             None if self.promise is None else self.promise.state,
+            None if self._bank is None else self._bank.state,
+            b"" if self.promise is None else Promise(power=self.promise.power).SerializeToString(),
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -269,7 +290,8 @@ class PlantPipeline:
         if watched.baseline:
             self._update.baseline = Baseline.FromString(watched.baseline)
         self._drift.until_next = watched.until_drift
-        self.promise = None if watched.promise is None else PlantPromise(watched.promise)
+        if watched.promise is not None:
+            self.promise = PlantPromise(watched.promise, list(Promise.FromString(watched.power).power))
         self._checks = [Check(name=name, result=result) for name, result in watched.checks]
         learned = [item.learned for item in watched.whiteners]
         outputs = len(self._config.outputs)
@@ -282,6 +304,10 @@ class PlantPipeline:
             for i, item in enumerate(watched.whiteners)
         ]
         self._charts.restore(watched.charts, self._evaluated)
+        if self._bank is not None:
+            if watched.bank is None:
+                raise ValueError("the state of a plant of many signals must have that of its models")
+            self._bank.restore(watched.bank)
         self._shift.restore(watched.shift)
         if (watched.suspicion is None) != (self._suspicion is None):
             raise ValueError("the state must tell of the search for causes as it is set")
@@ -396,15 +422,14 @@ class PlantPipeline:
         if self._modes is not None and self._modes.is_change(self.operation.values):
             self._change_mode(self._modes)
         interval = self._sampling.update(time_ns)
-        inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
-        follows = interval.follows and not row.restarted
-        measured = MeasuredRow(time_ns, inputs, values, units, interval, follows, publications)
-        if self.is_normal and not row.restarted and self._step_row(measured, row.values):
+        if self.is_normal and not row.restarted and self._step_row(row, units, interval, publications):
             return
         self._leave_normal()
+        self._units = units
         if row.restarted:
             self.operation.on_restart()
-        self.operation.inputs = inputs
+        measured = self._split_row(row, units, interval, publications)
+        self.operation.inputs = measured.inputs
         publications.extend(self.signals.check_row(time_ns, row.values))
         if self._is_process or self._config.bounds:
             usable = self.signals.mask_values(time_ns, row.values, publications)
@@ -488,8 +513,9 @@ class PlantPipeline:
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
-        if not self._training.is_enough([False] * len(self._config.outputs)):
-            raise InputError(f"there are only {self._training.rows} rows to learn from")
+        fewest = TIMES_FEWEST * self._training.fewest_rows
+        if self._training.rows < fewest or not self._training.is_enough([False] * len(self._config.outputs)):
+            raise InputError(f"must have at least {fewest} rows to be judged by, got {self._training.rows}")
         trained = self._training.finish(last_chance=True)
         if trained.refused:
             raise InputError(trained.refused)
@@ -577,6 +603,13 @@ class PlantPipeline:
             for predictor, value in zip(self._predictors, row.values, strict=True)
         ]
 
+    def _predict_by_bank(self, row: MeasuredRow) -> list[float]:
+        """Predict each output by its fitted model, for plants of many signals."""
+        assert self._bank is not None
+        if self._drift.wanted:
+            self._buffer(row)
+        return self._bank.predict(row.inputs, row.values, follows=row.follows)
+
     def _update_beside(self, row: MeasuredRow) -> None:
         """Update the identified models beside the reference; publish their predictions."""
         if not self._points:
@@ -601,8 +634,17 @@ class PlantPipeline:
     def _chance_alarms(self) -> int:
         """Number of alarms that can be false alarms."""
         of_signals = SignalChecks.CHANCE_ALARMS * sum(self._evaluated)
-        of_steps = sum(self._evaluated) if self._shift.is_active else 0
-        return self._charts.chance_alarms + of_signals + of_steps + self._drift.chance_alarms(self._evaluated)
+        return (
+            self._charts.chance_alarms
+            + of_signals
+            + self._count_step_tests
+            + self._drift.chance_alarms(self._evaluated)
+        )
+
+    @property
+    def _count_step_tests(self) -> int:
+        """Number of tests of lasting steps, each of which chance can raise an alarm of."""
+        return sum(self._evaluated) if self._shift.is_active else 0
 
     def _start_diagnosis(self, rows: TrainingState) -> None:
         if self._config.diagnose_training and equations_text(self.model):
@@ -611,7 +653,13 @@ class PlantPipeline:
             self.on_finding(self._diagnose(job))
 
     def _check_training(self, rows: TrainingState) -> None:
-        """Judge the training by itself; an error there leaves the promise without this check."""
+        """Judge the training by itself, and state the power; an error there leaves the promise without them."""
+        if self._watch is not None and self.promise is not None:
+            watch, self._watch = self._watch, None
+            try:
+                self.promise.power = state_power(watch, rows)
+            except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
+                self._failures.add("power", error, "the deviations that would be seen are not stated")
         if self._check is None or self.promise is None or self._reference is None:
             return
         model = self.equations if isinstance(self._reference, ProcessReference) else None
@@ -620,7 +668,7 @@ class PlantPipeline:
         except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
             self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
             return
-        self.promise = PlantPromise(replace(self.promise.state, check=check))
+        self.promise.state = replace(self.promise.state, check=check)
         if not self.promise.is_kept:
             self.notes.append(f"promise: {self.promise.text(self.rows_watched)}")
 
@@ -744,6 +792,8 @@ class PlantPipeline:
         change, self._update.baseline = self._update.baseline, None
         self._restore_training(msgspec.structs.replace(kept.trained, suspicion=None, baseline=b""))
         self._update.baseline = change
+        if self._bank is not None:
+            self._bank = ArxBank(self._predictors, self._inputs)
         assert self._reference is not None
         self._reference.restart()
         self._charts.restart()
@@ -792,12 +842,12 @@ class PlantPipeline:
             self._modes.state.is_learned = True
         self._leave_out(trained.left_out)
         unmade = self._charts.choose(self._evaluated, trained.e, trained.values)
-        self._shift.is_active = trained.responses is not None
+        self._shift.is_active = trained.responses is not None and not has_values_only(self._config)
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
         )
         asked, period_min = self._config.false_alarms_per_30_days, self._sampling.period_ns / MINUTE_NS
-        promised = self._promise_rate(asked, period_min, trained.checks)
+        promised = self._promise(asked, period_min, trained.checks)
         if asked is None and promised != false_alarm_budget.USUAL_PER_30_DAYS:
             text = (
                 f"{promised:.3g} false alarms in 30 days are promised instead of "
@@ -861,14 +911,39 @@ class PlantPipeline:
             )
 
     def _stop_judging(self) -> None:
-        self._reference = self._step = self._kalman = self._suspicion = None
+        """Judge no rows."""
+        self._reference = self._step = self._kalman = self._suspicion = self._bank = self.promise = None
         self._is_process = self._is_process_given
         self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         self._leave_out({})
         self._refusals = self.rows_watched = 0
-        self.promise = None
 
-    def _promise_rate(self, asked: float | None, period_min: float, checks: list[Check]) -> float:
+    def _start_promise(self, trained: TrainingResult, period_min: float) -> None:
+        """State the promise of false alarms; alarms so far go on to count."""
+        errors, arl0 = TrainingErrors.draw(len(trained.learned)), self._arl0
+        rates = self._charts.relative_rates(trained.learned, trained.e, trained.values, arl0, errors)
+        rates += self.signals.relative_rates(trained.learned, self._evaluated, arl0, errors)
+        rates += self._drift.chance_alarms(self._evaluated) + self._count_step_tests
+        self.alarm_rates = rates / arl0
+        rows = false_alarm_budget.DAYS_MIN / period_min
+        mean, upper = rows * self._chance_alarms / arl0, rows * float(np.quantile(self.alarm_rates, QUANTILE))
+        before = PromiseState(0.0, 0.0, rows) if self.promise is None else self.promise.state
+        state = replace(before, per_30_days=mean, upper_per_30_days=max(mean, upper), rows_in_30_days=rows)
+        self.promise = PlantPromise(replace(state, check=TrainingCheck()))
+        if self._states_power:
+            self._watch = Watch(
+                self._config,
+                trained.reference,
+                self._predictors,
+                trained.learned,
+                self._charts.detectors(trained.learned, trained.e, arl0),
+                self._shift.sensitivities,
+                self._evaluated,
+                dict(zip(self._config.outputs, self._units, strict=True)),
+                period_min,
+            )
+
+    def _promise(self, asked: float | None, period_min: float, checks: list[Check]) -> float:
         """False alarms in 30 days that are promised; tests of steps are left out if they would make it impossible."""
         try:
             return false_alarm_budget.promise_per_30_days(asked, self._chance_alarms, period_min)
@@ -880,19 +955,6 @@ class PlantPipeline:
             checks.append(Check(name=SHIFT, result=f"lasting steps are not tested for: {why}"))
             return false_alarm_budget.promise_per_30_days(asked, self._chance_alarms, period_min)
 
-    def _start_promise(self, trained: TrainingResult, period_min: float) -> None:
-        """State the promise of false alarms; alarms so far go on to count."""
-        errors, arl0 = TrainingErrors.draw(len(trained.learned)), self._arl0
-        rates = self._charts.relative_rates(trained.learned, trained.e, arl0, errors)
-        rates += self.signals.relative_rates(trained.learned, self._evaluated, arl0, errors)
-        rates += self._drift.chance_alarms(self._evaluated) + (sum(self._evaluated) if self._shift.is_active else 0)
-        self.alarm_rates = rates / arl0
-        rows = false_alarm_budget.DAYS_MIN / period_min
-        mean, upper = rows * self._chance_alarms / arl0, rows * float(np.quantile(self.alarm_rates, CONFIDENCE))
-        before = PromiseState(0.0, 0.0, rows) if self.promise is None else self.promise.state
-        state = replace(before, per_30_days=mean, upper_per_30_days=max(mean, upper), rows_in_30_days=rows)
-        self.promise = PlantPromise(replace(state, check=TrainingCheck()))
-
     def _set_reference(self, reference: Reference, learned: list[Prewhitening], arl0: float) -> None:
         """Set the reference for the rows to come."""
         self._reference, self._arl0 = reference, arl0
@@ -900,6 +962,9 @@ class PlantPipeline:
         self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
+        self._bank = None
+        if isinstance(reference, ArxReference) and has_values_only(self._config):
+            self._bank = ArxBank(self._predictors, self._inputs)
         self._kalman = None
         if isinstance(reference, BlackBoxReference):
             self._step = RowStep.of_black_box(self._config, reference, self._ranges)
@@ -961,20 +1026,37 @@ class PlantPipeline:
             self._charts.store(self._numbers[0])
             self.is_normal = False
 
-    def _step_row(self, row: MeasuredRow, values: tuple[float, ...]) -> bool:
+    def _split_row(
+        self, row: Row, units: list[str], interval: Interval, publications: list[Publication]
+    ) -> MeasuredRow:
+        inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
+        follows = interval.follows and not row.restarted
+        return MeasuredRow(row.time_ns, inputs, values, units, interval, follows, publications)
+
+    def _step_row(self, row: Row, units: list[str], interval: Interval, publications: list[Publication]) -> bool:
         """Process a row by the compiled step; returns False if it is an event, for which nothing has changed."""
         assert self._step is not None
         assert self._kalman is not None
-        assert isinstance(self._reference, ProcessReference | BlackBoxReference)
+        reference = self._reference
+        assert isinstance(reference, STEPPED)
         time_ns, time_min = row.time_ns, row.time_ns / MINUTE_NS
-        self._row[:] = values
+        self._row[:] = values = row.values
         verdict = self._step.update(self._numbers, self._kalman, time_ns, time_min, self._row)
         if verdict == EVENT:
             return False
         if verdict == VIOLATING:
             self._charts.store_delays(self._numbers[0])
-        self._reference.accept_row(time_min, row.inputs)
+        reference.accept_row(time_min, values[: self._inputs])
         self.rows_watched += 1
+        if self._points or self._drift.wanted or self._shift.is_active:
+            self._publish_stages(self._split_row(row, units, interval, publications))
+        if self._suspicion is not None:
+            self._suspicion.add(time_min, values[: self._inputs], values[self._inputs :])
+        return True
+
+    def _publish_stages(self, row: MeasuredRow) -> None:
+        """Publish a row that the compiled step has taken, and pass it to the stages that the step does not have."""
+        assert self._step is not None
         if self._points:
             self._publish_step(row)
         before = len(row.publications)
@@ -983,15 +1065,12 @@ class PlantPipeline:
             self._shift.update(row, self._step.work[0]["outputs"][3 * count : 4 * count].tolist(), points=self._points)
         if self._drift.wanted:
             self._update_beside(row)
-            row.publications.extend(self._drift.update(time_ns, self._predictors))
-        self._count_alarms(time_ns, row.publications, before)
+            row.publications.extend(self._drift.update(row.time_ns, self._predictors))
+        self._count_alarms(row.time_ns, row.publications, before)
         if self._board.has_unexplained:  # a lasting step
             self._leave_normal()
             self._set_learning()
             self._keep_incident(row)
-        if self._suspicion is not None:
-            self._suspicion.add(time_min, row.inputs, row.values)
-        return True
 
     def _publish_step(self, row: MeasuredRow) -> None:
         assert self._step is not None
@@ -1023,7 +1102,7 @@ class PlantPipeline:
             row.values = [nan if still else value for value, still in zip(row.values, stuck, strict=True)]
         values = row.values
         if isinstance(reference, ArxReference):
-            reference.predictions = self._predict(row)
+            reference.predictions = self._predict(row) if self._bank is None else self._predict_by_bank(row)
             reference.extrapolation_sds = [predictor.extrapolation_sd for predictor in self._predictors]
         if row.interval.is_gap:  # the input in it is unknown
             reference.restart()
@@ -1044,7 +1123,7 @@ class PlantPipeline:
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
             publications.extend(self._estimates(row, predictions, sds, scales, expected))
-        e = [whitener.update(residual) for whitener, residual in zip(self._whiteners, z, strict=True)]
+        e = innovations(self._numbers["whiteners"][0], z)
         self.rows_watched += 1
         self._quarantined = quarantined = self.signals.check_residuals(time_ns, e, scales, units, publications)
         if True in quarantined:

@@ -21,6 +21,7 @@ Snapshots are in the signals' own units.
 
 from collections.abc import Iterator, Sequence
 from math import inf, isfinite, nan, sqrt
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -103,6 +104,22 @@ class PredictorState(StoredState, frozen=True):
     copied_rows: int = 0
     learning: bool = True
     weight: float = 1.0
+
+
+class FittedModel(NamedTuple):
+    """Reference of a predictor in the signals' units, and the newest rows.
+
+    Attributes:
+        structure: structure of the model.
+        coefficients: coefficients of the output's lags, of the inputs' lags, and the offset.
+        inputs: inputs of the newest complete rows, the newest first.
+        outputs: output in the same rows.
+    """
+
+    structure: Structure
+    coefficients: list[float]
+    inputs: list[list[float]]
+    outputs: list[float]
 
 
 class ArxPredictor:
@@ -422,6 +439,21 @@ class ArxPredictor:
             if regressor is not None:
                 learn_row(regressor, scaled)
                 self._compare(regressor)
+
+    @property
+    def linear_reference(self) -> FittedModel | None:
+        """The reference and the rows before the next one; None before the fit."""
+        self.replay_buffer()
+        if self._reference is None or self._scaling is None:
+            return None
+        matrix, shift = self._scaling.unscaling(self._structure)
+        rows, (centre, spread) = self._buffer.state, self._output_scale
+        inputs = [
+            [middle + size * u for u, (middle, size) in zip(row, self._input_scales, strict=False)]
+            for row in rows.inputs
+        ]
+        outputs = [centre + spread * row[0] for row in rows.outputs]
+        return FittedModel(self._structure, (matrix @ self._reference + shift).tolist(), inputs, outputs)
 
     def adaptive_snapshot(self) -> ModelSnapshot | None:
         """Snapshot of the adaptive model, without a time; None before its first update."""

@@ -2,6 +2,7 @@
 
 import msgspec
 
+from monitor_node.baseline.arx_bank import ArxBankState
 from monitor_node.baseline.black_box_reference import BlackBoxReferenceState
 from monitor_node.baseline.predictor import PredictorState
 from monitor_node.baseline.promise import PromiseState
@@ -34,6 +35,8 @@ class TrainedState(StoredState, frozen=True):
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
         shift: tests for lasting steps, one an output; empty without them, and in states of earlier versions.
         promise: state of the promise of false alarms; None: it was stored by a version without one.
+        bank: state of the fitted models' bank; None if there is none.
+        power: deviations that would be seen, a serialized `Promise`; empty: not stated.
     """
 
     reference: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
@@ -49,6 +52,8 @@ class TrainedState(StoredState, frozen=True):
     baseline: bytes = b""
     shift: list[StepTestState] = msgspec.field(default_factory=list)
     promise: PromiseState | None = None
+    bank: ArxBankState | None = None
+    power: bytes = b""
 
 
 class KeptBaseline(StoredState, frozen=True):

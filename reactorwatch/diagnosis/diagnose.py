@@ -21,6 +21,7 @@ from reactorwatch.diagnosis.extended import extended_model
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.holdout import Errors, evaluate_holdout
 from reactorwatch.diagnosis.integration_error import looks_like_integration
+from reactorwatch.diagnosis.lasting import LastingResult, prefer_lasting
 from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
 from reactorwatch.diagnosis.law.localise import NOISY_SHARE, Localised, UnknownSearch
 from reactorwatch.diagnosis.parameter_priors import add_priors
@@ -50,7 +51,7 @@ from reactorwatch.process import effects_of
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.effect_twins import hidden_sources
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.profiles import FREE_NAME
+from reactorwatch.process.profiles import CONSTANT, FREE_NAME
 from reactorwatch.records.record import MAX_SPANS, Record
 
 LEAST_GAIN = 10.0
@@ -138,6 +139,14 @@ def diagnose(
             remarks.append(
                 "the residual is small, but not white: the course in time may be rougher than the fitted profile"
             )
+    lasting: LastingResult | None = None
+    if verdict in (NAMED, AMBIGUOUS) and _may_last(result, best, model):
+        lasting = prefer_lasting(search, result, best, model, uncertain or {})
+        if lasting is not None:
+            result, best, unknown = lasting.result, lasting.result.hypotheses[0], None
+            verdict = AMBIGUOUS if len(result.hypotheses) > 1 else NAMED
+            adequacy, location = minus_log10_p(best.fit.w, run.inputs), best.hypothesis.filter.effects[0].location
+            remarks.append("a lasting cause simulates the rows that were held out better than one that drifts")
     best.hypothesis.filter.noise, result.nominal.hypothesis.filter.noise = result.noise, result.nominal_noise
     law = unknown.law if unknown is not None and verdict == UNKNOWN and unknown.location == location else None
     if law is None:
@@ -164,7 +173,7 @@ def diagnose(
         curves = replace(curves, unknown=unknown.curve.curve)
     blind = ~np.all(np.isfinite(result.nominal.fit.innovations.prediction), axis=1)
     causes = convert_to_run_minutes(causes_of(best, covariances), record) if law is None else ()
-    parameters = adjusted_parameters(run, model, uncertain or {}, best)
+    parameters = adjusted_parameters(run, model, uncertain or {}, best, None if lasting is None else lasting.sds)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
     alternatives = _alternatives(result, best)
     experiment = (
@@ -232,6 +241,12 @@ def _locations(best: FittedHypothesis, alternatives: Sequence[FittedHypothesis])
         for effect in item.hypothesis.filter.effects:
             result.setdefault(effect.location, item.bic - best.bic)
     return result
+
+
+def _may_last(result: SearchResult, best: FittedHypothesis, model: ProcessModel) -> bool:
+    """Return true if the best hypothesis drifts, and much process noise hides how well it simulates."""
+    profiles = [profile.name for profile in best.hypothesis.profiles]
+    return profiles != [CONSTANT.name] and _seems_noisy(result, model)
 
 
 def _seems_noisy(result: SearchResult, model: ProcessModel) -> bool:

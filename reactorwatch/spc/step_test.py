@@ -256,6 +256,19 @@ class StepTests:
         _UPDATE.call(self._numbers, np.ascontiguousarray(z), self._statistics)
         return self._statistics.copy()
 
+    def sensitivity(self, signal: int) -> float:
+        """Statistic after a lasting step of one unit of a signal, without noise: what no outlier explains of it."""
+        step = self._numbers[signal]["response"][:ONSETS]
+        outlier, explained = np.diff(step, prepend=0.0), 0.0
+        for row in range(ONSETS):
+            shape = np.r_[np.zeros(row), outlier[: ONSETS - row]]
+            explained = max(explained, float(step @ shape) ** 2 / max(float(shape @ shape), 1e-300))
+        return sqrt(max(float(step @ step) - explained, 0.0))
+
+    def limit(self, signal: int) -> float:
+        """Limit of the statistic of a signal."""
+        return float(self._numbers[signal]["limit"])
+
     def restart(self) -> None:
         """Forget the rows seen."""
         self._numbers["recent"], self._numbers["whitener"]["count"] = nan, 0

@@ -154,7 +154,9 @@ class Conversion:
         board = msgspec.msgpack.decode(state.board, type=AnnunciatorState)
         if any(item is not None and item.usual is not None for item in state.watch.signals.spikes):
             return None
-        if watched is None or watched.baseline or not isinstance(watched.reference, ProcessReferenceState):
+        if watched is None or not isinstance(watched.reference, ProcessReferenceState):
+            return None
+        if watched.baseline or watched.power:
             return None
         if board.kpis_changed or board.told is None or board.kpi_minute is None:
             return None

@@ -7,6 +7,7 @@ normal equations), so that a simple law is not beaten by a richer place.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import log
 
 import numpy as np
@@ -22,7 +23,10 @@ from reactorwatch.diagnosis.fitting.fault_filter import (
 )
 from reactorwatch.diagnosis.law.shapes import LARGEST, Shape
 from reactorwatch.diagnosis.run import Run
+from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
+from reactorwatch.process.model import ProcessModel
 
 MOST_TERMS = 6
 """Largest number of functions of a correction."""
@@ -121,8 +125,7 @@ class ShapeFitter:
         return error_dynamics_between(errors, self._run, inputs, fit.evaluation.innovations, used)
 
     def _linearization(self, names: Sequence[str]) -> ErrorLinearization:
-        symbols = [self.shape.model.parameter(name).symbol for name in names]
-        return ErrorLinearization(self.ekf.model, self.ekf.noise_levels, symbols, symbols)
+        return _linearization(self.ekf.model, tuple(names)).with_noise(self.ekf.noise_levels)
 
     def estimate_noise(self, fit: ShapeFit, noise: Noise, smallest_sd: Sequence[float]) -> Noise:
         """Noise levels under a fit by maximum likelihood; `noise` has the sensors with coloured noise."""
@@ -136,7 +139,7 @@ class ShapeFitter:
 
     def _values(self, coefficients: Array) -> dict[str, float]:
         values = np.clip(self._first + coefficients, -LARGEST, LARGEST)
-        return dict(zip(self.shape.parameters, values.tolist(), strict=True))
+        return {**self.shape.scales, **dict(zip(self.shape.parameters, values.tolist(), strict=True))}
 
     def normal_equations(self, fit: ShapeFit) -> tuple[Array, Array]:
         """Information and gradient of all coefficients at a fit."""
@@ -155,6 +158,14 @@ class ShapeFitter:
         if chosen:
             result[chosen] = _solve(information, by, chosen)[0]
         return result
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def _linearization(model: ProcessModel, names: tuple[str, ...]) -> ErrorLinearization:
+    """Error equations of a model for some of its parameters; cached with what is compiled from them."""
+    symbols = [model.parameter(name).symbol for name in names]
+    unknown = NoiseLevels((1.0,) * len(model.outputs), (0.0,) * len(model.states))
+    return ErrorLinearization(model, unknown, symbols, symbols)
 
 
 def select_terms(information: Array, by: Array, charge: float) -> list[int]:

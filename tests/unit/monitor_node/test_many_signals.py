@@ -50,7 +50,7 @@ def raised(said: list[Publication]) -> list[Alarm]:
     [
         (settings(), CHARTS_OF_MANY),
         (settings(7), USUAL_CHARTS),
-        (settings(7, inputs=("u",)), CHARTS_OF_MANY),
+        (settings(7, inputs=("u", "v")), USUAL_CHARTS),
         (settings(process="plant.toml"), USUAL_CHARTS),
         (settings(process="plant.toml", reference="arx"), CHARTS_OF_MANY),
         (settings(charts=("cusum",)), ("cusum",)),
