@@ -162,8 +162,13 @@ class Plant:
             number=self._number,
             time_min=time_min,
             readings={
-                sensor.signal: self._publish(sensor.signal, sensor.reading(float(value), self._number))
-                for sensor, value in zip(self._sensors, (*inputs, *self._true_outputs(inputs)), strict=True)
+                sensor.signal: self._publish(sensor.signal, sensor.reading(float(value), self._number, beyond))
+                for sensor, value, beyond in zip(
+                    self._sensors,
+                    (*inputs, *self._true_outputs(inputs)),
+                    (*np.zeros(inputs.size).tolist(), *self._noise_beyond(inputs)),
+                    strict=True,
+                )
             },
             good=self.trouble is None,
             changes=self._changes(time_min),
@@ -287,8 +292,8 @@ class Plant:
         outputs = self._true_outputs(self._base_inputs(), self._controller_outputs)
         sensors = self._sensors[len(self._base.inputs) :]
         return {
-            sensor.signal: sensor.reading(float(value), self._number)
-            for sensor, value in zip(sensors, outputs, strict=True)
+            sensor.signal: sensor.reading(float(value), self._number, beyond)
+            for sensor, value, beyond in zip(sensors, outputs, self._noise_beyond(self._base_inputs()), strict=True)
         }
 
     def _base_inputs(self) -> Array:
@@ -333,6 +338,13 @@ class Plant:
         outputs: Array = function.results[1][0]
         return outputs
 
+    def _noise_beyond(self, inputs: Array) -> list[float]:
+        """Variances of the noise of the outputs' sensors beyond their own."""
+        if self._noise is None:
+            return [0.0] * len(self._base.outputs)
+        variances: list[float] = np.array(self._noise(inputs, self._p, self.time_min)).ravel().tolist()
+        return variances
+
     def _changes(self, time_min: float) -> tuple[FaultChange, ...]:
         """Fault changes up to now that were not reported yet."""
         changes, self._cleared = self._cleared, []
@@ -368,5 +380,6 @@ class Plant:
     def _use(self, model: ProcessModel) -> None:
         self._model, self._p = model, model.values()
         self._stepper, self._outputs = Stepper(model), ArrayFunction(model.function("outputs"))
+        self._noise = model.noise_function()
         physical = self._extend_model(self._physical(self._installed))
         self._controller_outputs = ArrayFunction(physical.function("outputs"))

@@ -1,6 +1,7 @@
 """Sensors: from a true value to a reading, with noise and quantisation."""
 
 from dataclasses import dataclass
+from math import hypot, sqrt
 
 from plant_node.noise import standard_normal
 
@@ -21,10 +22,17 @@ class Sensor:
     resolution: float
     seed: int
 
-    def reading(self, value: float, row: int) -> float:
-        """Reading in a row of the run, counted from 0, at a true value."""
-        if self.noise_sd:
-            value += self.noise_sd * standard_normal(self.seed, f"sensor {self.signal}", row)
+    def reading(self, value: float, row: int, beyond: float = 0.0) -> float:
+        """Reading in a row of the run.
+
+        Args:
+            value: true value.
+            row: index of the row, from 0.
+            beyond: variance of the noise beyond the sensor's own.
+        """
+        if self.noise_sd or beyond:
+            sd = hypot(self.noise_sd, sqrt(beyond)) if beyond else self.noise_sd
+            value += sd * standard_normal(self.seed, f"sensor {self.signal}", row)
         if self.resolution:
             value = round(value / self.resolution) * self.resolution
         return value

@@ -17,6 +17,9 @@ from tests.hidden_effect.excitation import (
 
 SEEDS_A_CLASS = 100_000
 
+NEARLY, BACKGROUND = "not quite the model", 0.2
+"""Class of plants that differ from the model beside what is hidden, and by which share of what is worth finding."""
+
 
 @dataclass(frozen=True)
 class StudyClass:
@@ -89,6 +92,7 @@ CLASSES: tuple[StudyClass, ...] = (
     *(StudyClass(name, "single", _always(NAMED_CIRCUMSTANCES[name])) for name in _HARD),
     StudyClass("hard nominal", "nominal", _HARD_QUIET),
     StudyClass("missing values", "single", _always(NAMED_CIRCUMSTANCES["missing values"])),
+    StudyClass(NEARLY, "single", _always(replace(_MEDIUM, background=BACKGROUND))),
 )
 """The seeds of a class follow from its place: a new one goes to the end."""
 

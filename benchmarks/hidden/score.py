@@ -3,11 +3,33 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import isnan, nan
+from math import isnan, nan, sqrt
 
 import numpy as np
 
-from tests.hidden_effect.judge import NOMINAL, UNKNOWN, Judged
+from tests.hidden_effect.judge import NOMINAL, UNKNOWN, WIDTH, Judged
+
+
+class Share(float):
+    """A share with the number of which it is one, so that its interval is known."""
+
+    count: int
+
+    @classmethod
+    def of(cls, found: Iterable[bool]) -> "Share":
+        """Share of the true ones; NaN of none."""
+        values = [float(item) for item in found]
+        result = cls(np.mean(values) if values else nan)
+        result.count = len(values)
+        return result
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval (Wilson 1927, J. American Statistical Association 22)."""
+        n, z = self.count, WIDTH
+        middle = (self + z * z / (2.0 * n)) / (1.0 + z * z / n)
+        half = z / (1.0 + z * z / n) * sqrt(self * (1.0 - self) / n + z * z / (4.0 * n * n))
+        return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
 @dataclass(frozen=True)
@@ -65,19 +87,19 @@ class Score:
         right = [(course, profile) for item in judged if item.first for course, profile in _courses(item)]
         return cls(
             records=len(judged),
-            first=_share(item.first for item in judged),
-            listed=_share(item.listed for item in judged),
+            first=Share.of(item.first for item in judged),
+            listed=Share.of(item.listed for item in judged),
             count=_mean([item.count for item in ended]),
-            wrong=_share(item.wrong for item in judged),
-            unknown=_share(item.verdict == UNKNOWN for item in judged),
-            unknown_in_place=_share(item.verdict == UNKNOWN and item.right_place for item in judged),
-            right_place=_share(item.right_place for item in judged),
-            same_profile=_share(course == profile for course, profile in right),
+            wrong=Share.of(item.wrong for item in judged),
+            unknown=Share.of(item.verdict == UNKNOWN for item in judged),
+            unknown_in_place=Share.of(item.verdict == UNKNOWN and item.right_place for item in judged),
+            right_place=Share.of(item.right_place for item in judged),
+            same_profile=Share.of(course == profile for course, profile in right),
             size=_two([error for item in judged for error in item.size_errors], 0.9),
             curve=_two([error for item in judged for error in item.curve_errors], 0.9),
-            size_inside=_share(inside for item in judged for inside in item.size_inside),
+            size_inside=Share.of(inside for item in judged for inside in item.size_inside),
             onset=_two([error for item in judged for error in item.onset_errors], 0.9),
-            onset_inside=_share(inside for item in judged for inside in item.onset_inside),
+            onset_inside=Share.of(inside for item in judged for inside in item.onset_inside),
             held_out=_two([item.held_out / item.drawn for item in ended if not isnan(item.drawn)], 0.9),
             held_out_in_sd=_two([item.held_out for item in ended], 0.9),
             drawn_in_sd=_two([item.drawn for item in ended if not isnan(item.drawn)], 0.9),
@@ -97,10 +119,6 @@ def confusion(judged: Sequence[Judged]) -> list[tuple[str, list[tuple[str, int]]
 
 def _courses(item: Judged) -> Iterable[tuple[str, str]]:
     return zip(item.courses, item.profiles, strict=True)
-
-
-def _share(found: Iterable[bool]) -> float:
-    return _mean([float(item) for item in found])
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -1,10 +1,10 @@
 """The tables of the study, for a terminal and for a page."""
 
 from collections.abc import Callable, Mapping, Sequence
-from math import isfinite, isnan
+from math import isfinite, isnan, nan
 
 from benchmarks.hidden.classes import CLASSES
-from benchmarks.hidden.score import Score, confusion
+from benchmarks.hidden.score import Score, Share, confusion
 from reactorwatch.diagnosis.result import UNKNOWN
 from tests.hidden_effect.judge import Judged
 
@@ -12,8 +12,11 @@ Cell = Callable[[Score], str]
 
 
 def percent(share: float) -> str:
-    """A share as a percentage; a dash if there is nothing."""
-    return "–" if isnan(share) else f"{100.0 * share:.1f}"
+    """A share as a percentage, with its 95 % interval if the number is known; a dash if there is nothing."""
+    if isnan(share):
+        return "–"
+    low, high = share.interval if isinstance(share, Share) else (nan, nan)
+    return f"{100.0 * share:.1f}" + ("" if isnan(low) else f" ({100.0 * low:.0f}–{100.0 * high:.0f})")
 
 
 def number(value: float, digits: int = 2) -> str:

@@ -21,6 +21,9 @@ from reactorwatch.errors import InputError
 MODELS = ("arx", "oe", "armax", "bj", "narx", "noe")
 ORDERS = (1, 2, 3, 4)
 SETTLE = 50
+_UNCERTAIN = "[parameters]\n" + "".join(f"k{i} = {{ value = 3.0, sd = 1.5 }}\n" for i in (1, 2, 3, 4))
+"""The constants of a rig are of this order; nothing more is known of them."""
+
 _TANKS = ("--time-unit", "s", "--input", "pump_V", "--output", "level_V")
 
 
@@ -51,27 +54,28 @@ def measure_tanks(folder: Path, _seed: int) -> list[Row]:
 
 
 def _equations(first: Path, second: Path, folder: Path) -> Row:
-    """Torricelli's equations, and what `diagnose` adds to them."""
+    """Torricelli's equations with constants that are known to a half, and what `diagnose` adds to them."""
     process = folder / "rig.toml"
-    process.write_text(
-        'name = "rig"\nequations = "cascaded_tanks"\n[time]\ncolumn = "time_s"\nunit = "s"\n'
-        '[[signals]]\nname = "u"\ncolumn = "pump_V"\nrole = "input"\nunit = "V"\n'
-        '[[signals]]\nname = "x2"\ncolumn = "level_V"\nrole = "output"\nunit = "V"\n',
-        encoding="utf-8",
-    )
+    process.write_text(_describe("cascaded_tanks") + _UNCERTAIN, encoding="utf-8")
     report = folder / "report"
     found = json.loads(run("diagnose", str(first), "--process", str(process), "-o", str(report), "--json"))
     named = " + ".join(item["cause"] for item in found["causes"]) or found["location"]
-    process.write_text(
-        process.read_text(encoding="utf-8").replace('"cascaded_tanks"', f'"{report / "extended.json"}"'),
-        encoding="utf-8",
-    )
+    process.write_text(_describe(str(report / "extended.json")), encoding="utf-8")
     out = folder / "simulated.csv"
     said = json.loads(
         run("simulate", str(second), "--process", str(process), "--settle", str(SETTLE), "-o", str(out), "--json")
     )
     error = said["rmse"]["x2"]["value"]
     return Row("reactorwatch diagnose, equations", f"{found['verdict']}: {named}", {"simulation, V": f"{error:.3f}"})
+
+
+def _describe(equations: str) -> str:
+    """Description of the rig."""
+    return (
+        f'name = "rig"\nequations = "{equations}"\n[time]\ncolumn = "time_s"\nunit = "s"\n'
+        '[[signals]]\nname = "u"\ncolumn = "pump_V"\nrole = "input"\nunit = "V"\n'
+        '[[signals]]\nname = "x2"\ncolumn = "level_V"\nrole = "output"\nunit = "V"\n'
+    )
 
 
 def measure_reactor(file: Path, _seed: int) -> list[Row]:

@@ -4,7 +4,7 @@ import argparse
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import beta, chi2
@@ -60,7 +60,7 @@ def watch(plant: Plant) -> Outcome:
     seed = SEED + 10 * plant.kind + plant.moves + SEED_STEP * plant.set
     flow = list(INPUTS.values())[plant.moves]
     record = simulate(KINDS[plant.kind], flow, seed, warmer_from_min=ONSET_MIN if plant.is_faulty else None)
-    settings = {} if plant.rate is None else {"false_alarms_per_30_days": plant.rate}
+    settings: dict[str, Any] = {} if plant.rate is None else {"false_alarms_per_30_days": plant.rate}
     found = rw.backtest(record, **settings)
     kept = found.promise is None or found.promise["kept"]
     return Outcome([item.raised_min for item in found.alarms], found.expected_false_alarms, kept)

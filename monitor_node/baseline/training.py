@@ -84,9 +84,9 @@ class TrainingResult(NamedTuple):
         checks: checks of the training.
         refused: reason to start again; empty if the training is usable.
         left_out: signals that cannot be monitored, with the reason.
-        outliers: number of single values of each output that were left out.
         responses: response of each residual to a lasting step of one unit of its output, shape (outputs, rows); NaN
             where there is no model; None for equations.
+        outliers: number of single values of each output that were left out.
     """
 
     reference: Reference
@@ -98,8 +98,8 @@ class TrainingResult(NamedTuple):
     checks: list[Check]
     refused: str
     left_out: dict[str, str]
-    outliers: list[int]
     responses: Array | None
+    outliers: list[int]
 
 
 MOST_OUT_OF_RANGE = 1.0 / 3.0
@@ -253,10 +253,9 @@ class Training:
         inputs = np.where([name not in left_out for name in self._config.inputs], inputs, np.nan)
         values = np.hstack([inputs, np.where(disturbed, np.nan, measured)])
         measured = np.where(usable, measured, np.nan)
-        responses = self._step_responses(reference)
-        outliers = [item.outliers for item in screenings]
+        responses, outliers = self._step_responses(reference), [item.outliers for item in screenings]
         return TrainingResult(
-            reference, learned, z, e, measured, values, checks, refused, left_out, outliers, responses
+            reference, learned, z, e, measured, values, checks, refused, left_out, responses, outliers
         )
 
     def _step_responses(self, reference: Reference) -> Array | None:

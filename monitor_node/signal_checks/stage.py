@@ -125,12 +125,6 @@ class SignalChecks:
         for check in self._checks:
             check.start(values, e, arl0)
 
-    def learn_spike_rates(self, counts: Sequence[int], rows: int, period_ns: float, arl0: float) -> None:
-        """Learn how often spikes are usual; arguments as for `SpikeCheck.learn_rates`."""
-        for check in self._checks:
-            if isinstance(check, SpikeCheck):
-                check.learn_rates(counts, rows, period_ns, arl0)
-
     def relative_rates(
         self, learned: Sequence[Prewhitening], evaluated: Sequence[bool], arl0: float, errors: TrainingErrors
     ) -> Array:
@@ -144,6 +138,12 @@ class SignalChecks:
         """
         of_checks = (check.relative_rates(learned, arl0, errors) for check in self._checks if check.can_be_false)
         return sum((rates[:, list(evaluated)].sum(axis=1) for rates in of_checks), np.zeros(len(errors.mean)))
+
+    def learn_spike_rates(self, counts: Sequence[int], rows: int, period_ns: float, arl0: float) -> None:
+        """Learn how often spikes are usual; arguments as for `SpikeCheck.learn_rates`."""
+        for check in self._checks:
+            if isinstance(check, SpikeCheck):
+                check.learn_rates(counts, rows, period_ns, arl0)
 
     # --- state -----------------------------------------------------------------------------------------------
 
@@ -181,6 +181,14 @@ class SignalChecks:
             elif check.name in others:
                 check.restore(state.others[check.name])
         self.silence.arm(now_ns)
+
+    def restore_limits(self, state: SignalChecksState) -> None:
+        """Restore what was learned in a training; the data timeouts stay as they are."""
+        for check in self._checks:
+            if check.name in FIELDS and check is not self.silence:
+                check.restore(getattr(state, FIELDS[check.name]))
+            elif check.name in state.others:
+                check.restore(state.others[check.name])
 
     # --- rows ------------------------------------------------------------------------------------------------
 

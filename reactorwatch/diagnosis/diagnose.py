@@ -21,6 +21,7 @@ from reactorwatch.diagnosis.extended import extended_model
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.holdout import Errors, evaluate_holdout
 from reactorwatch.diagnosis.integration_error import looks_like_integration
+from reactorwatch.diagnosis.lasting import LastingResult, prefer_lasting
 from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
 from reactorwatch.diagnosis.law.localise import NOISY_SHARE, Localised, UnknownSearch
 from reactorwatch.diagnosis.parameter_priors import add_priors
@@ -40,6 +41,7 @@ from reactorwatch.diagnosis.result import (
 )
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.cause_prior import FROM_BEGINNING
+from reactorwatch.diagnosis.search.noise_growth import search_noise_growth
 from reactorwatch.diagnosis.search.noise_masking import search_single_cause
 from reactorwatch.diagnosis.search.pairs import search_pairs
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult, smallest_noise
@@ -49,7 +51,7 @@ from reactorwatch.process import effects_of
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.effect_twins import hidden_sources
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.profiles import FREE_NAME
+from reactorwatch.process.profiles import CONSTANT, FREE_NAME
 from reactorwatch.records.record import MAX_SPANS, Record
 
 LEAST_GAIN = 10.0
@@ -111,7 +113,7 @@ def diagnose(
     single = result.best
     if not (np.any(minus_log10_p(single.fit.w, run.inputs) >= DOUBTFUL) and unknowns.is_simple):
         result = search_pairs(search, result)
-    result = _drop_hidden(result, hidden)
+    result = _drop_hidden(search_noise_growth(search, result), hidden)
     best = result.best if result.nominal.bic - result.best.bic >= LEAST_GAIN else result.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
     verdict = _decide_verdict(result, best)
@@ -121,7 +123,8 @@ def diagnose(
     remarks = [*_describe_record(record), *_describe_outliers(whole, run)]
     unknown: Localised | None = None
     if verdict == UNKNOWN or np.any(adequacy >= DOUBTFUL) or (best.label and _may_be_unknown(result, best, model)):
-        unknown = unknowns.localise()
+        white = best.label and not np.any(adequacy >= DOUBTFUL) and not _seems_noisy(result, model)
+        unknown = unknowns.localise(best.bic if white else np.inf)
         by_source = verdict == UNKNOWN and not np.any(adequacy >= DOUBTFUL)
         if verdict == UNKNOWN or _is_unknown(unknown, result, best, run, float(np.max(adequacy))):
             verdict, best = UNKNOWN, result.nominal
@@ -136,6 +139,14 @@ def diagnose(
             remarks.append(
                 "the residual is small, but not white: the course in time may be rougher than the fitted profile"
             )
+    lasting: LastingResult | None = None
+    if verdict in (NAMED, AMBIGUOUS) and _may_last(result, best, model):
+        lasting = prefer_lasting(search, result, best, model, uncertain or {})
+        if lasting is not None:
+            result, best, unknown = lasting.result, lasting.result.hypotheses[0], None
+            verdict = AMBIGUOUS if len(result.hypotheses) > 1 else NAMED
+            adequacy, location = minus_log10_p(best.fit.w, run.inputs), best.hypothesis.filter.effects[0].location
+            remarks.append("a lasting cause simulates the rows that were held out better than one that drifts")
     best.hypothesis.filter.noise, result.nominal.hypothesis.filter.noise = result.noise, result.nominal_noise
     law = unknown.law if unknown is not None and verdict == UNKNOWN and unknown.location == location else None
     if law is None:
@@ -162,7 +173,7 @@ def diagnose(
         curves = replace(curves, unknown=unknown.curve.curve)
     blind = ~np.all(np.isfinite(result.nominal.fit.innovations.prediction), axis=1)
     causes = convert_to_run_minutes(causes_of(best, covariances), record) if law is None else ()
-    parameters = adjusted_parameters(run, model, uncertain or {}, best)
+    parameters = adjusted_parameters(run, model, uncertain or {}, best, None if lasting is None else lasting.sds)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
     alternatives = _alternatives(result, best)
     experiment = (
@@ -230,6 +241,12 @@ def _locations(best: FittedHypothesis, alternatives: Sequence[FittedHypothesis])
         for effect in item.hypothesis.filter.effects:
             result.setdefault(effect.location, item.bic - best.bic)
     return result
+
+
+def _may_last(result: SearchResult, best: FittedHypothesis, model: ProcessModel) -> bool:
+    """Return true if the best hypothesis drifts, and much process noise hides how well it simulates."""
+    profiles = [profile.name for profile in best.hypothesis.profiles]
+    return profiles != [CONSTANT.name] and _seems_noisy(result, model)
 
 
 def _seems_noisy(result: SearchResult, model: ProcessModel) -> bool:

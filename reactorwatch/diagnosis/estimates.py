@@ -37,7 +37,7 @@ def refine_parameters(search: Search, best: FittedHypothesis) -> tuple[FittedHyp
         for number, sd in numbers.items():
             share = sd / max(float(np.sqrt(whole[number, number])), 1e-300)
             share = (
-                share if effect.is_discontinuous else max(share, 1.0)
+                max(share, 1.0) if effect.has_derivative else share
             )  # the derivatives' spread is marginal over the others
             whole[number] *= share
             whole[:, number] *= share
@@ -45,17 +45,29 @@ def refine_parameters(search: Search, best: FittedHypothesis) -> tuple[FittedHyp
 
 
 def adjusted_parameters(
-    run: Run, model: ProcessModel, uncertain: Mapping[str, float], best: FittedHypothesis
+    run: Run,
+    model: ProcessModel,
+    uncertain: Mapping[str, float],
+    best: FittedHypothesis,
+    sds: Mapping[str, float] | None = None,
 ) -> dict[str, AdjustedParameter]:
-    """Estimates of the uncertain parameters under the best hypothesis, marginal over its parameters."""
-    sds = best.hypothesis.offset_sds(run, best.fit) if uncertain else {}
+    """Estimates of the uncertain parameters under the best hypothesis, marginal over its parameters.
+
+    Args:
+        run: the record.
+        model: process model with the stated values.
+        uncertain: stated standard deviations, by name.
+        best: best hypothesis.
+        sds: standard deviations of the estimates, where they are parameters of its model; None: they are its states.
+    """
+    if sds is None:
+        sds = best.hypothesis.offset_sds(run, best.fit) if uncertain else {}
     offsets = best.hypothesis.offsets(best.fit)
     result = {}
     for name, stated_sd in uncertain.items():
-        item = model.parameter(name)
-        result[name] = AdjustedParameter(
-            item.value, stated_sd, Estimate(item.value + offsets[name], sds[name], item.unit)
-        )
+        item, about = model.parameter(name), best.hypothesis.filter.model.parameter(name)
+        estimate = Estimate(about.value + offsets.get(name, 0.0), sds[name], item.unit)
+        result[name] = AdjustedParameter(item.value, stated_sd, estimate)
     return result
 
 

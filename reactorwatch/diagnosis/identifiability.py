@@ -8,6 +8,7 @@ An effect with internal states is evaluated at sizes, as it is not linear.
 - Two causes are alike if at `TIMES` their smallest size the best imitation of one by the other costs less than `LISTED`
   in BIC, with that probability. In a group each two are alike.
 - A cause is invisible if no size within its bounds is seen.
+- The noise of a sensor counts as noise that sets in in the middle of the record, and is like no other cause.
 """
 
 from collections.abc import Sequence
@@ -24,8 +25,9 @@ from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
 from reactorwatch.diagnosis.result import LISTED
 from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.noise_growth import LEAST_GAIN
 from reactorwatch.diagnosis.search.search import Search, smallest_noise
-from reactorwatch.process.effect import Effect
+from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import ProcessModel
 
 POWER, TIMES = 0.9, 3.0
@@ -39,6 +41,9 @@ levels of its own, with which its filter follows part of a deviation."""
 
 SIZES, SMALLEST, LARGEST = 10, 1e-2, 30.0
 """Sizes at which an effect with internal states is evaluated; the first and the last, in its typical sizes."""
+
+NOISE_SIZES = 200
+"""Sizes at which further noise is evaluated, from `SMALLEST` to `LARGEST` of the usual noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +93,14 @@ def identifiability(model: ProcessModel, effects: Sequence[Effect], run: Run) ->
     causes = [
         *_static(search, nominal.hypothesis, nominal.fit, wanted),
         *(_dynamic(search, nominal.fit, effect, wanted) for effect in search.screen.dynamic_effects),
+        *(_noise(search, effect) for effect in search.noise_effects),
     ]
     order = {effect.name: index for index, effect in enumerate(effects)}
     causes.sort(key=lambda item: order[item.effect.name])
-    return Identifiability(tuple(causes), _groups([item for item in causes if item.is_visible]))
+    # Noise is seen in squares of the innovations, all others in the innovations themselves.
+    return Identifiability(
+        tuple(causes), _groups([item for item in causes if item.is_visible and not item.effect.is_noise])
+    )
 
 
 def _least_noncentrality(threshold: float) -> float:
@@ -112,6 +121,21 @@ def _static(search: Search, hypothesis: Hypothesis, fit: Fit, wanted: float) -> 
         smallest = size if signs else float("nan")
         result.append(Visibility(effect, smallest, TIMES * size * (signs or [1.0])[0] * g))
     return result
+
+
+def _noise(search: Search, effect: Effect) -> Visibility:
+    """Noise of a sensor that sets in in the middle of the run: the likelihood ratio of two variances against one."""
+    assert isinstance(effect, SensorEffect)
+    index = search.screen.model.output_names.index(effect.output)
+    sd = float(search.noise.sensor_sd(search.screen.model.output_names)[index])
+    half = 0.5 * np.count_nonzero(np.isfinite(search.run.measured[:, index]))
+    sizes = sd * np.geomspace(SMALLEST, LARGEST, NOISE_SIZES)
+    ratio = 1.0 + np.square(sizes / sd)
+    gains = 2.0 * half * np.log(0.5 * (1.0 + ratio)) - half * np.log(ratio)
+    wanted = _least_noncentrality(LEAST_GAIN + 2.0 * log(search.run.values))
+    seen = np.flatnonzero((gains >= wanted) & (sizes <= effect.upper))
+    smallest = float(sizes[seen[0]]) if seen.size else float("nan")
+    return Visibility(effect, smallest, np.zeros(0))
 
 
 def _dynamic(search: Search, nominal: Fit, effect: Effect, wanted: float) -> Visibility:

@@ -48,7 +48,7 @@ LARGEST_SHARE = 0.05
 """Maximum first reach, as a fraction of the record."""
 
 SIZE_SHARE = 0.005
-"""First reach of a discontinuous magnitude, as a fraction of it."""
+"""First reach of a magnitude without a derivative, as a fraction of it."""
 
 
 def refine(
@@ -70,15 +70,15 @@ def refine(
     ):
         rough: dict[int, float] = {}
         names = [item.name for item in profile.nonlinear_parameters]
-        if effect.is_discontinuous and profile.n_linear == 1:
+        if not effect.has_derivative and profile.n_linear == 1:
             reach = SIZE_SHARE * abs(float(best.fit.parameters[index][0]))
             best, rough[0] = _Scan(search, index, 0, reach, (effect.lower, effect.upper)).refine(best)
         if "onset" in names:
             if isinstance(profile, Step) and effect in search.screen.dynamic_effects:
                 best = _leave_local_optimum(search, best, index)
             number = profile.n_linear + names.index("onset")
-            # A discontinuous effect has no derivatives, hence no standard deviation from them.
-            sd = 0.0 if effect.is_discontinuous else float(sds[index][number])
+            # Without derivatives there is no standard deviation from them.
+            sd = float(sds[index][number]) if effect.has_derivative else 0.0
             reach = min(float(np.hypot(sd, profile.period_min)), LARGEST_SHARE * search.run.span_min)
             bounds = (profile.start_min, profile.end_min)
             best, sd = _Scan(search, index, number, reach, bounds).refine(best)

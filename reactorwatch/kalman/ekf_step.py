@@ -42,6 +42,8 @@ def row_function(model: ProcessModel) -> ca.Function:
         x, P = _reset(model, x, P, u, p, now)
     inside = ca.logic_and(ca.mmin(x - _bounds(model)[0]) >= 0, ca.mmin(_bounds(model)[1] - x) >= 0)
     expected, H = output_function(model)(x, u, p, now)
+    beyond = model.noise_function()
+    r = r if beyond is None else r + beyond(u, p, now)
     covariance = H @ P @ H.T + ca.diag(r)
     present = ca.fabs(measured) < inf  # false for NaN; CasADi takes x == x for true
     residual = ca.if_else(present, measured - expected, 0.0)

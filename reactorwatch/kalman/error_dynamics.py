@@ -136,6 +136,7 @@ class ErrorLinearization:
             predicted, F, G, spread = self._predict(x[:-1], inputs[:-1], time_min, p, uncertainty)
             H, D = self._code.outputs_by.map(predicted, inputs[1:], p, time_min[1:])
             P, residual = np.ascontiguousarray(P), np.ascontiguousarray(residual)  # one kernel is compiled for all
+            R = np.tile(R, (len(F), 1)) + self._code.noise_beyond(inputs[1:], p, time_min[1:])
             whitening, w, K = _normalize(F, H, P, q, np.diff(time_min), spread, R, residual, used)
         if began is not None:
             restarted = began[1:, None, None]
@@ -245,6 +246,15 @@ class _Code:
     def outputs_by(self) -> CompiledFunction:
         return CompiledFunction(output_derivatives(self.model, self.output_symbols), shared=[2])
 
+    def noise_beyond(self, inputs: Array, p: Array, time_min: Array) -> Array | float:
+        """Variances of the sensors' noise beyond the usual, shape (rows, n_y), or 0."""
+        return 0.0 if self._noise is None else self._noise.map(inputs, p, time_min)[0][:, :, 0]
+
+    @cached_property
+    def _noise(self) -> CompiledFunction | None:
+        function = self.model.noise_function()
+        return None if function is None else CompiledFunction(function, shared=[1])
+
     @cached_property
     def outputs(self) -> CompiledFunction:
         x, u, p, t, y = self.model.output_expressions()
@@ -263,7 +273,7 @@ def _normalize(
     residual: Array,
     used: NDArray[np.bool_],
 ) -> tuple[Array, Array, Array]:
-    """Whitening matrix, normalised innovation and gain of each interval.
+    """Whitening matrix, normalised innovation and gain of each interval; R has the shape (intervals, n_y).
 
     Where the filter has diverged these are meaningless; pivots are kept positive.
     """
@@ -295,7 +305,7 @@ def _normalize(
         for i in range(n_y):
             present[i] = np.isfinite(residual[k + 1, i])
             for j in range(n_y):
-                value = R[i] if i == j else 0.0
+                value = R[k, i] if i == j else 0.0
                 for m in range(n_x):
                     value += HP[i, m] * H[k, j, m]
                 S[i, j] = value
@@ -326,7 +336,7 @@ def _normalize(
                     value = 0.0
                     for m in range(n_x):
                         value += P[k + 1, i, m] * H[k, j, m]
-                    K[k, i, j] = value / R[j]
+                    K[k, i, j] = value / R[k, j]
     return whitening, w, K
 
 

@@ -64,6 +64,7 @@ class Effect(ABC):
         delays_output: the output that the effect delays by m, if it does nothing else; None: no such effect.
         is_traced: whether the monitor compares it with others after an alarm; if not, it is left to a diagnosis.
         is_source: whether it adds an unmodelled rate to a balance, which has a location but no physical meaning.
+        is_noise: whether it changes the noise of a sensor and nothing else.
         constants: constants of its own; `add_constants` adds them to a model.
     """
 
@@ -83,7 +84,13 @@ class Effect(ABC):
     delays_output: ClassVar[str | None] = None
     is_traced: ClassVar[bool] = True
     is_source: ClassVar[bool] = False
+    is_noise: ClassVar[bool] = False
     constants: ClassVar[tuple[EffectConstant, ...]] = ()
+
+    @property
+    def has_derivative(self) -> bool:
+        """True if the innovations have a derivative by the size."""
+        return not (self.is_discontinuous or self.is_noise)
 
     @abstractmethod
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
@@ -210,17 +217,5 @@ class SensorEffect(Effect):
             )
         value = model.outputs[model.output_names.index(self.output)].expression
         extended, reading = self.sense(model, value, size)
-        outputs = (replace(item, expression=reading) if item.name == self.output else item for item in model.outputs)
+        outputs = (replace(item, expression=reading) if item.name == self.output else item for item in extended.outputs)
         return replace(extended, outputs=tuple(outputs))
-
-
-class ReadingEffect(SensorEffect):
-    """An effect of a sensor without states: its reading is a function of the true value."""
-
-    @abstractmethod
-    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """Reading of the sensor at a true value."""
-
-    def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
-        """See `SensorEffect`."""
-        return model, self.reading(value, size)

@@ -42,7 +42,9 @@ class EffectChanges:
         x, u, p = extended.arguments()
         clock = [extended.clock.now, extended.clock.middle]
         resets = ca.vertcat(*(extended.resets.get(state.name, state.symbol) for state in extended.states))
-        shown = ca.vertcat(*extended.rhs, *(item.expression for item in extended.outputs), resets, extended.time_offset)
+        noise = (ca.SX(0) if item.noise_variance is None else item.noise_variance for item in extended.outputs)
+        outputs = (*(item.expression for item in extended.outputs), *noise)
+        shown = ca.vertcat(*extended.rhs, *outputs, resets, extended.time_offset)
         self._function = ca.Function("changed", [x, u, p, *clock, size], [ca.densify(shown)])
         self._slope = ca.Function("slope", [x, u, p, *clock, size], [ca.densify(ca.jacobian(shown, size))])
 

@@ -68,9 +68,9 @@ class _ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     parameters: dict[str, float] = {}  # msgspec copies the default
     zero_ns: int = 0
     laws: tuple[_LawFile, ...] = ()
-    uncertain: tuple[str, ...] = ()
     equations: dict[str, Any] | None = None
     process: dict[str, Any] | None = None
+    uncertain: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,10 @@ class ExtendedModel:
         parameters: values that differ from the model's nominal ones, by name, in their units.
         zero_ns: time from which the minutes are counted; 0: unknown.
         laws: laws of what was unknown, which act all the time.
-        uncertain: see `ProcessModel`.
         equations: the model with all of these in it, where the catalogue lacks the model; None: the catalogue has it.
         description: description of the process, as in its file (`reactorwatch.description.toml_file`); None: it has
             the signals of the equations.
+        uncertain: see `ProcessModel`.
     """
 
     name: str
@@ -94,9 +94,9 @@ class ExtendedModel:
     parameters: Mapping[str, float] = field(default_factory=dict)
     zero_ns: int = 0
     laws: tuple[ExtendedLaw, ...] = ()
-    uncertain: tuple[str, ...] = ()
     equations: ProcessModel | None = None
     description: Mapping[str, Any] | None = None
+    uncertain: tuple[str, ...] = ()
 
     def build(self, models: Sequence[Callable[[], ProcessModel]] = MODELS) -> ProcessModel:
         """Build the model; its clock is that of the record.
@@ -107,19 +107,17 @@ class ExtendedModel:
         Raises:
             InputError: there is no such model, or it cannot have these parameters or effects.
         """
-        if self.equations is not None:
-            return self._with_uncertain(self.equations)
+        model = self._build_from(models) if self.equations is None else self.equations
+        return replace(model, uncertain=self.uncertain) if self.uncertain else model
+
+    def _build_from(self, models: Sequence[Callable[[], ProcessModel]]) -> ProcessModel:
         nominal = {item.name: item for item in (make() for make in models)}
         if self.name not in nominal:
             raise InputError(f"unknown model {self.name!r} (valid: {', '.join(nominal)})")
         try:
-            model = extend(nominal[self.name].with_values(self.parameters), self.effects, self.laws)
+            return extend(nominal[self.name].with_values(self.parameters), self.effects, self.laws)
         except ValueError as error:
             raise InputError(str(error)) from error
-        return self._with_uncertain(model)
-
-    def _with_uncertain(self, model: ProcessModel) -> ProcessModel:
-        return replace(model, uncertain=self.uncertain) if self.uncertain else model
 
     def rebase(self, zero_ns: int) -> "ExtendedModel":
         """Copy with minutes counted from another time; unchanged where its own zero is unknown."""
@@ -139,9 +137,9 @@ class ExtendedModel:
             "effects": [str(item) for item in self.effects],
             "zero_ns": self.zero_ns,
             **({"laws": [_law_object(item) for item in self.laws]} if self.laws else {}),
-            **({"uncertain": list(self.uncertain)} if self.uncertain else {}),
             **({} if self.equations is None else {"equations": store_equations(self.equations)}),
             **({} if self.description is None else {"process": dict(self.description)}),
+            **({"uncertain": list(self.uncertain)} if self.uncertain else {}),
         }
 
 
@@ -205,11 +203,7 @@ def parse_extended_model(
     if file.equations is not None:
         equations = build_equations(file.model, file.equations)
         return ExtendedModel(
-            file.model,
-            zero_ns=file.zero_ns,
-            uncertain=file.uncertain,
-            equations=equations,
-            description=file.process,
+            file.model, zero_ns=file.zero_ns, equations=equations, description=file.process, uncertain=file.uncertain
         )
     if effects is None:
         effects = named_effects(ExtendedModel(file.model).build(models))
@@ -219,8 +213,8 @@ def parse_extended_model(
         file.parameters,
         file.zero_ns,
         tuple(item.law() for item in file.laws),
-        file.uncertain,
         description=file.process,
+        uncertain=file.uncertain,
     )
     extended.build(models)  # reports invalid combinations now
     return extended
@@ -254,7 +248,7 @@ def extended_model_of(
         for item in (nominal.parameters if nominal else ())
         if values[item.name] != item.value
     }
-    return ExtendedModel(model.name, tuple(found), differing, zero_ns, model.laws, model.uncertain)
+    return ExtendedModel(model.name, tuple(found), differing, zero_ns, model.laws, uncertain=model.uncertain)
 
 
 def are_named(extended: ExtendedModel) -> bool:

@@ -2,7 +2,7 @@
 
 | of | effects |
 |---|---|
-| an output | `.bias`, `.gain`, `.lag`, `.delay`, `.stuck` |
+| an output | `.bias`, `.gain`, `.lag`, `.delay`, `.stuck`, `.noise` |
 | an input | `.gain`, `.offset`, `.lag`, `.delay`, `.stiction` |
 | a parameter | `.deviation` from its value, as a share of it; in its unit where its value is 0 |
 | a state | `.source`, an unmodelled rate in its balance |
@@ -22,7 +22,14 @@ from reactorwatch.arrays import Array
 from reactorwatch.process.effect import Effect, EffectConstant, ParameterEffect, ParameterShift
 from reactorwatch.process.input_effects import InputDelay, InputGain, InputLag, InputOffset, InputStiction
 from reactorwatch.process.model import Output, Parameter, ProcessModel, Variable
-from reactorwatch.process.output_effects import OutputBias, OutputDelay, OutputGain, OutputLag, StuckOutput
+from reactorwatch.process.output_effects import (
+    OutputBias,
+    OutputDelay,
+    OutputGain,
+    OutputLag,
+    OutputNoise,
+    StuckOutput,
+)
 
 TIMES_MIN = (0.05, 0.3, 2.0, 10.0)
 """Lags and delays from which fits start."""
@@ -214,6 +221,17 @@ def _of_output(model: ProcessModel, output: Output, scale: float) -> list[Effect
             label=f"stuck {name}",
             larger=f"{name} is stuck to {{}} %",
             constants=(stuck_at,),
+            **at,
+        ),
+        _make(
+            OutputNoise,
+            f"{name}.noise",
+            f"The measured {name} has further noise with a standard deviation of m.",
+            label=f"noisier sensor of {name}",
+            larger=f"{name} has further noise of {{}}{in_unit}",
+            unit=unit,
+            upper=reach,
+            typical=TYPICAL_SCALES * scale,
             **at,
         ),
     ]

@@ -71,11 +71,20 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class Output:
-    """A measured quantity, as an expression of states, inputs and parameters."""
+    """A measured quantity.
+
+    Attributes:
+        name: name of the quantity.
+        unit: unit of its values.
+        expression: expression of states, inputs, parameters and time.
+        noise_variance: variance of its sensor's noise beyond the usual, an expression of inputs, parameters and time;
+            None: there is none.
+    """
 
     name: str
     unit: str
     expression: ca.SX
+    noise_variance: ca.SX | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,9 +143,9 @@ class ProcessModel:
             shorter.
         places: where something unknown may act; empty: they follow from the equations (`process.places`).
         laws: laws of what was unknown, which are part of the equations already.
+        effects: effects of its own; None: those of the catalogue under its name.
         uncertain: what a filter of this model estimates beside the states, see `kalman.uncertain_model`; no part of
             the equations.
-        effects: effects of its own; None: those of the catalogue under its name.
     """
 
     name: str
@@ -153,8 +162,8 @@ class ProcessModel:
     time_offset: ca.SX = field(default_factory=lambda: ca.SX(0))
     places: tuple[Place, ...] = ()
     laws: tuple["ExtendedLaw", ...] = ()
-    uncertain: tuple[str, ...] = ()
     effects: tuple["Effect", ...] | None = None
+    uncertain: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.rhs) != len(self.states):
@@ -282,14 +291,21 @@ class ProcessModel:
     def _map_expressions(self, change: Callable[[list[ca.SX]], list[ca.SX]]) -> "ProcessModel":
         """Copy with all expressions changed."""
         shown = [output.expression for output in self.outputs]
-        named = (self.terms, self.at_rest, self.resets)
-        of_states = (item for items in named for item in items.values())
-        changed = iter(change([*self.rhs, *shown, self.time_offset, *of_states]))
+        noisy = {item.name: item.noise_variance for item in self.outputs if item.noise_variance is not None}
+        named = (noisy, self.terms, self.at_rest, self.resets)
+        others = (item for items in named for item in items.values())
+        changed = iter(change([*self.rhs, *shown, self.time_offset, *others]))
+        rhs = tuple(next(changed) for _ in self.rhs)
+        expressions, time_offset = [next(changed) for _ in self.outputs], next(changed)
+        noisy = {name: next(changed) for name in noisy}
         return replace(
             self,
-            rhs=tuple(next(changed) for _ in self.rhs),
-            outputs=tuple(replace(output, expression=next(changed)) for output in self.outputs),
-            time_offset=next(changed),
+            rhs=rhs,
+            outputs=tuple(
+                replace(output, expression=expression, noise_variance=noisy.get(output.name))
+                for output, expression in zip(self.outputs, expressions, strict=True)
+            ),
+            time_offset=time_offset,
             terms={name: next(changed) for name in self.terms},
             at_rest={name: next(changed) for name in self.at_rest},
             resets={name: next(changed) for name in self.resets},
@@ -347,6 +363,15 @@ class ProcessModel:
             ["x", "u", "p", "t", "t_middle"],
             ["rhs", "y"],
         )
+
+    def noise_function(self) -> ca.Function | None:
+        """Variances of the sensors' noise beyond the usual, (u, p, t) -> (n_y,); None: there are none."""
+        if all(output.noise_variance is None for output in self.outputs):
+            return None
+        _, u, p = self.arguments()
+        beyond = [ca.SX(0) if item.noise_variance is None else item.noise_variance for item in self.outputs]
+        (variances,) = ca.substitute([ca.vertcat(*beyond)], [self.clock.middle], [self.clock.now])
+        return ca.Function("noise", [u, p, self.clock.now], [ca.densify(variances)])
 
     def arguments(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Symbols of states, inputs and parameters as three column vectors."""

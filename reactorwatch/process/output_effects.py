@@ -1,13 +1,14 @@
 """Effects on the sensor of one output of any model: bias, gain, lag, delay, a stuck reading, noise."""
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import ClassVar
 
 import casadi as ca
 
 from reactorwatch.process.effect import SensorEffect
 from reactorwatch.process.effect_states import add_delay, add_lag, window_states
-from reactorwatch.process.model import ProcessModel, variable
+from reactorwatch.process.model import Output, ProcessModel, variable
 
 
 class ReadingEffect(SensorEffect):
@@ -101,6 +102,22 @@ class StuckOutput(SensorEffect):
         """See `SensorEffect`."""
         extended, (constant,) = self.add_constants(model)
         return extended, value + size * (constant - value)
+
+
+class OutputNoise(SensorEffect):
+    """The reading carries further white noise with a standard deviation of m."""
+
+    is_noise = True
+    lower = 0.0
+
+    def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
+        """See `SensorEffect`."""
+
+        def add(item: Output) -> Output:
+            before = ca.SX(0) if item.noise_variance is None else item.noise_variance
+            return replace(item, noise_variance=before + size**2) if item.name == self.output else item
+
+        return replace(model, outputs=tuple(add(item) for item in model.outputs)), value
 
 
 UNBOUNDED = 1e6

@@ -72,7 +72,7 @@ def _equations_metadata(process: Process) -> dict[str, str]:
     if not (is_complete(extended, model) and process.effects == EFFECTS_OF.get(model.name, ())):
         if process.effects:
             return {}
-        extended = ExtendedModel(model.name, equations=model)
+        extended = ExtendedModel(model.name, equations=model, uncertain=model.uncertain)
     given = {
         name: item if isinstance(item, KnownParameter) else KnownParameter(*item)
         for name, item in process.parameters.items()

@@ -1,6 +1,6 @@
 """Draws a record with something hidden in it, from a seed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import pi
 
@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from reactorwatch.records.record import Record
-from tests.hidden_effect.catalogue import HiddenEffect, open_constants
+from tests.hidden_effect.catalogue import CATALOGUE, HiddenEffect, open_constants
 from tests.hidden_effect.courses import Array, HiddenCourse
 from tests.hidden_effect.excitation import Circumstances, Handling, handling
 from tests.hidden_effect.plant import Plan, Played, play
@@ -81,7 +81,7 @@ def draw(
     rng = np.random.default_rng([seed, 20])
     done = handling(circumstances, rng)
     noise = _noise(circumstances, done.time_min.size, rng)
-    plan = _plan(circumstances, done, noise, seed)
+    plan = replace(_plan(circumstances, done, noise, seed), deviations=_background(circumstances, effects, seed))
     nominal = play(plan)
     if not effects:
         record, shown = _record(plan, nominal, noise, circumstances, rng)
@@ -91,12 +91,13 @@ def draw(
             _course(effect, None if kinds is None else kinds[place], done.time_min, rng)
             for place, effect in enumerate(effects)
         )
-        trial = replace(plan, deviations={effect.name: course for effect, course in zip(effects, courses, strict=True)})
+        hidden = {effect.name: course for effect, course in zip(effects, courses, strict=True)}
+        trial = replace(plan, deviations={**plan.deviations, **hidden})
         played = play(trial)
         if not (may_leave_branch or _on_branch(played, circumstances)):
             continue
-        if min(_strengths(trial, played, circumstances.noise_sd)) >= LEAST_STRENGTH:
-            strength = _strength(trial, played, {}, circumstances.noise_sd)
+        if min(_strengths(trial, played, tuple(hidden), circumstances.noise_sd)) >= LEAST_STRENGTH:
+            strength = _strength(trial, played, plan.deviations, circumstances.noise_sd)
             record, shown = _record(trial, played, noise, circumstances, rng)
             return Hidden(record, seed, circumstances, tuple(effects), courses, strength, played, shown)
     names = " and ".join(effect.name for effect in effects)
@@ -117,6 +118,17 @@ def _plan(circumstances: Circumstances, done: Handling, noise: Array, seed: int)
         seed=seed,
         start=start,
     )
+
+
+def _background(circumstances: Circumstances, effects: Sequence[HiddenEffect], seed: int) -> dict[str, HiddenCourse]:
+    """Constant deviations that make a plant differ a little from the model, other than those that are hidden."""
+    if not circumstances.background:
+        return {}
+    rng = np.random.default_rng([seed, 21])
+    others = [item for item in CATALOGUE if item not in effects and "sine" in item.courses]
+    chosen = rng.choice(len(others), size=2, replace=False)
+    sizes = ((others[i], float(rng.choice(others[i].signs)) * circumstances.background) for i in chosen)
+    return {item.name: HiddenCourse("constant", share * item.smallest) for item, share in sizes}
 
 
 def _on_branch(played: Played, circumstances: Circumstances) -> bool:
@@ -207,16 +219,16 @@ def _record(
     return Record(plan.time_min[there], columns, f"hidden effect, seed {plan.seed}"), shown[there]
 
 
-def _strengths(plan: Plan, played: Played, noise_sd: tuple[float, float]) -> list[float]:
-    """Strength of each effect of a plan, beside the others."""
+def _strengths(plan: Plan, played: Played, names: Sequence[str], noise_sd: tuple[float, float]) -> list[float]:
+    """Strength of some effects of a plan, each beside the others."""
     found = []
-    for name in plan.deviations:
+    for name in names:
         others = {other: course for other, course in plan.deviations.items() if other != name}
         found.append(_strength(plan, played, others, noise_sd))
     return found
 
 
-def _strength(plan: Plan, played: Played, others: dict[str, HiddenCourse], noise_sd: tuple[float, float]) -> float:
+def _strength(plan: Plan, played: Played, others: Mapping[str, HiddenCourse], noise_sd: tuple[float, float]) -> float:
     """Error of a simulation with only some of the deviations, fed with the record's qc."""
     fed = replace(plan, command=played.qc, controller=None, deviations=others)
     if plan.controller is not None and fed.start is None:

@@ -35,6 +35,8 @@ class Circumstances:
         outliers: share of values that are far off.
         interpolated: whether qc went from row to row in straight lines.
         start: `settled`; `middle`, near the unstable steady state; or `extinguished`.
+        background: size of two constant deviations of the plant that are not hidden but make it differ from the model,
+            as a share of the smallest size that is worth finding; 0: there are none.
     """
 
     input: str = "rich"
@@ -49,6 +51,7 @@ class Circumstances:
     outliers: float = 0.0
     interpolated: bool = False
     start: str = "settled"
+    background: float = 0.0
 
 
 NAMED_CIRCUMSTANCES: dict[str, Circumstances] = {

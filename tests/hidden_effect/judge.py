@@ -1,7 +1,7 @@
 """Holds what a diagnosis said against the truth."""
 
 from dataclasses import dataclass, field
-from math import inf, nan
+from math import exp, inf, nan
 
 import numpy as np
 
@@ -35,9 +35,12 @@ class Judged:
         count: explanations on the list.
         size_errors: relative, of each cause that is right and has the right profile, other than a free curve.
         size_inside: whether its 95 % interval holds the size.
+        size_scores: its error in its standard deviations.
         curve_errors: of each cause that is right, root mean square of what its curve is off by, over that of the truth.
         onset_errors: in min, of each right step.
         onset_inside: whether its 95 % interval holds the onset.
+        onset_scores: its error in its standard deviations.
+        probability: probability of the explanation that was given, among all that were listed.
         right_place: whether the location is right.
         held_out: error of T on rows not seen, in true standard deviations of its noise.
         drawn: what that of the truth itself would be: the noise that was drawn in those rows, likewise.
@@ -70,6 +73,9 @@ class Judged:
     before: float = nan
     seconds: float = nan
     remark: str = field(default="")
+    size_scores: tuple[float, ...] = ()
+    onset_scores: tuple[float, ...] = ()
+    probability: float = nan
 
     @property
     def called(self) -> str:
@@ -125,6 +131,12 @@ def judge(hidden: Hidden, said: Diagnosis, seconds: float) -> Judged:
         drawn=_drawn(hidden, said) / noise_sd,
         before=held_out.rmse_before / noise_sd,
         seconds=seconds,
+        size_scores=tuple(_off(item, course) / max(item.parameters["size"].sd, 1e-300) for item, course in alike),
+        onset_scores=tuple(
+            abs(item.parameters["onset"].value - course.onset_min) / max(item.parameters["onset"].sd, 1e-300)
+            for item, course in steps
+        ),
+        probability=1.0 / (1.0 + sum(exp(-0.5 * item.delta_bic) for item in said.alternatives)),
     )
 
 

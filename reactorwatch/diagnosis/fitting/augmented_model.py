@@ -98,9 +98,10 @@ def augment_model(model: ProcessModel, effects: tuple[Effect, ...]) -> Augmented
         )
         ahead = ca.substitute(extended.time_offset, size, interval_input.symbol * model.clock.now)
         model = replace(extended.substitute(size, interval_input.symbol), time_offset=ahead)
+        shown = extended.substitute(size, sample_input.symbol).outputs
         outputs = tuple(
-            replace(item, expression=ca.substitute(was.expression, size, sample_input.symbol))
-            for item, was in zip(model.outputs, extended.outputs, strict=True)
+            replace(item, expression=was.expression, noise_variance=was.noise_variance)
+            for item, was in zip(model.outputs, shown, strict=True)
         )
         model = replace(model, outputs=outputs, inputs=(*model.inputs, interval_input, sample_input))
         interval_inputs.append(interval_input.symbol)

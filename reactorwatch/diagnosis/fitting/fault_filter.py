@@ -1,6 +1,6 @@
 """EKF of a model augmented with effects whose magnitudes are input signals."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
@@ -91,6 +91,7 @@ class FaultFilter:
         delays = (index for index, effect in enumerate(self.effects) if effect.delays_output is not None)
         self.delay_index = next(delays, None)
         self._plant, self._noise, self._period_min = model, noise, period_min
+        self._changes: dict[str, float] = {}
         augmented = augment_model(model, tuple(item for item in self.effects if item.delays_output is None))
         if noise.colored:
             augmented = replace(augmented, model=add_colored_noise(augmented.model, noise.colored, period_min))
@@ -129,8 +130,14 @@ class FaultFilter:
         self._noise, levels = noise, self._all_levels(noise)
         for item in self._filters:
             item.noise = levels
-            item.set_parameters(noise.parameter_changes)
+            item.set_parameters(noise.parameter_changes | self._changes)
         self._errors.noise, self._errors.changes = levels, noise.parameter_changes
+
+    def set_changes(self, changes: Mapping[str, float]) -> None:
+        """Set the parameters that differ from the model's values."""
+        self._changes = dict(changes)
+        for item in self._filters:
+            item.set_parameters(self._noise.parameter_changes | self._changes)
 
     @property
     def noise_levels(self) -> NoiseLevels:

@@ -11,6 +11,7 @@ from math import log
 import numpy as np
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.fault_filter import huber_clip
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import PiecewiseLinear, hat_functions
@@ -44,7 +45,7 @@ def select_knots(
     assert isinstance(curve, PiecewiseLinear)
     values = np.interp(grid.knots_min, curve.knots_min, fit.parameters[index][: curve.n_linear])
     g = hypothesis.signatures(run, fit, index, grid)
-    information = g.T @ g
+    information = signatures.gram_of_columns(g)
     gradient = g.T @ huber_clip(fit.w[2:]).ravel() + information @ values
     information += _RIDGE * np.trace(information) / GRID * np.eye(GRID)
     promised: list[tuple[float, Array]] = []

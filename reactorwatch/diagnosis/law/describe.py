@@ -10,7 +10,6 @@ from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
-from reactorwatch.diagnosis.law.fit import ShapeFitter
 from reactorwatch.diagnosis.law.path import variables_along
 from reactorwatch.diagnosis.law.shapes import coefficient_effect
 from reactorwatch.diagnosis.law.unknown import FittedLaw, PlaceFit, Unknown
@@ -29,7 +28,9 @@ LEAST_CORRELATION = 0.5
 
 def law_hypothesis(law: FittedLaw, run: Run) -> FittedHypothesis:
     """The law as a hypothesis whose parameters shift those of the law."""
-    hypothesis = Hypothesis(law.fitter.ekf, [Constant(run.time_min)] * law.fit.coefficients.size)
+    shape, period_min = law.fitter.shape, float(np.median(np.diff(run.time_min)))
+    ekf = FaultFilter(shape.model, [coefficient_effect(name) for name in shape.parameters], law.fit.noise, period_min)
+    hypothesis = Hypothesis(ekf, [Constant(run.time_min)] * law.fit.coefficients.size)
     parameters = tuple(np.array([value]) for value in law.fit.coefficients)
     return FittedHypothesis(hypothesis, Fit(parameters, *law.fit.evaluation), law.bic)
 
@@ -124,15 +125,9 @@ def _means(values: Array, groups: Sequence[NDArray[np.intp]]) -> Array:
 def _correlations(model: ProcessModel, run: Run, best: FittedLaw) -> dict[str, tuple[str, float]]:
     """The model's parameter that each parameter of the law is correlated with most, if it were uncertain."""
     names = [item.name for item in model.parameters if item.value != 0.0]
-    effects = (*best.fitter.shape.effects, *(coefficient_effect(name) for name in names))
-    ekf = FaultFilter(best.fitter.shape.model, effects, best.fitter.ekf.noise)
     n_law = best.fit.coefficients.size
-    signals = ShapeFitter.constant_signals(np.concatenate([best.fit.coefficients, np.zeros(len(names))]), run)
-    dynamics = ekf.error_dynamics(run, signals, ekf.evaluate(run, signals).innovations)
-    ones = np.ones((run.time_min.size - 2, 1))
-    g = np.column_stack(
-        [signatures.forward_signatures(dynamics, i, ones, ones).reshape(-1) for i in range(len(effects))]
-    )
+    dynamics = best.fitter.dynamics(best.fit, names)
+    g = signatures.constant_signatures(dynamics, n_law + len(names))
     result = {}
     for index, name in enumerate(best.law.parameters):
         largest = ("", 0.0)

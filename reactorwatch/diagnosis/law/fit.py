@@ -7,6 +7,7 @@ normal equations), so that a simple law is not beaten by a richer place.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import log
 
 import numpy as np
@@ -14,11 +15,18 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import HUBER, FaultFilter, FilterEvaluation
-from reactorwatch.diagnosis.fitting.profiles import Signal
-from reactorwatch.diagnosis.law.shapes import Shape
+from reactorwatch.diagnosis.fitting.fault_filter import (
+    HUBER,
+    FaultFilter,
+    FilterEvaluation,
+    error_dynamics_between,
+)
+from reactorwatch.diagnosis.law.shapes import LARGEST, Shape
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.error_dynamics import ErrorDynamics
+from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
+from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
+from reactorwatch.process.model import ProcessModel
 
 MOST_TERMS = 6
 """Largest number of functions of a correction."""
@@ -37,14 +45,14 @@ class ShapeFit:
 
     Attributes:
         shape: the shape.
-        ekf: filter of its model.
+        noise: noise levels of the fit.
         coefficients: coefficients of its functions; 0 of those that are not needed.
         evaluation: run of the filter.
         bic: twice the loss plus the charge for the coefficients; noise levels are not charged.
     """
 
     shape: Shape
-    ekf: FaultFilter
+    noise: Noise
     coefficients: Array
     evaluation: FilterEvaluation
     bic: float
@@ -62,17 +70,25 @@ class ShapeFitter:
     def __init__(self, shape: Shape, run: Run, noise: Noise) -> None:
         self.shape, self._run = shape, run
         period_min = float(np.median(np.diff(run.time_min)))
-        self.ekf = FaultFilter(shape.model, shape.effects, noise, period_min)
-        self._ones = np.ones((run.time_min.size - 2, 1))
+        self.ekf = FaultFilter(shape.model, (), noise, period_min)
+        if not run.breaks:  # a fit that loses an unstable plant is given up instead of started again in each row
+            self.ekf.limit(None)
+        self._first = np.array([shape.model.parameter(name).value for name in shape.parameters])
+        self._errors = self._linearization(shape.parameters)
 
     def evaluate(self, coefficients: Array, select: bool = True) -> ShapeFit:
         """Run the filter at these coefficients; with `select`, those that are 0 are not charged."""
-        evaluation = self.ekf.evaluate(self._run, self.signals(coefficients))
+        self._use(coefficients)
+        return self._fit_of(coefficients, self.ekf.evaluate(self._run, ()), select)
+
+    def _fit_of(self, coefficients: Array, evaluation: FilterEvaluation, select: bool) -> ShapeFit:
         charged = np.count_nonzero(coefficients) if select else coefficients.size
         bic = 2.0 * evaluation.loss + charged * log(self._run.values)
-        return ShapeFit(self.shape, self.ekf, coefficients, evaluation, float(bic))
+        return ShapeFit(self.shape, self.ekf.noise, coefficients, evaluation, float(bic))
 
-    def fit(self, start: Array, noise: Noise, steps: int, select: bool = True) -> ShapeFit:
+    def fit(
+        self, start: Array, noise: Noise, steps: int, select: bool = True, first: FilterEvaluation | None = None
+    ) -> ShapeFit:
         """Fit the coefficients.
 
         Args:
@@ -80,9 +96,10 @@ class ShapeFitter:
             noise: noise levels.
             steps: maximum number of steps.
             select: whether to keep only those functions that lower the BIC.
+            first: run of the filter at the initial coefficients, if it is known.
         """
         self.ekf.noise = noise
-        best = self.evaluate(start, select)
+        best = self.evaluate(start, select) if first is None else self._fit_of(start, first, select)
         for _ in range(steps):
             target = self._target(best, select)
             if target is None:
@@ -98,18 +115,36 @@ class ShapeFitter:
                 break
         return best
 
-    def dynamics(self, fit: ShapeFit) -> ErrorDynamics:
-        """Error equations about a fit."""
-        return self.ekf.error_dynamics(self._run, self.signals(fit.coefficients), fit.evaluation.innovations)
+    def dynamics(self, fit: ShapeFit, further: Sequence[str] = ()) -> ErrorDynamics:
+        """Error equations about a fit, for its coefficients and further parameters of the model."""
+        self.ekf.noise = fit.noise
+        errors = self._linearization((*self.shape.parameters, *further)) if further else self._errors
+        errors.noise = self.ekf.noise_levels
+        errors.changes = self.ekf.noise.parameter_changes | self._values(fit.coefficients)
+        inputs, used = self.ekf.inputs(self._run, ()), self.ekf.used_values(self._run)
+        return error_dynamics_between(errors, self._run, inputs, fit.evaluation.innovations, used)
+
+    def _linearization(self, names: Sequence[str]) -> ErrorLinearization:
+        return _linearization(self.ekf.model, tuple(names)).with_noise(self.ekf.noise_levels)
+
+    def estimate_noise(self, fit: ShapeFit, noise: Noise, smallest_sd: Sequence[float]) -> Noise:
+        """Noise levels under a fit by maximum likelihood; `noise` has the sensors with coloured noise."""
+        self.ekf.noise = noise
+        extended = self.shape.model.with_values(self._values(fit.coefficients))
+        ekf = FaultFilter(extended, (), noise, float(np.median(np.diff(self._run.time_min))))
+        return ekf.estimate_noise(self._run, (), smallest_sd)
+
+    def _use(self, coefficients: Array) -> None:
+        self.ekf.set_changes(self._values(coefficients))
+
+    def _values(self, coefficients: Array) -> dict[str, float]:
+        values = np.clip(self._first + coefficients, -LARGEST, LARGEST)
+        return {**self.shape.scales, **dict(zip(self.shape.parameters, values.tolist(), strict=True))}
 
     def normal_equations(self, fit: ShapeFit) -> tuple[Array, Array]:
         """Information and gradient of all coefficients at a fit."""
-        dynamics = self.dynamics(fit)
-        columns = [
-            signatures.forward_signatures(dynamics, index, self._ones, self._ones).reshape(-1)
-            for index in range(fit.coefficients.size)
-        ]
-        g, w = np.column_stack(columns), np.nan_to_num(fit.evaluation.w[2:]).ravel()
+        g = signatures.constant_signatures(self.dynamics(fit), fit.coefficients.size)
+        w = np.nan_to_num(fit.evaluation.w[2:]).ravel()
         weights = HUBER / np.maximum(np.abs(w), HUBER)
         return g.T @ (g * weights[:, None]), g.T @ (weights * w)
 
@@ -124,14 +159,13 @@ class ShapeFitter:
             result[chosen] = _solve(information, by, chosen)[0]
         return result
 
-    def signals(self, coefficients: Array) -> list[Signal]:
-        """Coefficients as constant signals."""
-        return self.constant_signals(coefficients, self._run)
 
-    @staticmethod
-    def constant_signals(values: Array, run: Run) -> list[Signal]:
-        """Constant signals with these values."""
-        return [Signal(column, column) for column in np.tile(values, (run.time_min.size, 1)).T]
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def _linearization(model: ProcessModel, names: tuple[str, ...]) -> ErrorLinearization:
+    """Error equations of a model for some of its parameters; cached with what is compiled from them."""
+    symbols = [model.parameter(name).symbol for name in names]
+    unknown = NoiseLevels((1.0,) * len(model.outputs), (0.0,) * len(model.states))
+    return ErrorLinearization(model, unknown, symbols, symbols)
 
 
 def select_terms(information: Array, by: Array, charge: float) -> list[int]:

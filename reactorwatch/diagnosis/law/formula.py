@@ -17,7 +17,7 @@ from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.fault_filter import HUBER
 from reactorwatch.diagnosis.fitting.profiles import hat_functions
 from reactorwatch.diagnosis.law.fit import ShapeFit
-from reactorwatch.diagnosis.law.shapes import Shape, coefficient_effect
+from reactorwatch.diagnosis.law.shapes import Shape
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.law import (
@@ -35,6 +35,9 @@ from reactorwatch.process.law import (
 )
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.places import Place
+
+MOST_STARTS = 2
+"""Starts of a form that are fitted further, the best with fitted linear parameters."""
 
 STEPS = 12
 """Steps of a fit about a path."""
@@ -147,7 +150,9 @@ class FormulaSearch:
         if form.positive and min(float(np.min(grid.variables[name])) for name in names) <= 0.0:
             return None
         references = [round_reference(grid.means[name], grid.spreads[name]) for name in names]
-        fits = [_fit_form(form, names, references, start, grid) for start in _starts(form, names, grid)]
+        starts = [_start_form(form, names, references, start, grid) for start in _starts(form, names, grid)]
+        starts = sorted(starts, key=lambda item: item[0])[:MOST_STARTS]
+        fits = [_fit_form(form, names, references, loss, p, grid) for loss, p in starts]
         loss, p = min(fits, key=lambda item: item[0])
         if not (np.isfinite(loss) and _is_in_bounds(form, p, [grid.variables[name] for name in names])):
             return None
@@ -217,16 +222,24 @@ def _starts(form: Form, names: Sequence[str], grid: _Grid) -> list[Array]:
     return starts
 
 
-def _fit_form(
+def _start_form(
     form: Form, names: Sequence[str], references: Sequence[float], start: Array, grid: _Grid
 ) -> tuple[float, Array]:
-    """Twice the loss of a form and its parameters, by damped Gauss-Newton steps on the values at the knots."""
+    """Twice the loss of a form and its parameters, of which the linear ones are fitted."""
     values = [grid.variables[name] for name in names]
     linear = [index for index, item in enumerate(form.parameters) if item.kind in (GAIN, SLOPE, CURVATURE)]
     with np.errstate(over="ignore", invalid="ignore"):
         p = _solve_linear(form, values, references, start, linear, grid)
+        return grid.loss(form.expression(values, p, references)), p
+
+
+def _fit_form(
+    form: Form, names: Sequence[str], references: Sequence[float], best: float, p: Array, grid: _Grid
+) -> tuple[float, Array]:
+    """Twice the loss of a form and its parameters, by damped Gauss-Newton steps on the values at the knots."""
+    values = [grid.variables[name] for name in names]
+    with np.errstate(over="ignore", invalid="ignore"):
         course = form.expression(values, p, references)
-        best = grid.loss(course)
         for _ in range(STEPS):
             if not np.isfinite(best):
                 break
@@ -284,7 +297,7 @@ def law_shape(model: ProcessModel, place: Place, law: ExtendedLaw) -> Shape:
     """Model with a law, as a shape whose coefficients shift the law's parameters."""
     extended = law.extend(model)
     names = extended.parameter_names[-len(law.parameters) :]
-    return Shape(place, extended, tuple(coefficient_effect(name) for name in names), names, 1.0, ())
+    return Shape(place, extended, names, names, 1.0, ())
 
 
 def round_reference(mean: float, spread: float) -> float:

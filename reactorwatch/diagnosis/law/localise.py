@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.diagnosis.fitting.fault_filter import FilterEvaluation, huber_loss
-from reactorwatch.diagnosis.law.unknown import FittedLaw, Unknown, find_laws, fit_places
+from reactorwatch.diagnosis.law.unknown import (
+    FittedLaw,
+    StartedPlaces,
+    Unknown,
+    find_laws,
+    fit_places,
+    start_places,
+)
 from reactorwatch.diagnosis.result import LISTED
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis, SearchResult
@@ -27,6 +34,14 @@ CURVE_MARGIN, LAW_MARGIN = 25.0, 10.0
 
 SIMPLE = 3
 """Largest number of parameters of a law that stands beside a pair of causes."""
+
+MISFIT = 1.6
+"""Mean square of the normalised innovations of the best smooth correction: beyond it pairs are searched before laws.
+Beside a law with a kink it is 1.2."""
+
+HOPELESS = 0.25
+"""BIC a value by which smooth corrections may be worse than an explanation with a white residual before laws are
+sought: a law with a kink explains more than they do."""
 
 NOISY_SHARE = 0.003
 """Fraction of a state's scale per square root of a minute: with more process noise a law may not be complete."""
@@ -97,7 +112,7 @@ class UnknownSearch:
     @property
     def is_simple(self) -> bool:
         """True if a law with few parameters explains all of the run, so that a pair of causes cannot be much better."""
-        if not self._evidence.laws:
+        if self._first_places.misfit > MISFIT or not self._evidence.laws:
             return False
         law = self._evidence.laws[0]
         return (
@@ -106,10 +121,18 @@ class UnknownSearch:
             and law.bic < self._evidence.places[0].fit.bic + LISTED
         )
 
-    def localise(self) -> Localised:
-        """Localise the unknown."""
+    def localise(self, explained_bic: float = np.inf) -> Localised:
+        """Localise the unknown.
+
+        Args:
+            explained_bic: BIC of a hypothesis of the catalogue that leaves a white residual without much process noise,
+                which a free curve in time cannot improve; infinite: there is none.
+        """
+        limit = explained_bic + HOPELESS * self._run.values
+        if self._first_places.fits[0].fit.bic > limit:
+            return Localised(Unknown(tuple(self._first_places.fits), (), self._first_places.free, np.inf), None)
         found, curve = self._evidence, None
-        if found.log_p >= WHITE or _is_noisy(found, self._model):
+        if np.isinf(explained_bic) and (found.log_p >= WHITE or _is_noisy(found, self._model)):
             curve = locate(self._model, self._effects, self._run, self._nominal.fit, self._noise)
             if curve is not None:
                 count = np.count_nonzero(found.places[0].fit.coefficients)
@@ -118,12 +141,12 @@ class UnknownSearch:
         return Localised(found, curve)
 
     @cached_property
-    def _places(self) -> Unknown:
-        return fit_places(self._model, self._run, self._nominal.fit, self._noise)
+    def _first_places(self) -> StartedPlaces:
+        return start_places(self._model, self._run, self._nominal.fit, self._noise)
 
     @cached_property
     def _evidence(self) -> Unknown:
-        return find_laws(self._model, self._run, self._places)
+        return find_laws(self._model, self._run, fit_places(self._model, self._run, self._first_places))
 
 
 def _is_noisy(found: Unknown, model: ProcessModel) -> bool:

@@ -6,13 +6,15 @@ the same for every record. A sensor may also remember: its functions include the
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import combinations
 
 import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.process.effect import Effect, ParameterShift
 from reactorwatch.process.law import add_lag_states
 from reactorwatch.process.model import Parameter, ProcessModel
@@ -23,6 +25,9 @@ HINGES = (-0.7, 0.0, 0.7)
 
 QUICK = 3.0
 """Sharpness of the direction in which an output moves, in spreads of its rate."""
+
+LARGEST = 1e12
+"""Largest size of a coefficient."""
 
 _BOUND = 1e6
 
@@ -42,20 +47,22 @@ class Shape:
     Attributes:
         place: the place.
         model: model with corrections, whose coefficients are parameters.
-        effects: one for each coefficient, which shifts it from zero.
+        parameters: names of the coefficients among the model's parameters.
         functions: functions of the correction as text, one for each coefficient.
         unit_size: correction at a unit coefficient of the constant function, the first one.
         terms: functions of the correction in the place itself as expressions.
         apart: functions of the correction apart from it; empty: none.
+        scales: values of the model's parameters that scale the functions, by name.
     """
 
     place: Place
     model: ProcessModel
-    effects: tuple[Effect, ...]
+    parameters: tuple[str, ...]
     functions: tuple[str, ...]
     unit_size: float
     terms: tuple[ca.SX, ...]
     apart: tuple[ca.SX, ...] = ()
+    scales: Mapping[str, float] = field(default_factory=dict)
 
     def lag_min(self, coefficients: Array) -> float:
         """Time constant with which the correction lags behind its variables; 0: none."""
@@ -75,7 +82,7 @@ class Shape:
         function = ca.Function("basis", symbols, [ca.vertcat(*self.terms, *self.apart)])
         none = np.zeros((1, len(x)))
         own = bridge_gaps(x[:, : len(self.model.states)])
-        values = function(own.T, np.nan_to_num(inputs.T), self.model.values(), none, none)
+        values = function(own.T, np.nan_to_num(inputs.T), self.model.values(self.scales), none, none)
         return np.asarray(self.unit_size * np.array(values).T)
 
 
@@ -93,12 +100,38 @@ def make_shape(model: ProcessModel, place: Place, scales: Mapping[str, Scale]) -
         place: one of its places.
         scales: scales of the variables by name; of an output's rate as `d(name)`.
     """
+    built = _build(model, place.name)
+    parts = (place, *([find_place(model, place.apart)] if place.apart else []))
+    units = {f"law.{index}.unit": _typical(model, part, scales) for index, part in enumerate(parts)}
+    values = {name: float(getattr(scales[of], what)) for name, (what, of) in built.scaled.items()}
+    unit = _typical(model, place, scales)
+    return replace(built.shape, unit_size=unit, scales=units | values)
+
+
+@dataclass(frozen=True, eq=False)
+class _Built:
+    """Shape of a place without the scales of a record.
+
+    Attributes:
+        shape: the shape.
+        scaled: for each parameter of a scale its kind, `mean` or `spread`, and the variable.
+    """
+
+    shape: Shape
+    scaled: Mapping[str, tuple[str, str]]
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def _build(model: ProcessModel, name: str) -> _Built:
+    """Build the shape of a place, once for all records, with everything that is compiled from its model."""
+    place = find_place(model, name)
     parts = [_part(model, place, place.variables)]
     if place.apart:
         parts.append(_part(model, find_place(model, place.apart), place.variables, order=1))
     parameters: list[Parameter] = []
     names: list[str] = []
     coefficients: list[Parameter] = []
+    scaled: dict[str, tuple[str, str]] = {}
     extended, terms, apart = model, list[ca.SX](), list[ca.SX]()
     lag = _constant("law.lag")
     for index, part in enumerate(parts):
@@ -108,8 +141,8 @@ def make_shape(model: ProcessModel, place: Place, scales: Mapping[str, Scale]) -
             extended, symbols = add_lag_states(extended, lag_min, list(part.arguments), symbols)
         for name, expression in zip(part.arguments, symbols, strict=True):
             mean, spread = (_constant(f"law.{index}.{what}.{name}") for what in ("mean", "spread"))
-            scale = scales[name]
-            parameters += [replace(mean, value=scale.mean), replace(spread, value=scale.spread)]
+            parameters += [mean, replace(spread, value=1.0)]
+            scaled |= {mean.name: ("mean", name), spread.name: ("spread", name)}
             z[name] = (expression - mean.symbol) / spread.symbol
         correction = ca.SX(0)
         for text, function in _functions(part.place, z, part.order):
@@ -119,14 +152,14 @@ def make_shape(model: ProcessModel, place: Place, scales: Mapping[str, Scale]) -
             correction += coefficient.symbol * function
             (apart if index else terms).append(function)
         size = _constant(f"law.{index}.unit")
-        parameters.append(replace(size, value=_typical(model, part.place, scales)))
+        parameters.append(replace(size, value=1.0))
         extended = correct(extended, part.place, size.symbol * correction)
     if place.lag_min:
         coefficients.append(lag)
         names.append("logarithm of the lag's ratio")
     extended = replace(extended, parameters=(*extended.parameters, *parameters, *coefficients))
-    effects = tuple(coefficient_effect(item.name) for item in coefficients)
-    return Shape(place, extended, effects, tuple(names), _typical(model, place, scales), tuple(terms), tuple(apart))
+    chosen = tuple(item.name for item in coefficients)
+    return _Built(Shape(place, extended, chosen, tuple(names), 1.0, tuple(terms), tuple(apart)), scaled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +211,7 @@ def _typical(model: ProcessModel, place: Place, scales: Mapping[str, Scale]) -> 
 
 
 def _constant(name: str) -> Parameter:
-    return Parameter(name, 0.0, "1", -1e12, 1e12, "", ca.SX.sym(name))
+    return Parameter(name, 0.0, "1", -LARGEST, LARGEST, "", ca.SX.sym(name))
 
 
 def coefficient_effect(name: str) -> Effect:

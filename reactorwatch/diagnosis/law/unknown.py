@@ -6,14 +6,14 @@ noise levels are estimated under it, process noise too; then the nearest places 
 formulas are sought (`formula`). A location's evidence is the best BIC of its corrections and formulas.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import HUBER
+from reactorwatch.diagnosis.fitting.fault_filter import HUBER, FilterEvaluation
 from reactorwatch.diagnosis.fitting.hypothesis import Fit
 from reactorwatch.diagnosis.law.fit import ShapeFit, ShapeFitter
 from reactorwatch.diagnosis.law.formula import FormulaSearch, law_shape
@@ -47,7 +47,7 @@ FAR = 1000.0
 FORMULAS = 4
 """Forms that are fitted inside the simulation."""
 
-WORTH = 30.0
+WORTH = 15.0
 """Threshold in BIC: forms whose prediction is worse than the best by more are not fitted."""
 
 
@@ -76,16 +76,24 @@ class FittedLaw:
 
     def noise_sd(self, model: ProcessModel) -> Array:
         """Standard deviation of each sensor's noise, shape (n_y,)."""
-        return self.fitter.ekf.noise.sensor_sd(model.output_names)
+        return self.fit.noise.sensor_sd(model.output_names)
 
 
 @dataclass(frozen=True, eq=False)
 class PlaceFit:
-    """The best smooth correction of a place."""
+    """The best smooth correction of a place.
+
+    Attributes:
+        place: the place.
+        fit: fit of the correction.
+        fitter: fitter, for other noise levels.
+        nominal: run of its filter without any correction, with process noise.
+    """
 
     place: Place
     fit: ShapeFit
     fitter: ShapeFitter
+    nominal: FilterEvaluation
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +129,32 @@ class Unknown:
         return dict(sorted(result.items(), key=lambda item: item[1]))
 
 
-def fit_places(model: ProcessModel, run: Run, nominal: Fit, noise: Noise) -> Unknown:
-    """Fit smooth corrections in all places of a process.
+@dataclass(frozen=True, eq=False)
+class StartedPlaces:
+    """Smooth corrections fitted with the sensors' noise alone.
+
+    Attributes:
+        fits: corrections, the best first.
+        apart: places of corrections with a part in another place, not yet fitted.
+        scales: scales of the variables.
+        free: noise levels of the fits.
+        wide: noise levels of their first steps.
+    """
+
+    fits: list["PlaceFit"]
+    apart: list[Place]
+    scales: Mapping[str, Scale]
+    free: Noise
+    wide: Noise
+
+    @property
+    def misfit(self) -> float:
+        """Mean square of the best correction's normalised innovations."""
+        return float(np.nanmean(np.square(self.fits[0].fit.evaluation.w)))
+
+
+def start_places(model: ProcessModel, run: Run, nominal: Fit, noise: Noise) -> StartedPlaces:
+    """Fit smooth corrections in all places of a process, with the sensors' noise alone.
 
     Args:
         model: process model of the plant.
@@ -139,9 +171,23 @@ def fit_places(model: ProcessModel, run: Run, nominal: Fit, noise: Noise) -> Unk
     wide = Noise(tuple(sensor_sd.tolist()), noise.process_sd[:own], noise.colored)
     free = Noise(wide.measurement_sd, (0.0,) * own, noise.colored)
     alone, apart = ([place for place in places if bool(place.apart) is flag] for flag in (False, True))
-    fits = _fit_all([_start(model, place, scales, run, wide) for place in alone], free)
-    if _log_p(fits[0].fit, run) >= DOUBTFUL or any(item.location == fits[0].place.location for item in apart):
-        fits += _fit_all([_start(model, place, scales, run, wide) for place in apart], free)
+    started: list[PlaceFit] = []
+    for place in alone:
+        started.append(_start(model, place, scales, run, wide, started))
+    return StartedPlaces(_fit_all(started, free), apart, scales, free, wide)
+
+
+def fit_places(model: ProcessModel, run: Run, started: StartedPlaces) -> Unknown:
+    """Fit the best smooth corrections with the noise levels that are likely under them.
+
+    Args:
+        model: process model of the plant.
+        run: the record.
+        started: corrections with the sensors' noise alone.
+    """
+    fits, wide, free = list(started.fits), started.wide, started.free
+    if _log_p(fits[0].fit, run) >= DOUBTFUL or any(item.location == fits[0].place.location for item in started.apart):
+        fits += _fit_all([_start(model, place, started.scales, run, wide) for place in started.apart], free)
         fits.sort(key=_bic)
     levels = _likely_noise(model, run, fits[0], free, wide)
     fits = sorted((_refit(item, levels) for item in fits if item.fit.bic < fits[0].fit.bic + FAR), key=_bic)
@@ -173,17 +219,27 @@ def _likely_noise(model: ProcessModel, run: Run, best: PlaceFit, free: Noise, wi
     if _log_p(fit, run) < DOUBTFUL:
         rms = np.sqrt(np.nanmean(np.square(np.clip(fit.evaluation.w, -HUBER, HUBER)), axis=0))
         return Noise(tuple((np.array(free.measurement_sd) * rms).tolist()), free.process_sd, free.colored)
-    best.fitter.ekf.noise = wide
     smallest = [SMALLEST_SHARE * item for item in wide.measurement_sd]
-    found = best.fitter.ekf.estimate_noise(run, best.fitter.signals(best.fit.coefficients), smallest)
+    found = best.fitter.estimate_noise(best.fit, wide, smallest)
     # The states that a correction adds, such as that of a lag, are its own; other corrections do not have them.
     return Noise(found.measurement_sd, found.process_sd[: len(model.states)], found.colored)
 
 
-def _start(model: ProcessModel, place: Place, scales: Mapping[str, Scale], run: Run, wide: Noise) -> PlaceFit:
-    """First steps of a fit, with process noise."""
+def _start(
+    model: ProcessModel,
+    place: Place,
+    scales: Mapping[str, Scale],
+    run: Run,
+    wide: Noise,
+    others: Sequence[PlaceFit] = (),
+) -> PlaceFit:
+    """First steps of a fit, with process noise; without any correction all filters with the same states are equal."""
     fitter = ShapeFitter(make_shape(model, place, scales), run, wide)
-    return PlaceFit(place, fitter.fit(np.zeros(len(fitter.shape.effects)), wide, FIRST_STEPS), fitter)
+    alike = (item for item in others if item.fitter.shape.model.state_names == fitter.shape.model.state_names)
+    first = next((item.nominal for item in alike), None)
+    nominal = fitter.evaluate(np.zeros(len(fitter.shape.parameters))).evaluation if first is None else first
+    zero = np.zeros(len(fitter.shape.parameters))
+    return PlaceFit(place, fitter.fit(zero, wide, FIRST_STEPS, first=nominal), fitter, nominal)
 
 
 def _fit_all(started: list[PlaceFit], free: Noise) -> list[PlaceFit]:

@@ -28,9 +28,6 @@ REMOVED_CAUSES, SINES_SHARE = 2, 0.3
 """Number of causes that are removed in turn to see sines beneath them, and minimum gain of a sine as a fraction of the
 best."""
 
-BLOCK, NEGLIGIBLE = 512, 1e-9
-"""Rows of columns that are multiplied at once, and the fraction of a column's maximum below which it counts as 0."""
-
 _RIDGE = 1e-9
 _MOST_SIZES = 3.0
 
@@ -159,7 +156,7 @@ class PairScreen:
         predict less.
         """
         columns = np.concatenate([block.columns for block in blocks], axis=1)
-        gram, by = _gram(columns), columns.T @ w
+        gram, by = signatures.gram_of_columns(columns), columns.T @ w
         ends = np.cumsum([block.columns.shape[1] for block in blocks])
         places = [np.arange(end - block.columns.shape[1], end) for end, block in zip(ends, blocks, strict=True)]
         price = log(self._run.values)
@@ -240,18 +237,6 @@ def _range(block: Block) -> tuple[Array, Array]:
     if block.size is not None:
         lower, upper = lower / block.size, min(upper / block.size, _MOST_SIZES)
     return np.full(count, lower), np.full(count, upper)
-
-
-def _gram(columns: Array) -> Array:
-    """Gram matrix of all columns. Most of a hat function's column is 0 and costs nothing."""
-    sizes, products = np.abs(columns), np.zeros((columns.shape[1],) * 2)
-    least = NEGLIGIBLE * np.max(sizes, axis=0)
-    for begin in range(0, len(columns), BLOCK):
-        part = slice(begin, begin + BLOCK)
-        present = np.flatnonzero(np.max(sizes[part], axis=0) > least)
-        shown = columns[part, present]
-        products[np.ix_(present, present)] += shown.T @ shown
-    return products
 
 
 def _gain(columns: Array, w: Array) -> tuple[float, Array]:

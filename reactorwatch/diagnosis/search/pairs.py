@@ -136,7 +136,7 @@ class PairSearch:
                 break
             search.update_noise(best)
             best = self._fit(_parts(best))
-            if self.gain(best) < LEAST_PAIR_GAIN:
+            if self._largest_gain(best) < LEAST_PAIR_GAIN:
                 return None
             if not np.any(minus_log10_p(best.fit.w, self._run.inputs) > DOUBTFUL):
                 break
@@ -184,6 +184,14 @@ class PairSearch:
         singles += [self._fit([part]) for part in _parts(pair)]
         self.single = min(singles, key=_bic)
         return self.single.bic - pair.bic
+
+    def _largest_gain(self, pair: FittedHypothesis) -> float:
+        """Upper bound of `gain`: the best single cause as it was fitted at other noise levels."""
+        single = self._search.fit_nominal()
+        if self.single.label:
+            self._search.filter(self.single.hypothesis.filter.effects)
+            single = self._search.evaluate(self.single.hypothesis, self.single.fit.parameters)
+        return single.bic - pair.bic
 
     def _skip_tried(self, candidates: Sequence[CandidatePair], best: FittedHypothesis | None) -> list[CandidatePair]:
         """Select pairs that were not fitted and predict more than the best pair itself."""

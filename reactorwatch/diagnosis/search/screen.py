@@ -82,13 +82,14 @@ class Screen:
         run: the record.
 
     Attributes:
+        model: process model of the plant.
         effects: the catalogue.
         static_effects: effects without internal states.
         dynamic_effects: effects with internal states.
     """
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run) -> None:
-        self._model, self._run, self.effects = model, run, tuple(effects)
+        self.model, self._run, self.effects = model, run, tuple(effects)
         self._errors: dict[FaultFilter, ErrorLinearization] = {}
         names = model.state_names
         self.static_effects = tuple(effect for effect in effects if effect.extend(model).state_names == names)
@@ -196,7 +197,7 @@ class Screen:
 
         It is compiled once for all hypotheses.
         """
-        of_all = augment_model(self._model, self._columns)
+        of_all = augment_model(self.model, self._columns)
         nothing = np.zeros(self._run.time_min.size)
         by_effect = dict(zip(ekf.effects, signals, strict=True))
         sizes = [by_effect.get(effect, Signal(nothing, nothing)) for effect in self._columns]

@@ -132,6 +132,7 @@ class Search:
         run: the record without its outliers.
         noise: noise levels with which all hypotheses are compared.
         screen: screen of the run.
+        noise_effects: effects that change the noise of a sensor, which the screen leaves out.
         prior: prior probabilities of the hypotheses.
     """
 
@@ -143,7 +144,8 @@ class Search:
         self._recent: list[Noise] = []  # the latest first
         self._period_min = float(np.median(np.diff(run.time_min)))
         self.noise = self._initial_noise()
-        self.screen = Screen(model, effects, self.run)
+        self.screen = Screen(model, [effect for effect in effects if not effect.is_noise], self.run)
+        self.noise_effects = tuple(effect for effect in effects if effect.is_noise)
         self.dynamic_screen = DynamicEffectsScreen(self.screen.dynamic_effects, self.run)
         self.prior = CausePrior(len(effects))
 

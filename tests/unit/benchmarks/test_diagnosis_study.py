@@ -1,6 +1,7 @@
 """The study scores what was judged, draws each cause as often, and writes it down."""
 
 import json
+from dataclasses import replace
 from math import isnan, nan
 from pathlib import Path
 
@@ -9,9 +10,13 @@ import pytest
 
 from benchmarks.diagnosis_study import earlier, section, with_section
 from benchmarks.diagnosis_study import judge_record as run_one
-from benchmarks.hidden.classes import CLASSES, draw_record, find_class, seed_of
-from benchmarks.hidden.score import Score, confusion
-from benchmarks.hidden.tables import failures, main_table
+from benchmarks.hidden.classes import CLASSES, NEARLY, draw_record, find_class, seed_of
+from benchmarks.hidden.reliability import reliability_table
+from benchmarks.hidden.score import Score, Share, confusion
+from benchmarks.hidden.suspects import SuspectsJudged
+from benchmarks.hidden.tables import failures, main_table, percent
+from tests.hidden_effect.draw import draw
+from tests.hidden_effect.excitation import MEDIUM_NOISE
 from tests.hidden_effect.judge import Judged
 
 
@@ -65,6 +70,36 @@ def test_a_failure_is_told_with_its_seed() -> None:
     assert "named b step" in line
 
 
+def test_a_share_has_the_interval_of_its_number_of_records() -> None:
+    assert percent(Share.of([True] * 9 + [False])) == "90.0 (60–98)"
+    assert percent(Share.of([])) == "–"
+    assert Share.of([True] * 50).interval == pytest.approx((1.0 / (1.0 + 1.959964**2 / 50), 1.0))
+
+
+def test_the_table_of_reliability_counts_what_was_right_at_each_stated_probability() -> None:
+    exact = [one("a", "a", size_scores=(z,), probability=0.99) for z in (0.1, 0.6, 1.0, 1.7)]
+    wrong = one("a", "b", probability=0.6)
+    suspects = [SuspectsJudged("a", True, 0.7, right, True) for right in (True, False)]
+    table = reliability_table({"medium": [*exact, wrong]}, suspects)
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
+    right = {tuple(row[:3]): row[3].split()[0] for row in cells}
+    assert right["the model itself", "size in its interval", "50"] == "50.0"
+    assert right["the model itself", "size in its interval", "90"] == "75.0"
+    assert right["the model itself", "size in its interval", "95"] == "100.0"
+    assert right["the model itself", "verdict", "99"] == "100.0"
+    assert right["the model itself", "verdict", "60"] == "0.0"
+    assert right["not quite the model", "first suspect", "70"] == "50.0"
+    assert right["not quite the model", "cause in the set of suspects", "90"] == "100.0"
+
+
+def test_a_plant_that_is_not_quite_the_model_differs_from_it_by_less_than_is_worth_finding() -> None:
+    circumstances = find_class(NEARLY).circumstances(0)
+    nearly, exact = (draw(7, (), replace(circumstances, background=share)) for share in (circumstances.background, 0.0))
+    apart = np.sqrt(np.mean((nearly.shown - exact.shown) ** 2, axis=0)) / MEDIUM_NOISE
+    assert 0.02 < np.max(apart) < 1.0
+    assert draw_record(find_class(NEARLY), 0, 50_000_000).circumstances == circumstances
+
+
 def test_causes_take_turns() -> None:
     study = find_class("150 min")
     found = [draw_record(study, number, 50_000_000).causes[0] for number in range(6)]
@@ -84,7 +119,7 @@ def test_a_record_goes_through_and_comes_out_as_tables_that_can_be_put_together_
     assert "60000000" in text
     file = tmp_path / "numbers.json"
     file.write_text(json.dumps({"150 min": [found["150 min"][0].__dict__]}))
-    assert section(earlier([file]), 60_000_000) == text
+    assert section(earlier([file])[0], 60_000_000) == text
 
 
 def test_the_tables_take_the_place_of_those_before() -> None:

@@ -22,7 +22,9 @@ of_every_model = pytest.mark.parametrize("make", [*MODELS, tank], ids=lambda mak
 @of_every_model
 def test_every_signal_parameter_and_state_has_its_effects(make: Callable[[], ProcessModel]) -> None:
     model = make()
-    expected = {f"{name}.{kind}" for name in model.output_names for kind in ("bias", "gain", "lag", "delay", "stuck")}
+    expected = {
+        f"{name}.{kind}" for name in model.output_names for kind in ("bias", "gain", "lag", "delay", "stuck", "noise")
+    }
     kinds = ("gain", "offset", "lag", "delay", "stiction")
     expected |= {f"{name}.{kind}" for name in model.input_names for kind in kinds}
     expected |= {f"{name}.deviation" for name in model.parameter_names}

@@ -1,5 +1,7 @@
 """What is promised of false alarms is kept on average over trainings, for white residuals and autocorrelated ones."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -41,6 +43,12 @@ def prewhitened(z: np.ndarray) -> tuple[Prewhitening, np.ndarray]:
     return learned, e / learned.sd
 
 
+@cache
+def trainings(phi: float) -> list[tuple[Prewhitening, np.ndarray]]:
+    """Trainings of 300 plants with one residual each, and the rows after them."""
+    return [prewhitened(z[0]) for z in residuals(phi, seed=1)]
+
+
 def rate_of_one(charts: list[CompiledChart], e: np.ndarray) -> float:
     """Alarms a row, over charts of many plants; each begins anew after its alarm."""
     bank, alarms = Bank(charts), 0
@@ -56,7 +64,7 @@ def rate_of_one(charts: list[CompiledChart], e: np.ndarray) -> float:
 @pytest.mark.parametrize("chart", ["ewma", "cusum", "shewhart"])
 def test_each_chart_alarms_as_often_as_its_share_allows(chart: str, phi: float) -> None:
     """300 trainings of 600 rows; 900 alarms are expected, clustered by training, so to a tenth or so."""
-    pairs = [prewhitened(z[0]) for z in residuals(phi, seed=1)]
+    pairs = trainings(phi)
     charts: list[CompiledChart] = []
     for learned, _ in pairs:
         if chart == "ewma":
@@ -71,7 +79,7 @@ def test_each_chart_alarms_as_often_as_its_share_allows(chart: str, phi: float) 
 
 def test_without_the_correction_for_the_training_it_alarms_too_often() -> None:
     """What the limits of known parameters do: the reason for the correction."""
-    pairs = [prewhitened(z[0]) for z in residuals(0.5, seed=1)]
+    pairs = trainings(0.5)
     plain = ewma_limit(ARL0, 0.03)
     e = np.array([e for _, e in pairs])
     assert rate_of_one([Ewma(0.0, 1.0, 0.03, plain) for _ in pairs], e) * ARL0 > 1.5

@@ -49,21 +49,20 @@ def learned(seen: Run, reference: Array, arl0: float, rows: int = TRAINING) -> P
     return parameter_drift.learn(seen.regressors[:rows], residuals, FORGETTING, rows, arl0, NAMES, past_outputs=1)
 
 
-def textbook(seen: Run, reference: Array, limit: float) -> ParameterT2:
-    """The chart that takes residuals for white: s^2 H^-1 instead of the sandwich."""
+def textbook(seen: Run, reference: Array, differences: Array) -> Array:
+    """Statistic of the chart that takes residuals for white: s^2 H^-1 instead of the sandwich."""
     regressors = seen.regressors[:TRAINING]
     residuals = seen.outputs[:TRAINING] - regressors @ reference
     weight = 1.0 - FORGETTING
     variance = 2.0 * weight / (2.0 - weight) * residuals.var()
     root = np.linalg.cholesky(regressors.T @ regressors / TRAINING).T / np.sqrt(variance)
-    return ParameterT2(NAMES, root, limit)
+    return np.asarray(np.sum((differences @ root.T) ** 2, axis=1))
 
 
-def alarms(chart: ParameterT2, differences: Array, regressors: Array) -> float:
+def alarms(statistic: Array, limit: float) -> float:
     """How many: a further one only after the statistic has been back where it is half of the time."""
-    statistic = np.array([chart.update(d, row).statistic for d, row in zip(differences, regressors, strict=True)])
-    usual = min(float(np.median(statistic)), chart.limit)
-    events = np.where(statistic > chart.limit, 1, np.where(statistic <= usual, -1, 0))
+    usual = min(float(np.median(statistic)), limit)
+    events = np.where(statistic > limit, 1, np.where(statistic <= usual, -1, 0))
     return float(np.sum(np.diff(events[events != 0], prepend=-1) == 2))
 
 
@@ -75,10 +74,13 @@ def false_alarms(correlation: float, *, sandwich: bool) -> tuple[float, float]:
         seen = run(rng, TRAINING + rows, correlation)
         parameters = adapt(seen, FORGETTING)
         reference = parameters[TRAINING - 1]
-        chart = learned(seen, reference, arl0)
-        if not sandwich:
-            chart = textbook(seen, reference, chart.limit)
-        counts.append(alarms(chart, parameters[TRAINING:] - reference, seen.regressors[TRAINING:]))
+        chart, differences = learned(seen, reference, arl0), parameters[TRAINING:] - reference
+        if sandwich:
+            rows_after = zip(differences, seen.regressors[TRAINING:], strict=True)
+            statistic = np.array([chart.update(d, row).statistic for d, row in rows_after])
+        else:
+            statistic = textbook(seen, reference, differences)
+        counts.append(alarms(statistic, chart.limit))
     return float(np.mean(counts)) * arl0 / rows, float(np.std(counts) / np.sqrt(plants)) * arl0 / rows
 
 

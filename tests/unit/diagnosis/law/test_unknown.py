@@ -14,7 +14,7 @@ from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.law.describe import describe_law
 from reactorwatch.diagnosis.law.fit import select_terms
 from reactorwatch.diagnosis.law.formula import round_reference
-from reactorwatch.diagnosis.law.unknown import Unknown, find_laws, fit_places
+from reactorwatch.diagnosis.law.unknown import Unknown, find_laws, fit_places, start_places
 from reactorwatch.diagnosis.result import SD_95, Law
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.law import find_form
@@ -65,7 +65,8 @@ def found(kind: str) -> tuple[ProcessModel, Run, Unknown]:
     run = Run(time_min, inputs, outputs + sd * random.standard_normal(outputs.shape))
     noise = Noise(tuple(sd.tolist()), tuple(0.02 * state.scale for state in model.states))
     nominal = Hypothesis(FaultFilter(model, (), noise), ()).evaluate(run, ())
-    return model, run, find_laws(model, run, fit_places(model, run, nominal, noise))
+    started = start_places(model, run, nominal, noise)
+    return model, run, find_laws(model, run, fit_places(model, run, started))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,276 @@
+"""Lasting explanations, fitted as simulations and compared on held-out rows.
+
+A filter with much process noise follows the measurements whatever its model lacks, so its likelihood hardly
+distinguishes a cause that lasts from one that drifts with the error of the model. Where the best explanation needs such
+noise, causes that are there from the beginning and stay are fitted once more without process noise, together with the
+uncertain parameters. If the one with the smallest error simulates held-out rows better than the explanation that
+drifts, each fitted to the others, it is the better explanation.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting import signatures
+from reactorwatch.diagnosis.fitting.bounded_least_squares import solve_bounded
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import (
+    HUBER,
+    FaultFilter,
+    FilterEvaluation,
+    error_dynamics_between,
+)
+from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import Constant
+from reactorwatch.diagnosis.holdout import evaluate_holdout, holdout_rows
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult
+from reactorwatch.kalman.error_dynamics import ErrorLinearization
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.model import ProcessModel
+
+BETTER = 0.95
+"""Ratio of held-out errors below which one explanation simulates better than another."""
+
+MOST_CAUSES = 6
+"""Number of single causes that are fitted."""
+
+FIRST_STEPS, STEPS, ROUNDS = 4, 12, 2
+"""Steps from each start, from the best start, and estimates of the error's size."""
+
+_DAMPING, _LARGEST_DAMPING, _CONVERGED = 1e-3, 1e4, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class LastingFit:
+    """A lasting cause fitted as a simulation.
+
+    Attributes:
+        effect: the cause.
+        values: size, constants of the effect and uncertain parameters, by name in the extended model.
+        sds: their standard deviations, if the errors of the simulation were white.
+        error_sd: root mean square error of a fit to all rows, shape (n_y,).
+        held_out: root mean square error on held-out rows, of a fit to the others, shape (n_y,).
+    """
+
+    effect: Effect
+    values: Mapping[str, float]
+    sds: Mapping[str, float]
+    error_sd: Array
+    held_out: Array
+
+
+class LastingResult(NamedTuple):
+    """Lasting explanations that take the place of a search's result.
+
+    Attributes:
+        result: hypotheses about a model with the estimated values of its uncertain parameters, the best first.
+        sds: standard deviations of these parameters, by name.
+    """
+
+    result: SearchResult
+    sds: Mapping[str, float]
+
+
+def prefer_lasting(
+    search: Search, result: SearchResult, best: FittedHypothesis, model: ProcessModel, uncertain: Mapping[str, float]
+) -> LastingResult | None:
+    """Result with lasting explanations if one simulates held-out rows better than the best hypothesis; else None.
+
+    Args:
+        search: search of the run.
+        result: result of the search.
+        best: best hypothesis.
+        model: process model without priors.
+        uncertain: standard deviations of its uncertain parameters.
+    """
+    run = search.run
+    drifting = evaluate_holdout(run, result.nominal, best)[1].simulation
+    fits = [fit_lasting(model, effect, uncertain, run) for effect in _likely_causes(search, result)]
+    usable = [item for item in fits if item is not None]
+    if not usable:
+        return None
+    first = min(usable, key=lambda item: float(np.mean(np.log(item.error_sd))))
+    if not _worst(first.held_out, drifting) < BETTER:
+        return None
+    near = [item for item in usable if item is not first and _worst(first.error_sd, item.error_sd) >= BETTER]
+    return _as_result(search, [first, *near], model, uncertain)
+
+
+def _worst(errors: Array, others: Array) -> float:
+    """Largest ratio of errors; a simulation that diverged has an infinite one."""
+    ratios = np.where(np.isfinite(errors), errors, np.inf) / np.where(np.isfinite(others), others, np.inf)
+    return float(np.max(np.nan_to_num(ratios, nan=np.inf)))
+
+
+def _likely_causes(search: Search, result: SearchResult) -> list[Effect]:
+    """Causes of the best hypotheses, then others of the catalogue whose size has a derivative."""
+    ranked = [effect for item in result.hypotheses for effect in item.hypothesis.filter.effects]
+    usable = [
+        effect
+        for effect in dict.fromkeys([*ranked, *search.screen.static_effects])
+        if effect.has_derivative and effect.delays_output is None and not effect.is_source
+    ]
+    return usable[:MOST_CAUSES]
+
+
+def fit_lasting(model: ProcessModel, effect: Effect, uncertain: Mapping[str, float], run: Run) -> LastingFit | None:
+    """Fit a constant deviation and the uncertain parameters as a simulation; None if that diverges.
+
+    Args:
+        model: process model of the plant.
+        effect: the cause.
+        uncertain: standard deviations of uncertain parameters, by name.
+        run: the record.
+    """
+    fitter = _SimulationFitter(model, effect, uncertain, run)
+    fitted = fitter.fit()
+    if fitted is None:
+        return None
+    hidden = holdout_rows(run).astype(np.bool_)
+    without = fitter.fit_without(hidden, fitted[0])
+    errors, unseen = (run.measured - item.innovations.prediction for item in (fitted[1], without))
+    values = dict(zip(fitter.names, fitted[0].tolist(), strict=True))
+    sds = dict(zip(fitter.names, fitter.sds(*fitted).tolist(), strict=True))
+    return LastingFit(effect, values, sds, _rms(errors), _rms(unseen[hidden]))
+
+
+class _SimulationFitter:
+    """Least squares of a simulation's error, with priors and bounds."""
+
+    def __init__(self, model: ProcessModel, effect: Effect, uncertain: Mapping[str, float], run: Run) -> None:
+        prefix, self._extended, self._run = effect.prefix(model), effect.extend(model), run
+        self.names = (f"{prefix}.size", *(f"{prefix}.{item.name}" for item in effect.constants), *uncertain)
+        parameters = [self._extended.parameter(name) for name in self.names]
+        self._lower = np.array([item.lower for item in parameters])
+        self._upper = np.array([item.upper for item in parameters])
+        self._mean = np.array([item.value for item in parameters])
+        sds = [effect.upper - effect.lower, *(item.sd for item in effect.constants), *uncertain.values()]
+        self._weight = np.array(sds) ** -2.0
+        self._first = [
+            np.clip(start + shift, self._lower, self._upper)
+            for start in _starts(effect, self._mean)
+            for shift in _shifts(effect, list(uncertain.values()))
+        ]
+        sd = [max(float(np.nanstd(column)), 1e-12) for column in run.measured.T]
+        self._ekf = FaultFilter(self._extended, (), self._noise(sd), float(np.median(np.diff(run.time_min))))
+        if not run.breaks:
+            self._ekf.limit(None)
+        symbols = [item.symbol for item in parameters]
+        self._errors = ErrorLinearization(self._extended, self._ekf.noise_levels, symbols, symbols)
+
+    def fit(self) -> tuple[Array, FilterEvaluation] | None:
+        """Parameters and run of the best fit; None if every start diverges."""
+        tried = [item for item in (self._climb(start, FIRST_STEPS) for start in self._first) if item is not None]
+        if not tried:
+            return None
+        best = min(tried, key=lambda item: self._loss(*item))
+        for _ in range(ROUNDS):
+            residual = self._run.measured - best[1].innovations.prediction
+            self._ekf.noise = self._noise(np.maximum(_rms(residual), 1e-12).tolist())
+            best = self._climb(best[0], STEPS) or best
+        return best
+
+    def sds(self, p: Array, evaluation: FilterEvaluation) -> Array:
+        """Standard deviations of the parameters at a fit."""
+        return np.sqrt(np.diag(np.linalg.pinv(self._normal_equations(p, evaluation)[0], hermitian=True)))
+
+    def fit_without(self, hidden: NDArray[np.bool_], start: Array) -> FilterEvaluation:
+        """Run of a fit to the other rows."""
+        whole, seen = self._run, np.where(hidden[:, None], np.nan, self._run.measured)
+        self._run = replace(whole, measured=seen)
+        fitted = self._climb(start, STEPS)
+        self._run = whole
+        return self._evaluate(start) if fitted is None else fitted[1]
+
+    def _climb(self, p: Array, steps: int) -> tuple[Array, FilterEvaluation] | None:
+        """Damped Gauss-Newton steps from a start; None if the simulation diverges there."""
+        best, damping = (p, self._evaluate(p)), _DAMPING
+        if not np.all(np.isfinite(best[1].innovations.prediction[1:])):
+            return None
+        for _ in range(steps):
+            information, gradient = self._normal_equations(*best)
+            if not np.all(np.isfinite(information)):
+                break
+            before = self._loss(*best)
+            while damping < _LARGEST_DAMPING:
+                damped = information + damping * np.diag(np.diag(information))
+                step = solve_bounded(damped, gradient, self._lower - best[0], self._upper - best[0])[1]
+                trial = best[0] + step
+                other = (trial, self._evaluate(trial))
+                if self._loss(*other) < before:
+                    best, damping = other, 0.1 * damping
+                    break
+                damping *= 10.0
+            if before - self._loss(*best) < _CONVERGED:
+                break
+        return best
+
+    def _evaluate(self, p: Array) -> FilterEvaluation:
+        self._ekf.set_changes(dict(zip(self.names, p.tolist(), strict=True)))
+        return self._ekf.evaluate(self._run, ())
+
+    def _loss(self, p: Array, evaluation: FilterEvaluation) -> float:
+        return evaluation.loss + 0.5 * float(np.sum(self._weight * (p - self._mean) ** 2))
+
+    def _normal_equations(self, p: Array, evaluation: FilterEvaluation) -> tuple[Array, Array]:
+        self._errors.noise = self._ekf.noise_levels
+        self._errors.changes = dict(zip(self.names, p.tolist(), strict=True))
+        inputs, used = self._ekf.inputs(self._run, ()), self._ekf.used_values(self._run)
+        dynamics = error_dynamics_between(self._errors, self._run, inputs, evaluation.innovations, used)
+        g = signatures.constant_signatures(dynamics, p.size)
+        w = np.nan_to_num(evaluation.w[2:]).ravel()
+        weights = HUBER / np.maximum(np.abs(w), HUBER)
+        information = g.T @ (g * weights[:, None]) + np.diag(self._weight)
+        return information, g.T @ (weights * w) - self._weight * (p - self._mean)
+
+    def _noise(self, sd: Sequence[float]) -> Noise:
+        return Noise(tuple(sd), (0.0,) * len(self._extended.states))
+
+
+def _starts(effect: Effect, mean: Array) -> list[Array]:
+    """Initial parameters: the neutral size; of an effect with constants a typical one, at all their start values."""
+    if not effect.constants and not effect.start_values:
+        return [mean]
+    sizes = effect.start_values or (effect.typical,)
+    constants = product(*((item.value, *item.start_values) for item in effect.constants))
+    rest = mean[1 + len(effect.constants) :]
+    return [np.array([size, *values, *rest]) for values in constants for size in sizes]
+
+
+def _shifts(effect: Effect, sds: Sequence[float]) -> list[Array]:
+    """Shifts of the uncertain parameters in starts: none, and all by a standard deviation."""
+    own = np.zeros(1 + len(effect.constants))
+    return [np.append(own, sign * np.array(sds)) for sign in (0.0, -1.0, 1.0)[: 3 if sds else 1]]
+
+
+def _as_result(
+    search: Search, fits: Sequence[LastingFit], model: ProcessModel, uncertain: Mapping[str, float]
+) -> LastingResult:
+    """Hypotheses of lasting causes without process noise, about the uncertain parameters of the first."""
+    run, best = search.run, fits[0]
+    about = model.with_values({name: best.values[name] for name in uncertain})
+    constant, noise = Constant(run.time_min), Noise(tuple(best.error_sd.tolist()), (0.0,) * len(about.states))
+    period_min = float(np.median(np.diff(run.time_min)))
+    items = []
+    for fit in fits:
+        hypothesis = Hypothesis(FaultFilter(about, (fit.effect,), noise, period_min), (constant,))
+        own = [value for name, value in fit.values.items() if name not in uncertain]
+        start = (np.array(own),)
+        fitted = hypothesis.evaluate(run, start) if fit is best else hypothesis.fit(run, start)
+        items.append(search.score_fit(hypothesis, fitted))
+    nominal = Hypothesis(FaultFilter(about, (), noise, period_min), ())
+    without = search.score_fit(nominal, nominal.evaluate(run, ()))
+    ordered = [items[0], *sorted(items[1:], key=lambda item: item.bic)]
+    sds = {name: best.sds[name] for name in uncertain}
+    return LastingResult(SearchResult(noise, noise, without, ordered), sds)
+
+
+def _rms(errors: Array) -> Array:
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(np.nanmean(np.square(errors), axis=0)))
