@@ -45,10 +45,17 @@ DEFAULT_TRAINING_ROWS = 1000
 LEAST_FALSE_ALARMS, LARGEST_FALSE_ALARMS = 1e-3, 1e6
 """Fewest and most false alarms in 30 days that can be asked for."""
 
-USUAL_CHARTS = ("shewhart", "ewma", "mewma")
+
+class DefaultCharts(tuple[str, ...]):
+    """Charts that the settings do not name; the type tells them from the same charts named, in other processes too."""
+
+    __slots__ = ()
+
+
+USUAL_CHARTS = DefaultCharts(("shewhart", "ewma", "mewma"))
 """Charts where the settings name none."""
 
-CHARTS_OF_MANY = ("residual_space",)
+CHARTS_OF_MANY = DefaultCharts(("residual_space",))
 """Charts where the settings name none, of many outputs that no equations judge."""
 
 WITHOUT_EQUATIONS = ""
@@ -201,7 +208,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
                 f"training_min and training_rows both state the training, got {self.training_min:g} and "
                 f"{self.training_rows}; leave one out"
             )
-        if self.charts is USUAL_CHARTS or self.charts is CHARTS_OF_MANY:  # no others are named
+        if isinstance(self.charts, DefaultCharts):
             are_many = len(self.outputs) >= FEWEST_SIGNALS and not self._may_have_equations
             msgspec.structs.force_setattr(self, "charts", CHARTS_OF_MANY if are_many else USUAL_CHARTS)
         if len(set(self.charts)) != len(self.charts) or not self.charts:

@@ -105,6 +105,7 @@ class Monitor:
         judged_by = self.pipeline.model
         self._sample_units = make_sample_units(config.units, {} if judged_by is None else judged_by.units)
         self._plain_units: dict[str, str] = {}  # newest unit by signal that needs no conversion
+        self._converted: set[str] = set()  # signals whose samples were converted
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -158,6 +159,9 @@ class Monitor:
                 return []
             if converted == unit:
                 self._plain_units[signal] = unit
+                self._converted.discard(signal)
+            else:
+                self._converted.add(signal)
             unit = converted
         index = self._indices.get(signal)
         if index is None:
@@ -446,6 +450,11 @@ class Monitor:
         return self._watching_since_ns
 
     @property
+    def converts_samples(self) -> bool:
+        """True if samples come in other units than those in which they are judged."""
+        return bool(self._converted)
+
+    @property
     def unjudged_rows(self) -> int:
         """Number of rows that were not judged, see `PlantPipeline.unjudged_rows`."""
         return self.pipeline.unjudged_rows
@@ -458,7 +467,7 @@ class Monitor:
     @property
     def promise(self) -> Promise | None:
         """Promise of false alarms, as it is now; None before the end of the training."""
-        promise = self.pipeline.promise
+        promise = self.pipeline.promises.promise
         return None if promise is None else promise.message(self.last_ns or 0, self.pipeline.rows_watched)
 
     @property

@@ -10,20 +10,16 @@ after the training is charted as drift.
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from math import isfinite, nan
-from typing import TypeAlias
 
 import msgspec
 import numpy as np
-from msgspec.structs import replace
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.alarms.states import Event
 from monitor_node.baseline.arx_bank import ArxBank
 from monitor_node.baseline.black_box_reference import BlackBoxReference, BlackBoxReferenceState
 from monitor_node.baseline.commands import ACCEPT, RESTORE, TRAINED, check_command, is_command
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.predictor import ArxPredictor, arx_structure
-from monitor_node.baseline.promise import PlantPromise, PromiseState, TrainingCheck
 from monitor_node.baseline.references import (
     ArxReference,
     ArxReferenceState,
@@ -34,7 +30,7 @@ from monitor_node.baseline.references import (
 from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
-from monitor_node.chart_stage import ChartWatch, alarm_names, count_chance_alarms, has_values_only
+from monitor_node.chart_stage import ChartWatch, count_chance_alarms, has_values_only
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
@@ -44,7 +40,8 @@ from monitor_node.ingest.sampling import Interval, SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.operating_modes import OperatingModes, key_of
 from monitor_node.operation import Operation
-from monitor_node.power import Watch, state_power
+from monitor_node.power import Watch
+from monitor_node.promise_stage import CheckTraining, PromiseStage
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.shift_stage import NAME as SHIFT
 from monitor_node.shift_stage import ShiftWatch
@@ -54,14 +51,12 @@ from monitor_node.state.pipeline_state import KeptBaseline, ModeTraining, Pipeli
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import (
-    Alarm,
     Baseline,
     BaselineCommand,
     Check,
     Estimate,
     ModelSnapshot,
     Parameter,
-    Promise,
 )
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
@@ -69,19 +64,14 @@ from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening, innovations
-from reactorwatch.spc.training_errors import QUANTILE, TrainingErrors
+from reactorwatch.spc.training_errors import TrainingErrors
 from reactorwatch.stored_state import unpack_numbers, unpack_times
-
-RAISED = Event.RAISED.value
 
 MOST_KEPT = 3
 """Baselines that can be restored; memory stays bounded."""
 
 TIMES_FEWEST = 2
 """Times the fewest rows of a training that a part of it needs to judge the rest: with fewer it is too rough."""
-
-CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, TrainingState, str], TrainingCheck]
-"""Judges a training by itself, see `training_check`."""
 
 
 def check_promise(config: MonitorConfig, period_min: float) -> None:
@@ -130,8 +120,7 @@ class PlantPipeline:
         signals: signal checks.
         operation: operation of the plant, for the texts of alarms.
         training_rows: number of rows of the training, after its end.
-        promise: promise of false alarms; None before the end of the training.
-        alarm_rates: false alarms a row by the errors that the training may have made, shape (draws,), after its end.
+        promises: promise of false alarms.
     """
 
     def __init__(
@@ -148,22 +137,12 @@ class PlantPipeline:
         power: bool = False,
     ) -> None:
         self._config = config
-        self._check, self._states_power = check, power
-        self._watch: Watch | None = None
-        self.promise: PlantPromise | None = None
-        self._promised: Promise | None = None
+        self._states_power = power
         self._units = [config.units.get(name, "") for name in config.outputs]
-        self.alarm_rates = np.zeros(0)
-        self._chance_names = {
-            *(name for name, _ in alarm_names(config)),
-            *config.charts,
-            SHIFT,
-            *SignalChecks.CHANCE_NAMES,
-        }
-        self._promise_key = keys.key(config.plant, keys.PROMISE, NODE)
         self._update = ModelUpdate(config, deque() if changes is None else changes)
         self._diagnose = diagnose
         self._failures = Failures() if failures is None else failures
+        self.promises = PromiseStage(config, self._failures, check=check, points=points)
         self._board = board
         self._points = points
         self.model = _model(config, model)
@@ -246,9 +225,9 @@ class PlantPipeline:
             self._drift.until_next,
             b"" if self.baseline is None else self.baseline.SerializeToString(),
             self._shift.state,
-            None if self.promise is None else self.promise.state,
+            self.promises.state,
             None if self._bank is None else self._bank.state,
-            b"" if self.promise is None else Promise(power=self.promise.power).SerializeToString(),
+            self.promises.power,
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -290,8 +269,7 @@ class PlantPipeline:
         if watched.baseline:
             self._update.baseline = Baseline.FromString(watched.baseline)
         self._drift.until_next = watched.until_drift
-        if watched.promise is not None:
-            self.promise = PlantPromise(watched.promise, list(Promise.FromString(watched.power).power))
+        self.promises.restore(watched.promise, watched.power)
         self._checks = [Check(name=name, result=result) for name, result in watched.checks]
         learned = [item.learned for item in watched.whiteners]
         outputs = len(self._config.outputs)
@@ -319,7 +297,7 @@ class PlantPipeline:
         self, state: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
     ) -> Reference:
         if isinstance(state, ArxReferenceState):
-            for predictor in self._predictors:
+            for predictor in () if has_values_only(self._config) else self._predictors:
                 if not predictor.judges:  # in a state of an earlier version, where the reference judged
                     predictor.start_judging()
             return ArxReference(state)
@@ -450,7 +428,7 @@ class PlantPipeline:
                 self.signals.reset()
             before = len(publications)
             self._evaluate(measured)
-            self._count_alarms(time_ns, publications, before)
+            self._note(self.promises.count_alarms(time_ns, self.rows_watched, publications, before))
             self.is_normal = self._find_normal(time_ns)
         self.operation.inputs = ()
 
@@ -461,7 +439,7 @@ class PlantPipeline:
         """
         if not self._points:
             return []
-        publications, reference = self._promise_messages(time_ns), self._reference
+        publications, reference = self.promises.messages(time_ns, self.rows_watched), self._reference
         outputs = zip(self._model_keys, self._config.outputs, self._predictors, strict=True)
         for index, (key, output, predictor) in enumerate(outputs):
             adaptive, fitted = predictor.adaptive_snapshot(), predictor.reference_snapshot()
@@ -584,7 +562,7 @@ class PlantPipeline:
                     self._check_training(rows)
                 self._evaluate(row)
                 publications.extend(self.snapshots(time_ns))
-                publications.extend(self._promise_messages(time_ns))
+                publications.extend(self.promises.messages(time_ns, self.rows_watched))
                 return
         self._training.add(time_ns, row.inputs, values)
         if not self._points:
@@ -659,53 +637,18 @@ class PlantPipeline:
             self.on_finding(self._diagnose(job))
 
     def _check_training(self, rows: TrainingState) -> None:
-        """Judge the training by itself, and state the power; an error there leaves the promise without them."""
-        if self._watch is not None and self.promise is not None:
-            watch, self._watch = self._watch, None
-            try:
-                self.promise.power = state_power(watch, rows)
-            except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
-                self._failures.add("power", error, "the deviations that would be seen are not stated")
-        if self._check is None or self.promise is None or self._reference is None:
-            return
-        model = self.equations if isinstance(self._reference, ProcessReference) else None
-        try:
-            check = self._check(self._config, model, rows, self._reference.kind)
-        except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
-            self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
-            return
-        self.promise.state = replace(self.promise.state, check=check)
-        if not self.promise.is_kept:
-            self.notes.append(f"promise: {self.promise.text(self.rows_watched)}")
+        """Judge the training by itself."""
+        if self._reference is not None:
+            model = self.equations if isinstance(self._reference, ProcessReference) else None
+            self._note(self.promises.check(rows, model, self._reference.kind, self.rows_watched))
+
+    def _note(self, text: str) -> None:
+        if text:
+            self.notes.append(text)
 
     def _describe(self, time_ns: int) -> str:
         """Operation of the plant, and a promise that it does not keep, as the text of an alarm has them."""
-        warning = "" if self.promise is None else self.promise.warning
-        return "; ".join(filter(None, (self.operation.describe(time_ns), warning)))
-
-    def _promise_messages(self, time_ns: int) -> list[Publication]:
-        """The promise as it is now; without points only one that is not kept or no longer holds."""
-        promise, rows = self.promise, self.rows_watched
-        if promise is None or not (self._points or not promise.is_kept or promise.has_drifted(rows)):
-            return []
-        message = promise.message(time_ns, rows)
-        if message == self._promised:  # it was published for another reason in this row
-            return []
-        self._promised = message
-        return [Publication(self._promise_key, message)]
-
-    def _count_alarms(self, time_ns: int, publications: list[Publication], before: int) -> None:
-        """Count the alarms that chance can raise among the publications of a row, from an index on."""
-        if self.promise is None:
-            return
-        alarms = [item.message for item in publications[before:] if isinstance(item.message, Alarm)]
-        raised = [alarm for alarm in alarms if alarm.event == RAISED]
-        if count := sum(alarm.alarm.partition("/")[0] in self._chance_names for alarm in raised):
-            had_drifted = self.promise.has_drifted(self.rows_watched)
-            self.promise.count_alarms(count, self.rows_watched)
-            publications.extend(self._promise_messages(time_ns))
-            if self.promise.has_drifted(self.rows_watched) and not had_drifted:
-                self.notes.append(f"promise: {self.promise.text(self.rows_watched)}")
+        return "; ".join(filter(None, (self.operation.describe(time_ns), self.promises.warning)))
 
     def _change_baseline(self, time_ns: int, publications: list[Publication]) -> None:
         """Execute the change that holds from a row on, if there is one."""
@@ -739,7 +682,7 @@ class PlantPipeline:
             trained.reference.restart()
             self._quarantined = (False,) * len(self._config.outputs)
             publications.extend(self.snapshots(time_ns))
-            publications.extend(self._promise_messages(time_ns))
+            publications.extend(self.promises.messages(time_ns, self.rows_watched))
         return True
 
     # --- commands --------------------------------------------------------------------------------------------
@@ -867,7 +810,7 @@ class PlantPipeline:
         self._whiteners = [
             Prewhitener(item, self._numbers["whiteners"][0, i : i + 1]) for i, item in enumerate(trained.learned)
         ]
-        if isinstance(trained.reference, ArxReference):
+        if isinstance(trained.reference, ArxReference) and self._bank is None:
             for predictor in self._predictors:
                 predictor.start_judging()
         self._charts.start(trained.learned, trained.e, trained.values, self._arl0)
@@ -921,26 +864,22 @@ class PlantPipeline:
 
     def _stop_judging(self) -> None:
         """Judge no rows."""
-        self._reference = self._step = self._kalman = self._suspicion = self._bank = self.promise = None
+        self._reference = self._step = self._kalman = self._suspicion = self._bank = None
         self._is_process = self._is_process_given
         self.signals.use_ranges(self._ranges if self._is_process else self._stated)
         self._leave_out({})
         self._refusals = self.rows_watched = 0
+        self.promises.promise = None
 
     def _start_promise(self, trained: TrainingResult, period_min: float) -> None:
-        """State the promise of false alarms; alarms so far go on to count."""
+        """State the promise of false alarms."""
         errors, arl0 = TrainingErrors.draw(len(trained.learned)), self._arl0
         rates = self._charts.relative_rates(trained.learned, trained.e, trained.values, arl0, errors)
         rates += self.signals.relative_rates(trained.learned, self._evaluated, arl0, errors)
         rates += self._drift.chance_alarms(self._evaluated) + self._count_step_tests
-        self.alarm_rates = rates / arl0
-        rows = false_alarm_budget.DAYS_MIN / period_min
-        mean, upper = rows * self._chance_alarms / arl0, rows * float(np.quantile(self.alarm_rates, QUANTILE))
-        before = PromiseState(0.0, 0.0, rows) if self.promise is None else self.promise.state
-        state = replace(before, per_30_days=mean, upper_per_30_days=max(mean, upper), rows_in_30_days=rows)
-        self.promise = PlantPromise(replace(state, check=TrainingCheck()))
+        watch = None
         if self._states_power:
-            self._watch = Watch(
+            watch = Watch(
                 self._config,
                 trained.reference,
                 self._predictors,
@@ -951,6 +890,7 @@ class PlantPipeline:
                 dict(zip(self._config.outputs, self._units, strict=True)),
                 period_min,
             )
+        self.promises.start(rates / arl0, self._chance_alarms / arl0, period_min, watch)
 
     def _promise(self, asked: float | None, period_min: float, checks: list[Check]) -> float:
         """False alarms in 30 days that are promised; tests of steps are left out if they would make it impossible."""
@@ -1075,7 +1015,7 @@ class PlantPipeline:
         if self._drift.wanted:
             self._update_beside(row)
             row.publications.extend(self._drift.update(row.time_ns, self._predictors))
-        self._count_alarms(row.time_ns, row.publications, before)
+        self._note(self.promises.count_alarms(row.time_ns, self.rows_watched, row.publications, before))
         if self._board.has_unexplained:  # a lasting step
             self._leave_normal()
             self._set_learning()
@@ -1159,7 +1099,7 @@ class PlantPipeline:
         """Let a reference that learns do so while no alarm without a known cause is active."""
         if isinstance(self._reference, BlackBoxReference):
             self._reference.set_learning(not self._board.has_unexplained)
-        elif isinstance(self._reference, ArxReference):
+        elif isinstance(self._reference, ArxReference) and self._bank is None:
             for predictor in self._predictors:
                 predictor.set_learning(not self._board.has_unexplained)
 

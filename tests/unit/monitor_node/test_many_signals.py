@@ -1,10 +1,12 @@
 """Plants of many signals without equations: the residual space is their chart, and names where a disturbance enters."""
 
+import pickle
+
 import msgspec
 import numpy as np
 import pytest
 
-from monitor_node.config import CHARTS_OF_MANY, USUAL_CHARTS, MonitorConfig
+from monitor_node.config import CHARTS_OF_MANY, USUAL_CHARTS, DefaultCharts, MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm
@@ -61,7 +63,12 @@ def raised(said: list[Publication]) -> list[Alarm]:
 def test_many_signals_without_equations_have_charts_of_their_own_where_none_are_named(
     config: MonitorConfig, charts: tuple[str, ...]
 ) -> None:
+    """So too after another process has got the settings, where signals may be named later."""
     assert config.charts == charts
+    sent = pickle.loads(pickle.dumps(config))
+    assert sent.charts == charts
+    few = msgspec.structs.replace(sent, outputs=("a",), priorities={})
+    assert few.charts == (USUAL_CHARTS if isinstance(config.charts, DefaultCharts) else charts)
 
 
 @pytest.mark.parametrize("faulty", [0, 6])
