@@ -354,6 +354,11 @@ class PlantPipeline:
         return "" if self._reference is None else self._reference.kind
 
     @property
+    def newest_reference(self) -> str:
+        """Kind of the reference that judges, or judged last; empty before there was one."""
+        return self.reference or ("" if self._modes is None else self._modes.state.reference)
+
+    @property
     def noise_levels(self) -> dict[str, dict[str, float]] | None:
         """Noise levels of the equations, see `ProcessReference`; None with another reference."""
         return self._reference.noise_levels if isinstance(self._reference, ProcessReference) else None
@@ -384,7 +389,8 @@ class PlantPipeline:
     @property
     def expected_false_alarms(self) -> float:
         """Mean number of false alarms expected so far."""
-        return self.opportunities / self._arl0 if self._arl0 else 0.0
+        before = 0.0 if self._modes is None else self._modes.state.expected
+        return before + (self.opportunities / self._arl0 if self._arl0 else 0.0)
 
     def update(self, row: Row, units: list[str], publications: list[Publication]) -> None:
         """Process a row.
@@ -735,6 +741,8 @@ class PlantPipeline:
         change, self._update.baseline = self._update.baseline, None
         self._restore_training(msgspec.structs.replace(kept.trained, suspicion=None, baseline=b""))
         self._update.baseline = change
+        if self._bank is not None:
+            self._bank = ArxBank(self._predictors, self._inputs)
         assert self._reference is not None
         self._reference.restart()
         self._charts.restart()
@@ -780,7 +788,7 @@ class PlantPipeline:
             again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
         """
         if self._modes is not None:
-            self._modes.state.is_learned = True
+            self._modes.state.is_learned, self._modes.state.reference = True, trained.reference.kind
         self._leave_out(trained.left_out)
         unmade = self._charts.choose(self._evaluated, trained.e, trained.values)
         self._shift.is_active = trained.responses is not None and not has_values_only(self._config)
@@ -826,7 +834,10 @@ class PlantPipeline:
         elif state.is_judged and self._training.rows:
             state.trainings[old] = ModeTraining(self._training.state, [item.state for item in self._predictors])
         self._incident = None
-        state.mode = [self.operation.values[name] for name in self._config.modes]
+        state.mode, state.expected = (
+            [self.operation.values[name] for name in self._config.modes],
+            self.expected_false_alarms,
+        )
         new, change = key_of(state.mode), self._update.baseline
         self._stop_judging()
         state.is_judged = not modes.is_startup(state.mode)
@@ -834,7 +845,7 @@ class PlantPipeline:
             return
         if (known := state.baselines.pop(new, None)) is not None:
             self._restore_baseline(known)
-            self._update.baseline = change
+            self._update.baseline, state.expected = change, 2.0 * state.expected - self.expected_false_alarms
             return
         begun = state.trainings.pop(new, None)
         state.is_resumed = begun is not None and state.is_learned
@@ -852,6 +863,7 @@ class PlantPipeline:
             )
 
     def _stop_judging(self) -> None:
+        """Judge no rows."""
         self._reference = self._step = self._kalman = self._suspicion = self._bank = None
         self._is_process = self._is_process_given
         self.signals.use_ranges(self._ranges if self._is_process else self._stated)

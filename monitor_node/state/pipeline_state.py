@@ -91,6 +91,8 @@ class ModesState(msgspec.Struct, forbid_unknown_fields=True):
         mode: present mode, one value a signal; NaN before its first sample.
         is_judged: False in a mode in which signals are checked only.
         is_learned: True once a mode was learned: one that is new then has not been seen in the training.
+        reference: kind of the reference that judged last.
+        expected: false alarms expected in the modes before, less those of the present one before.
         is_resumed: True if the present mode was seen in the training, and is learned from these rows now.
         baselines: baselines of the other modes.
         trainings: trainings of the other modes.
@@ -99,6 +101,8 @@ class ModesState(msgspec.Struct, forbid_unknown_fields=True):
     mode: list[float]
     is_judged: bool = True
     is_learned: bool = False
+    reference: str = ""
+    expected: float = 0.0
     is_resumed: bool = False
     baselines: dict[str, KeptBaseline] = msgspec.field(default_factory=dict)
     trainings: dict[str, ModeTraining] = msgspec.field(default_factory=dict)
