@@ -66,6 +66,7 @@ soak: $(READY) ## a fleet for ten minutes of kills, cuts and garbage (MINUTES=10
 promise: $(READY) ## false alarms beside the number promised: 80 runs without a fault, 33 sound plants that are not quite the model
 	@$(BIN)/python benchmarks/false_alarms.py
 	@$(BIN)/python -m benchmarks.promise
+	@$(BIN)/python -m benchmarks.promise.statements
 
 outside: $(READY) ## public benchmarks beside other methods (DATA=folder of their data); writes its tables into docs/outside.md
 	@$(BIN)/python -m benchmarks.outside --data $(DATA) --write docs/outside.md

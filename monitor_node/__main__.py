@@ -13,10 +13,9 @@ from pathlib import Path
 
 import structlog
 
-from monitor_node.alarms.commands import COMMANDS
 from monitor_node.baseline.training_diagnosis import read_equations
 from monitor_node.config import MonitorConfig
-from monitor_node.core import Monitor
+from monitor_node.core import COMMANDS, Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker
 from monitor_node.health import NODE
 from monitor_node.isolation import stage

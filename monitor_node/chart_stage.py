@@ -28,6 +28,7 @@ from reactorwatch.spc.charts.catalogue import chart
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.shewhart import designed_width
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalState
+from reactorwatch.spc.detection import Detector
 from reactorwatch.spc.joint_chart import JointChart
 from reactorwatch.spc.m_of_n import false_alarm_rate
 from reactorwatch.spc.prewhitening import Prewhitening
@@ -73,12 +74,12 @@ def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
             names += [(name, signal) for signal in config.outputs]
         elif issubclass(kind, ValueChart) or (issubclass(kind, JointChart) and len(config.outputs) > 1):
             names.append((name, ALL))
-    if _has_values_only(config):
+    if has_values_only(config):
         names += [(name, signal) for name in SUBSTITUTES for signal in config.outputs]
     return names
 
 
-def _has_values_only(config: MonitorConfig) -> bool:
+def has_values_only(config: MonitorConfig) -> bool:
     """True if all charts of the settings are of values, so that there may be none after a training."""
     return all(issubclass(chart(name), ValueChart) for name in config.charts)
 
@@ -215,19 +216,19 @@ class _OfValues:
 
     Args:
         values: the chart.
-        signals: names of the signals of a row, the inputs first.
+        config: configuration of the monitor.
     """
 
-    def __init__(self, values: ValueChart, signals: Sequence[str]) -> None:
-        self._chart = values
-        self._indices = [signals.index(name) for name in values.names]
+    def __init__(self, values: ValueChart, config: MonitorConfig) -> None:
+        self._chart, self._has_inputs = values, bool(config.inputs)
+        self._indices = [config.signals.index(name) for name in values.names]
 
     def to_bytes(self) -> bytes:
         return self._chart.state.to_bytes()
 
     def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
-        """Update with a row; a row that the reference does not predict at all is skipped."""
-        if True not in row.known:
+        """Update with a row; one that is not predicted at all is skipped, since inputs may be beyond the training."""
+        if self._has_inputs and True not in row.known:
             return None
         outputs: Sequence[float] = row.values
         if True in row.withheld:
@@ -394,12 +395,14 @@ class ChartWatch:
             if issubclass(kind, SignalChart):
                 return _of_each(kind, [kind.design(baseline.of([index])) for index in range(len(config.outputs))])
             if issubclass(kind, ValueChart):
-                of_values = ValueBaseline(*self._complete_values(values), arl0, config.chart_settings)
-                return _OfValues(kind.design(of_values), config.signals)
+                return _OfValues(kind.design(self._value_baseline(values, arl0)), config)
             assert issubclass(kind, JointChart)
             return _OfAll(kind.design(baseline.of(np.flatnonzero(self._evaluated).tolist())), self._evaluated)
 
         self._watch(design_charts)
+
+    def _value_baseline(self, values: Array, arl0: float) -> ValueBaseline:
+        return ValueBaseline(*self._complete_values(values), arl0, self._config.chart_settings)
 
     def _baseline(self, learned: list[Prewhitening], e: Array, arl0: float) -> Baseline:
         config = self._config
@@ -407,12 +410,15 @@ class ChartWatch:
         sds = memory_sds(e, config.chart_settings["ewma_weight"])
         return Baseline(tuple(learned), e, sds, arl0, p, config.chart_settings)
 
-    def relative_rates(self, learned: list[Prewhitening], e: Array, arl0: float, errors: TrainingErrors) -> Array:
+    def relative_rates(
+        self, learned: list[Prewhitening], e: Array, values: Array, arl0: float, errors: TrainingErrors
+    ) -> Array:
         """Rate of false alarms of all charts by the errors of the training, in shares of one alarm, shape (draws,).
 
         Args:
             learned: prewhitening of each output.
             e: prewhitened residuals of the training, shape (n, outputs); NaN where there is none.
+            values: measured values of the training, see `choose`.
             arl0: run length of each alarm without a fault, in rows.
             errors: errors of all outputs.
         """
@@ -420,6 +426,9 @@ class ChartWatch:
         total = np.zeros(len(errors.mean))
         for name in self._chosen:
             kind = chart(name)
+            if issubclass(kind, ValueChart):
+                total += kind.relative_rates(self._value_baseline(values, arl0))
+                continue
             groups = [[index] for index in evaluated] if issubclass(kind, SignalChart) else [evaluated]
             assert issubclass(kind, SignalChart | JointChart)
             for group in groups:
@@ -427,11 +436,24 @@ class ChartWatch:
                 total += rates if kind.has_memory else self._rule_rates(baseline, rates)
         return total
 
+    def detectors(self, learned: list[Prewhitening], e: Array, arl0: float) -> list[Detector]:
+        """The charts as moving averages, as far as they are; arguments as for `start`."""
+        baseline, evaluated, found = self._baseline(learned, e, arl0), np.flatnonzero(self._evaluated).tolist(), []
+        for name in self._chosen:
+            kind = chart(name)
+            for group in [[index] for index in evaluated] if issubclass(kind, SignalChart) else [evaluated]:
+                average = kind.detector(baseline.of(group))
+                if average is not None:
+                    weight, level, matrix = average
+                    rule = (1, 1) if kind.has_memory else (self._config.raise_count, self._config.window)
+                    found.append(Detector(tuple(group), matrix, weight, level, rule))
+        return found
+
     def _rule_rates(self, baseline: Baseline, rates: Array) -> Array:
         """Relative rate of an alarm that takes several points, from that of single points."""
         count, window, p = self._config.raise_count, self._config.window, baseline.point_probability
-        nodes = np.geomspace(1e-3 * p, 1.0, 40)
-        of_rule = [false_alarm_rate(count, window, float(node)) * baseline.arl0 for node in nodes]
+        nodes = np.geomspace(0.1 * p, 1.0, 40)  # rates of far rarer points are rounding errors, and nothing
+        of_rule = [max(false_alarm_rate(count, window, float(node)) * baseline.arl0, 1e-9) for node in nodes]
         return np.asarray(np.exp(np.interp(np.log(np.maximum(rates * p, nodes[0])), np.log(nodes), np.log(of_rule))))
 
     @property
@@ -454,7 +476,7 @@ class ChartWatch:
         self._evaluated, self._chosen = evaluated, [name for name in self._names if name in state.charts]
         outputs = len(self._config.outputs)
         each = {name for name in self._names if issubclass(chart(name), SignalChart)}
-        if _has_values_only(self._config) and not each & set(state.charts):
+        if has_values_only(self._config) and not each & set(state.charts):
             each = set()
         if not each <= set(state.charts) <= set(self._names) or not len(self.widths) == len(self._passed) == outputs:
             raise ValueError(f"there must be the charts {', '.join(self._names)}, got {', '.join(state.charts)}")
@@ -471,11 +493,17 @@ class ChartWatch:
             if issubclass(kind, ValueChart):
                 of_values = kind.from_state(kind.State.from_bytes(data))
                 self._signals = of_values.names
-                return _OfValues(of_values, self._config.signals)
+                return _OfValues(of_values, self._config)
             assert issubclass(kind, JointChart)
             return _OfAll(kind.from_state(kind.State.from_bytes(data)), self._evaluated)
 
         self._watch(restore_charts)
+
+    def restart(self) -> None:
+        """Forget the rows seen, in all charts."""
+        for watched in self._watched.values():
+            for index in range(len(watched.alarms)):
+                watched.charts.restart(index)
 
     def _watch(self, made: Callable[[type[Chart]], _Charts]) -> None:
         """Give the charts of each name their alarms and keys."""

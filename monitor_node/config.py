@@ -42,14 +42,21 @@ DEFAULT = find_process()
 DEFAULT_TRAINING_ROWS = 1000
 """Training where nothing is stated, of a process that has no duration of its own."""
 
-LARGEST_FALSE_ALARMS = 1e6
-"""Most false alarms in 30 days that can be asked for."""
+LEAST_FALSE_ALARMS, LARGEST_FALSE_ALARMS = 1e-3, 1e6
+"""Fewest and most false alarms in 30 days that can be asked for."""
 
-USUAL_CHARTS = ("shewhart", "ewma", "mewma")
+
+class DefaultCharts(tuple[str, ...]):
+    """Charts that the settings do not name; the type tells them from the same charts named, in other processes too."""
+
+    __slots__ = ()
+
+
+USUAL_CHARTS = DefaultCharts(("shewhart", "ewma", "mewma"))
 """Charts where the settings name none."""
 
-CHARTS_OF_MANY = ("residual_space",)
-"""Charts where the settings name none, of many signals that no equations judge."""
+CHARTS_OF_MANY = DefaultCharts(("residual_space",))
+"""Charts where the settings name none, of many outputs that no equations judge."""
 
 WITHOUT_EQUATIONS = ""
 """Setting `process` of a plant that no equations judge."""
@@ -90,7 +97,11 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         inputs: signals that drive the plant; none, one or several.
         outputs: signals that are predicted and monitored.
         setpoints: signals that controllers aim at; an alarm states their recent moves.
-        modes: signals that say how the plant is operated, such as a controller in manual; an alarm states unusual ones.
+        modes: signals that say how the plant is operated, such as a controller in manual: each mode has a baseline of
+            its own; one that the training has not seen is watched by the signal checks only. An alarm states unusual
+            ones.
+        startup_modes: values by mode in which the plant starts up or shuts down; they are watched by the signal checks
+            only.
         labels: signals that are carried along, and ignored.
         bounds: lowest and highest value by signal, in the unit in which it is judged; other values are not measured
             values, and an input at a bound is saturated, which an alarm states.
@@ -110,7 +121,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             inputs no black box).
         process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
             nominal reactor where its signals are watched; empty: no equations judge.
-        charts: charts of the residuals and of the values; where none are named, `residual_space` for 8 signals or more
+        charts: charts of the residuals and of the values; where none are named, `residual_space` for 8 outputs or more
             that no equations judge, else `shewhart`, `ewma` and `mewma`.
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
             nearest number that the charts can keep for the number of alarms and the sampling period.
@@ -138,6 +149,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     outputs: tuple[str, ...] = DEFAULT_SIGNALS["outputs"]
     setpoints: tuple[str, ...] = ()
     modes: tuple[str, ...] = ()
+    startup_modes: dict[str, tuple[float, ...]] = msgspec.field(default_factory=dict)
     labels: tuple[str, ...] = ()
     bounds: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
     resolution: dict[str, float] = msgspec.field(default_factory=dict)
@@ -151,7 +163,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     reference: ReferenceName | Literal["process"] = "auto"
     process: str | None = None
     charts: tuple[ChartName, ...] = USUAL_CHARTS
-    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=LARGEST_FALSE_ALARMS)] | None = None
+    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=LEAST_FALSE_ALARMS, le=LARGEST_FALSE_ALARMS)] | None = (
+        None
+    )
     smallest_sd: dict[str, float] = msgspec.field(default_factory=lambda: dict(DEFAULT.watch.smallest_sd))
     isolation: bool = True
     isolation_rows: Annotated[int, msgspec.Meta(ge=50, le=10_000)] = 600
@@ -194,13 +208,16 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
                 f"training_min and training_rows both state the training, got {self.training_min:g} and "
                 f"{self.training_rows}; leave one out"
             )
-        if self.charts is USUAL_CHARTS or self.charts is CHARTS_OF_MANY:  # no others are named
-            are_many = len(self.signals) >= FEWEST_SIGNALS and not self._may_have_equations
+        if isinstance(self.charts, DefaultCharts):
+            are_many = len(self.outputs) >= FEWEST_SIGNALS and not self._may_have_equations
             msgspec.structs.force_setattr(self, "charts", CHARTS_OF_MANY if are_many else USUAL_CHARTS)
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
         if self.process is not None and self.outputs == DEFAULT_SIGNALS["outputs"]:
             return  # the outputs are those of the process, which `watched_process` sets
+        for signal in self.startup_modes:
+            if signal not in self.modes:
+                raise ValueError(f"startup_modes are by mode, {self.modes}, got {signal!r}")
         for signal, (lower, upper) in self.bounds.items():
             if signal not in self.signals:
                 raise ValueError(f"bounds are by input and output, {self.signals}, got {signal!r}")

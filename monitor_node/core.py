@@ -7,11 +7,15 @@ follow from its samples and from operators' actions. So a replay reproduces them
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from google.protobuf.message import Message
+
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.alarms.commands import COMMANDS as ALARM_COMMANDS
 from monitor_node.alarms.commands import execute_command
+from monitor_node.baseline.commands import BASELINE, LIST
 from monitor_node.baseline.model_update import ScheduledChange
 from monitor_node.baseline.training import NO_VALUE
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
@@ -32,10 +36,14 @@ from monitor_node.state.monitor_state import MonitorState, learning_settings, op
 from monitor_node.training_check import check_training
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.messages_pb2 import Alarm, Baseline, CommandReply, Promise, Sample
+from reactorwatch.contract.commands import decode_command
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, BaselineCommand, CommandReply, Promise, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+
+COMMANDS: Mapping[str, type[Message]] = {**ALARM_COMMANDS, BASELINE: BaselineCommand}
+"""Message type by command."""
 
 
 class Monitor:
@@ -48,6 +56,7 @@ class Monitor:
         model: process model, in minutes since 1970-01-01 UTC; None: the nominal reactor.
         diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`, and
             hands the result to `on_finding`.
+        power: True to state the deviations that would be seen; None: with points.
 
     Raises:
         InputError: the settings are inconsistent.
@@ -73,7 +82,9 @@ class Monitor:
         points: bool = True,
         model: ProcessModel | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
+        power: bool | None = None,
     ) -> None:
+        self._power = points if power is None else power
         self.config = config = order_inputs(config, model)
         self._points, self._model, self._diagnose = points, model, diagnose
         self._changes: deque[ScheduledChange] = deque()
@@ -92,7 +103,9 @@ class Monitor:
         self.alarms = Annunciator(config)
         self.pipeline = self._new_pipeline(self.alarms)
         judged_by = self.pipeline.model
-        self._sample_units = make_sample_units(config.units, None if judged_by is None else judged_by.units)
+        self._sample_units = make_sample_units(config.units, {} if judged_by is None else judged_by.units)
+        self._plain_units: dict[str, str] = {}  # newest unit by signal that needs no conversion
+        self._converted: set[str] = set()  # signals whose samples were converted
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -115,10 +128,9 @@ class Monitor:
         if message.received_ns and now_ns - message.received_ns > self.stats.lag_ns:
             self.stats.lag_ns = now_ns - message.received_ns
         signal = self._signal_by_key.get(message.key)
-        if signal is None and message.key in self._label_keys:
-            return []
         if signal is None:
-            self.rejects.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
+            if message.key not in self._label_keys:
+                self.rejects.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
             return []
         if len(message.payload) > LARGEST_SAMPLE:
             self.rejects.add("too_large", f"{message.key}: {len(message.payload)} bytes are no Sample")
@@ -139,12 +151,18 @@ class Monitor:
         if quality not in USABLE or not abs(value) < LARGEST_VALUE:
             self.rejects.add(*reject_reason(signal, sample))
             return []
-        if self._sample_units is not None:
+        if unit != self._plain_units.get(signal):
             try:
-                value, unit = self._sample_units.convert(signal, unit, value)
+                value, converted = self._sample_units.convert(signal, unit, value)
             except InputError as error:
                 self.rejects.add("unit", str(error))
                 return []
+            if converted == unit:
+                self._plain_units[signal] = unit
+                self._converted.discard(signal)
+            else:
+                self._converted.add(signal)
+            unit = converted
         index = self._indices.get(signal)
         if index is None:
             self.pipeline.operation.on_sample(signal, sample.time_ns, value)
@@ -197,13 +215,25 @@ class Monitor:
         """Execute an operator's command at the time of the newest row, or refuse it."""
         self.received += 1
         try:
-            reply, publications = execute_command(self.alarms, question)
+            reply, publications = self._execute(question)
         except (InputError, DecodeError) as error:
             reason = error.reason if isinstance(error, DecodeError) else "command"
             self.rejects.add(reason, f"{question.key}: {error}")
             return CommandReply(accepted=False, text=str(error)), []
         self._published += len(publications)
         return reply, publications
+
+    def _execute(self, question: Encoded) -> tuple[CommandReply, list[Publication]]:
+        if question.key != keys.key(self.config.plant, keys.COMMAND, BASELINE):
+            return execute_command(self.alarms, question)
+        _, command = decode_command(question, COMMANDS)
+        assert isinstance(command, BaselineCommand), "the catalogue says so"
+        if command.what == LIST:
+            baselines = self.pipeline.baselines
+            return CommandReply(accepted=True, text=f"{len(baselines)} baselines", baselines=baselines), []
+        change = self.pipeline.schedule_command(command)
+        text = f"{change.what} by {change.by}, from the next row on"
+        return CommandReply(accepted=True, text=text), []
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Publish health if it is due; raise the alarm of a plant without data."""
@@ -377,7 +407,7 @@ class Monitor:
         """`waiting` for the first row, `training` or `watching`."""
         if self.first_ns is None:
             return "waiting"
-        return "training" if self._watching_since_ns is None else "watching"
+        return "watching" if self.pipeline.watching or not self.pipeline.is_judged else "training"
 
     @property
     def model(self) -> ProcessModel | None:
@@ -420,6 +450,11 @@ class Monitor:
         return self._watching_since_ns
 
     @property
+    def converts_samples(self) -> bool:
+        """True if samples come in other units than those in which they are judged."""
+        return bool(self._converted)
+
+    @property
     def unjudged_rows(self) -> int:
         """Number of rows that were not judged, see `PlantPipeline.unjudged_rows`."""
         return self.pipeline.unjudged_rows
@@ -432,7 +467,7 @@ class Monitor:
     @property
     def promise(self) -> Promise | None:
         """Promise of false alarms, as it is now; None before the end of the training."""
-        promise = self.pipeline.promise
+        promise = self.pipeline.promises.promise
         return None if promise is None else promise.message(self.last_ns or 0, self.pipeline.rows_watched)
 
     @property
@@ -545,6 +580,7 @@ class Monitor:
             changes=self._changes,
             diagnose=self._diagnose,
             check=check_training,
+            power=self._power,
         )
 
     def _contain(self, stage: str, error: Exception) -> None:

@@ -76,6 +76,7 @@ class DriftWatch:
             arl0: run length of each alarm without a fault, in rows.
         """
         notes: list[str] = []
+        self.until_next = ROWS
         if not self.wanted:
             return notes
         for signal, predictor in compress(zip(self._outputs, predictors, strict=True), evaluated):

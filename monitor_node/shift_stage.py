@@ -72,6 +72,12 @@ class ShiftWatch:
         self._tests = StepTests.from_state(state) if state else None
         self.is_active = self._tests is not None
 
+    @property
+    def sensitivities(self) -> list[tuple[float, float]]:
+        """Statistic of each output's test after a lasting step of one unit, and its limit; empty without tests."""
+        tests = self._tests
+        return [] if tests is None else [(tests.sensitivity(i), tests.limit(i)) for i in range(len(self._outputs))]
+
     def restart(self) -> None:
         """Forget the rows seen, after a gap."""
         if self._tests is not None:

@@ -30,6 +30,7 @@ class Benchmark:
 
 BENCHMARKS = (
     Benchmark("Tennessee Eastman: detection", "tep", tennessee.measure),
+    Benchmark("Tennessee Eastman: place of a fault", "tep", tennessee.measure_places),
     Benchmark("SKAB: anomalies and change points", "skab", water_circuit.measure),
     Benchmark("Three tanks: cause and place", "three_tanks", three_tanks.measure),
     Benchmark("Cascaded tanks: simulation", "cascaded_tanks", free_run.measure_tanks),

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from math import inf, nan
 
 import numpy as np
+from numpy.typing import NDArray
 
 from monitor_node.baseline.references import GATE, RowPrediction
 from monitor_node.ingest.sampling import TOLERANCE, regular_intervals
@@ -193,6 +194,19 @@ class BlackBoxReference:
             reference=True,
             held=not self._filter.learning,
         )
+
+    def normalised_residuals(self, inputs: Array, outputs: Array, follows: NDArray[np.bool_]) -> Array:
+        """Normalised residuals of other rows by the model as fitted, shape (rows, monitored outputs).
+
+        Args:
+            inputs: shape (rows, inputs).
+            outputs: monitored outputs, shape (rows, monitored outputs).
+            follows: True where a row is one period after the row before.
+        """
+        residuals, sds = BlackBoxFilter(self.model).run(inputs, outputs[:, self._outputs], follows)
+        z = np.full(outputs.shape, nan)
+        z[:, self._outputs] = residuals / sds * self.model.out_of_sample
+        return z
 
     @property
     def weakness(self) -> str:

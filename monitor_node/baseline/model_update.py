@@ -8,6 +8,7 @@ same.
 from collections import deque
 from typing import NamedTuple
 
+from monitor_node.baseline.commands import is_command
 from monitor_node.baseline.predictor import ArxPredictor, arx_structure
 from monitor_node.baseline.references import ProcessReference
 from monitor_node.baseline.training import Training, TrainingResult, TrainingState
@@ -87,11 +88,15 @@ class ModelUpdate:
             time_ns: time of the row. Where the row that a recording names was lost, the change holds from the next.
         """
         last_ns, self._last_ns = self._last_ns, time_ns
-        if self.rows is None or not self.changes:
+        if not self.changes:
             return None
         at_ns, baseline = self.changes[0]
         is_skipped = at_ns is not None and last_ns is not None and last_ns < at_ns < time_ns
         if at_ns not in (None, time_ns) and not is_skipped:
+            return None
+        if self.rows is None and not is_command(baseline):
+            if at_ns is None:  # of a training that a command has ended since
+                self.changes.popleft()
             return None
         self.changes.popleft()
         change = Baseline()

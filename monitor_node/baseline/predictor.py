@@ -1,7 +1,13 @@
-"""One-step-ahead predictions of an output by two ARX models of the same structure.
+"""One-step-ahead predictions of an output by a recursive ARX model, and the same model as the training left it.
 
-The adaptive model is updated with every row. The reference is fitted to the whole training at its end and then frozen.
-Until then the prediction is that of the adaptive model before the update.
+The adaptive model is updated with every row by recursive least squares; the prediction is that before the update. The
+reference is fitted to the whole training at its end and then frozen: the adaptive model's distance from it is charted.
+
+Where the adaptive model judges, it starts from the reference, and learns while nothing is wrong: not from a row whose
+residual is beyond `GATE` standard deviations, and not while an alarm is active. It forgets a row after `MEMORY` others,
+and the training counts as so many: a model that learned faster would learn a fault before the charts see it. What it
+learned shortly before an alarm is taken back: its state becomes that of a copy that is `COPY_ROWS` to twice as many
+rows old.
 
 If the training has too few rows for the parameters, the models get fewer lags of the inputs, then no inputs, then fewer
 lags of the output (`simpler_structures`), and the adaptive model is updated with the rows of the training again.
@@ -15,7 +21,9 @@ Snapshots are in the signals' own units.
 
 from collections.abc import Iterator, Sequence
 from math import inf, isfinite, nan, sqrt
+from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -50,6 +58,15 @@ MOSTLY = 0.5
 MOST_BUFFERED = 1000
 """Buffered rows; memory stays bounded."""
 
+GATE = 6.0
+"""Standard deviations of a residual beyond which a row teaches an adaptive model that judges nothing."""
+
+MEMORY = 10_000
+"""Rows after which an adaptive model that judges has forgotten a row."""
+
+COPY_ROWS = 250
+"""Rows between two copies of an adaptive model that judges."""
+
 _BREAK: tuple[int, Sequence[float], float] = (-(2**63), (), nan)
 """Marks a gap between two buffered rows."""
 
@@ -68,6 +85,10 @@ class PredictorState(StoredState, frozen=True):
         drifted: newest point of that chart.
         ranges: smallest and largest value of each input of the reference's regressor in the training, scaled; doubles.
             Empty before the fit, and in states of earlier versions.
+        copies: the older and the newer copy of an adaptive model that judges; empty where it does not.
+        copied_rows: rows since the newer one.
+        learning: False while the adaptive model does not learn.
+        weight: rows for which a row of the training counts in an adaptive model that judges.
     """
 
     buffer: BufferState
@@ -79,6 +100,26 @@ class PredictorState(StoredState, frozen=True):
     drift: ParameterState | None
     drifted: Judgement | None
     ranges: bytes = b""
+    copies: list[RlsState] = msgspec.field(default_factory=list)
+    copied_rows: int = 0
+    learning: bool = True
+    weight: float = 1.0
+
+
+class FittedModel(NamedTuple):
+    """Reference of a predictor in the signals' units, and the newest rows.
+
+    Attributes:
+        structure: structure of the model.
+        coefficients: coefficients of the output's lags, of the inputs' lags, and the offset.
+        inputs: inputs of the newest complete rows, the newest first.
+        outputs: output in the same rows.
+    """
+
+    structure: Structure
+    coefficients: list[float]
+    inputs: list[list[float]]
+    outputs: list[float]
 
 
 class ArxPredictor:
@@ -99,6 +140,10 @@ class ArxPredictor:
         self._drift: ParameterT2 | None = None
         self._newest_drift: Judgement | None = None
         self._ranges: Array | None = None
+        self._copies: list[RlsState] = []
+        self._copied_rows = 0
+        self._learning = True
+        self._weight = 1.0
         self.extrapolation_sd = 1.0
         """Standard deviation of the newest residual as a multiple of the usual one: what inputs beyond their range in
         the training add to the prediction counts as uncertain as it is large."""
@@ -146,6 +191,10 @@ class ArxPredictor:
             None if self._drift is None else self._drift.state,
             self._newest_drift,
             b"" if self._ranges is None else pack_numbers(self._ranges),
+            list(self._copies),
+            self._copied_rows,
+            self._learning,
+            self._weight,
         )
 
     def restore(self, state: PredictorState) -> None:
@@ -170,6 +219,8 @@ class ArxPredictor:
         self._newest_drift = state.drifted
         if state.ranges:
             self._ranges = unpack_numbers(state.ranges, len(state.ranges) // 16)
+        self._copies, self._copied_rows = list(state.copies), state.copied_rows
+        self._learning, self._weight = state.learning, state.weight
 
     def update(self, time_ns: int, inputs: Sequence[float], value: float, *, follows: bool) -> float:
         """Update with a row; returns the prediction made before it, NaN if there is none.
@@ -193,12 +244,50 @@ class ArxPredictor:
         regressor = self._buffer.update(time_ns, [(u - middle) / size for u, (middle, size) in scales], [scaled])
         if regressor is None:
             return nan
-        innovation = self._rls.update(regressor, scaled)
+        if self._reference is None:
+            return centre + spread * self._rls.update(regressor, scaled).prediction
+        if self._copies:
+            prediction = self._learn_carefully(regressor, scaled)
+        else:
+            prediction = self._rls.update(regressor, scaled).prediction
+        self._compare(regressor)
+        self.extrapolation_sd = self._extrapolation_sd(regressor)
+        return centre + spread * prediction
+
+    def start_judging(self) -> None:
+        """Judge rows from now on; the adaptive model starts from the reference."""
+        self.replay_buffer()
         if self._reference is not None:
-            self._compare(regressor)
-            self.extrapolation_sd = self._extrapolation_sd(regressor)
-            return centre + spread * float(self._reference @ regressor)
-        return centre + spread * innovation.prediction
+            rows = min(self._rls.rows, 1.0 / max(1.0 - self._forgetting, 1e-12))
+            self._rls.set_parameters(self._reference)
+            self._weight = max(MEMORY / max(rows, 1.0), 1.0)
+            self._rls.raise_information(self._weight)
+            self._rls.raise_forgetting(max(1.0 - 1.0 / MEMORY, self._rls.forgetting))
+            self._copies, self._copied_rows, self._learning = [self._rls.state] * 2, 0, True
+
+    @property
+    def judges(self) -> bool:
+        """True if rows are judged by the adaptive model."""
+        return bool(self._copies)
+
+    def set_learning(self, learning: bool) -> None:
+        """Learn from the rows to come or not; the end of learning takes back what was learned last."""
+        if learning == self._learning or not self._copies:
+            return
+        self._learning = learning
+        if not learning:
+            self._rls = RecursiveLeastSquares.from_state(self._copies[0])
+        self._copies, self._copied_rows = [self._rls.state] * 2, 0
+
+    def _learn_carefully(self, regressor: Array, scaled: float) -> float:
+        """Learn from a row where nothing is wrong; returns the prediction before."""
+        prediction = self._rls.predict(regressor)
+        if self._learning and (scaled - prediction) ** 2 <= GATE**2 * self._rls.noise_variance:
+            self._rls.update(regressor, scaled)
+            self._copied_rows += 1
+            if self._copied_rows == COPY_ROWS:
+                self._copies, self._copied_rows = [self._copies[1], self._rls.state], 0
+        return prediction
 
     def fit_reference(self, time_min: Array, inputs: Array, outputs: Array) -> Array:
         """Fit the reference to a training by least squares.
@@ -289,6 +378,11 @@ class ArxPredictor:
         for row in zip(times_ns, inputs.tolist(), outputs.tolist(), follows, strict=True):
             self.buffer(*row[:3], follows=row[3])
 
+    def restart(self) -> None:
+        """Forget the rows of the next regressor; the models stay."""
+        self.replay_buffer()
+        self._buffer.restart()
+
     def start_drift_chart(self, arl0: float) -> None:
         """Start the chart of the difference between the parameters of the adaptive model and the reference.
 
@@ -346,13 +440,29 @@ class ArxPredictor:
                 learn_row(regressor, scaled)
                 self._compare(regressor)
 
+    @property
+    def linear_reference(self) -> FittedModel | None:
+        """The reference and the rows before the next one; None before the fit."""
+        self.replay_buffer()
+        if self._reference is None or self._scaling is None:
+            return None
+        matrix, shift = self._scaling.unscaling(self._structure)
+        rows, (centre, spread) = self._buffer.state, self._output_scale
+        inputs = [
+            [middle + size * u for u, (middle, size) in zip(row, self._input_scales, strict=False)]
+            for row in rows.inputs
+        ]
+        outputs = [centre + spread * row[0] for row in rows.outputs]
+        return FittedModel(self._structure, (matrix @ self._reference + shift).tolist(), inputs, outputs)
+
     def adaptive_snapshot(self) -> ModelSnapshot | None:
         """Snapshot of the adaptive model, without a time; None before its first update."""
         self.replay_buffer()
         rls = self._rls
         if not rls.rows:
             return None
-        return self._snapshot(rls.parameters, rls.parameter_covariance, rls.condition, rls.rows, rls.forgetting)
+        covariance = self._weight * rls.parameter_covariance
+        return self._snapshot(rls.parameters, covariance, rls.condition, rls.rows, rls.forgetting)
 
     def reference_snapshot(self) -> ModelSnapshot | None:
         """Snapshot of the reference, without a time; None before the fit."""

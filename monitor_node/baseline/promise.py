@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from scipy.special import pdtrc
 
 from reactorwatch.arrays import Array
-from reactorwatch.contract.messages_pb2 import Promise
+from reactorwatch.contract.messages_pb2 import Power, Promise
 from reactorwatch.spc.false_alarm_budget import DAYS, DAYS_MIN
 from reactorwatch.spc.training_errors import CONFIDENCE
 from reactorwatch.stored_state import StoredState
@@ -93,10 +93,15 @@ class PlantPromise:
 
     Args:
         state: the state.
+        power: deviations that would be seen.
+
+    Attributes:
+        state: the state.
+        power: deviations that would be seen.
     """
 
-    def __init__(self, state: PromiseState) -> None:
-        self.state = state
+    def __init__(self, state: PromiseState, power: Sequence[Power] = ()) -> None:
+        self.state, self.power = state, power
 
     def count_alarms(self, count: int, row: int) -> None:
         """Count alarms that chance can raise.
@@ -187,6 +192,7 @@ class PlantPromise:
             found=state.found,
             expected_so_far=self.mean_count(rows),
             drifted=self.has_drifted(rows),
+            power=self.power,
         )
 
 

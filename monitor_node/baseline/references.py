@@ -1,7 +1,7 @@
 """Reference that predicts rows; residuals are taken against it.
 
 `ProcessReference` is the extended Kalman filter of the process model: it is nonlinear, so inputs beyond the training
-and irregular rows are no problem. `ArxReference` is the identified linear model, frozen when the training ends: it
+and irregular rows are no problem. `ArxReference` is the recursive ARX model, which learns while nothing is wrong: it
 serves any plant, but only within the inputs of its training; other rows are not evaluated. A black box of few signals:
 `black_box_reference`.
 """

@@ -6,7 +6,6 @@ diagnosis takes far longer than a row, so a job and its finding are values, and 
 them.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -15,12 +14,13 @@ import msgspec
 import numpy as np
 
 from monitor_node.baseline.training import TrainingState
-from monitor_node.baseline.uncertainty import describe_uncertain, find_uncertain
+from monitor_node.baseline.uncertainty import Uncertain, describe_uncertain, find_uncertain
 from reactorwatch.contract.messages_pb2 import Baseline
+from reactorwatch.diagnosis.extended import extended_model
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
-from reactorwatch.kalman.uncertain_model import is_disturbance, widen_model
+from reactorwatch.process import effects_of
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME
@@ -87,43 +87,42 @@ def diagnose_training(job: DiagnosisJob) -> Finding:
     time_min = (times_ns - job.first_ns) / MINUTE_NS
     record = Record(time_min, dict(zip(job.signals, columns, strict=True)), "training", zero_ns=job.first_ns)
     given = parse_extended_model(job.equations)
-    given = replace(given, effects=tuple(item.shift(-job.first_ns / MINUTE_NS) for item in given.effects))
-    model = given.build()
+    effects = tuple(item.shift(-job.first_ns / MINUTE_NS) for item in given.effects)
+    model = replace(given, effects=effects).build()
     outputs = job.signals[len(model.inputs) :]
     measured = columns[len(model.inputs) :].T
     rows = time_min, columns[: len(model.inputs)].T, measured
     uncertain = find_uncertain(model, outputs, *rows)
-    found, why, extended = _diagnose(record, given, uncertain)
-    if extended.effects != given.effects:
+    verdict, why, extended = _diagnose(record, model, uncertain)
+    if extended is not None:
         uncertain = find_uncertain(extended.build(), outputs, *rows)
-    if uncertain:
-        why = f"{why}; {describe_uncertain(uncertain)}"
-    extended = replace(extended, uncertain=uncertain)
-    return Finding(job.first_ns, found, why, "" if extended == given else _json(extended.to_object()))
+    if uncertain.names:
+        why = f"{why}; {describe_uncertain(uncertain.names)}"
+    result = replace(extended or given, uncertain=uncertain.names)
+    return Finding(job.first_ns, verdict, why, _json(result.to_object()) if extended or uncertain.names else "")
 
 
-def _diagnose(record: Record, given: ExtendedModel, uncertain: Sequence[str]) -> tuple[str, str, ExtendedModel]:
-    """Verdict of the diagnosis, the reason, and the model with the causes that last.
+def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tuple[str, str, ExtendedModel | None]:
+    """Verdict of the diagnosis, the reason, and the model with the causes that last; None: there are none.
 
     Args:
         record: the training.
-        given: equations of the plant.
+        model: equations of the plant.
         uncertain: what its filter estimates beside the states, see `find_uncertain`.
     """
     from reactorwatch.diagnosis.diagnose import diagnose  # a quarter of a second, which no other row needs
 
-    disturbances = tuple(item for item in uncertain if is_disturbance(item))
     try:
-        found = diagnose(record, widen_model(given.build(), disturbances))
+        found = diagnose(record, uncertain.add_disturbances(model))
     except InputError as error:
-        if not uncertain:
+        if not uncertain.names:
             raise
-        return FAILED, f"not diagnosed: {error}", given
-    if all(cause.profile == FREE_NAME for cause in found.causes):
-        return found.verdict, _reason(found), given
-    extended = parse_extended_model(_json(found.extended_model))
-    added = (item for item in extended.effects[len(given.effects) :] if item.profile.name != FREE_NAME)
-    return found.verdict, _reason(found), replace(extended, effects=(*extended.effects[: len(given.effects)], *added))
+        return FAILED, f"not diagnosed: {error}", None
+    lasting = [cause for cause in found.causes if cause.profile != FREE_NAME]
+    if not lasting:
+        return found.verdict, _reason(found), None
+    extended = extended_model(model, effects_of(model), lasting, record.zero_ns)
+    return found.verdict, _reason(found), parse_extended_model(_json(extended))
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)

@@ -331,6 +331,11 @@ class FleetMonitor:
         """Count a failure to store the state of a plant."""
         self._watched.count_not_stored(plant)
 
+    @property
+    def registered_plants(self) -> int:
+        """Number of registered plants, with any owner."""
+        return len(self._registered)
+
     def register(self, plant: str, now_ns: int, *, verified: bool) -> None:
         """Register a plant, if it is new.
 

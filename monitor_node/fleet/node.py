@@ -8,10 +8,9 @@ from pathlib import Path
 import msgspec
 import structlog
 
-from monitor_node.alarms.commands import COMMANDS
 from monitor_node.alarms.kpis import is_empty
 from monitor_node.config import MonitorConfig
-from monitor_node.core import Monitor
+from monitor_node.core import COMMANDS, Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker
 from monitor_node.fleet import sharding
 from monitor_node.fleet.config import FleetConfig
@@ -106,13 +105,16 @@ class FleetNode(FleetMonitor):
         self._tokens: set[str] = set()
         self._report_ns = start_ns
         self._evicted_logged = 0
+        self._excess_logged = False
         self._rate, self._commands_refused = CommandRateLimiter(), RejectCounter()
         # The older of two monitors with the same shard is active: names sort by the time of the start.
         name = f"{start_ns:020d}-{secrets.token_hex(4)}"
         self.shards = ShardGroup(self.expression, sharding.parse_shard(fleet.shard), name)
         self._others = OtherMonitors(self.shards.token, lambda: self.plants)
+        config = fleet.share_promise(config)
         kinds = load_kinds(config, fleet)
         config, model = load_process(config)
+        self._fleet = fleet
         super().__init__(
             config,
             start_ns,
@@ -144,6 +146,17 @@ class FleetNode(FleetMonitor):
         """Key expressions of the liveliness tokens that it subscribes to: of fleets, plants and plants' monitors."""
         monitors = keys.monitor_token(self.expression.removeprefix(f"{keys.ROOT}/"), "*")
         return keys.FLEET_TOKENS, f"{self.expression}/{keys.ALIVE}/*", monitors
+
+    @property
+    def _promise_excess(self) -> str | None:
+        """Text for more plants than share the false alarms of the fleet; None: there are not more."""
+        promised, plants = self._fleet.false_alarms_per_day, self.registered_plants
+        if promised is None or plants <= self._fleet.divisor:
+            return None
+        return (
+            f"the fleet has {plants} plants, and false_alarms_per_day is divided among {self._fleet.divisor}: up to "
+            f"{promised * plants / self._fleet.divisor:.3g} false alarms a day may come; set [fleet] most_plants"
+        )
 
     def _set_ownership(self, plant: str, ours: bool) -> None:
         token = keys.key(plant, keys.ALIVE, NODE)
@@ -216,6 +229,9 @@ class FleetNode(FleetMonitor):
                 log.debug("traceback", plant=plant, traceback=text)
             if (refused := self._commands_refused.report(now_ns)) is not None:
                 log.warning(refused)
+            if (excess := self._promise_excess) is not None and not self._excess_logged:
+                self._excess_logged = True
+                log.warning(excess)
             if self.evictions > self._evicted_logged:
                 self._evicted_logged = self.evictions
                 log.warning("unverified plants without messages were evicted", so_far=self.evictions)
@@ -370,7 +386,11 @@ def run(
     for setting in ("alarm_state_file", "state_file"):
         if getattr(config, setting) is not None:
             raise InputError(f"{setting} holds what is known of one plant; a fleet takes [fleet] state, a folder")
+    if fleet.share_per_30_days is not None:
+        text = f"{fleet.false_alarms_per_day:g} false alarms a day are promised for {fleet.divisor} plants"
+        log.info(text, per_plant_in_30_days=fleet.share_promise(config).false_alarms_per_30_days)
     # Inconsistent settings are refused here, and machine code is compiled before plants wait.
+    config = fleet.share_promise(config)
     kinds = (*load_kinds(config, fleet), PlantKind(ANY, *load_process(config)))
     WatchedKinds(kinds, 0, points=fleet.points).prepare()
     states = FleetStates(Path(fleet.state)) if fleet.state is not None else None

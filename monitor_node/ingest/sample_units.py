@@ -54,12 +54,11 @@ def _find_conversion(signal: str, unit: str, wanted: str) -> tuple[float, float]
         return SAME
 
 
-def make_sample_units(declared: Mapping[str, str], model_units: Mapping[str, str] | None) -> SampleUnits | None:
-    """Conversion of a plant's samples; None: they are judged in the units that they come in.
+def make_sample_units(declared: Mapping[str, str], model_units: Mapping[str, str]) -> SampleUnits:
+    """Conversion of a plant's samples; those of signals without a unit here are judged in the units that they come in.
 
     Args:
         declared: units of the signals as their process describes them.
-        model_units: units of the equations; None: there are none.
+        model_units: units of the equations.
     """
-    wanted = {**declared, **(model_units or {})}
-    return SampleUnits(wanted, declared) if wanted else None
+    return SampleUnits({**declared, **model_units}, declared)

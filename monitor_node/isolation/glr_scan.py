@@ -88,7 +88,7 @@ class GlrScan:
             return self._scan_both(window)
 
     def _scan_both(self, window: Window) -> tuple[Scan, Scan]:
-        times, first, rows, dynamics = window.time_min, window.first_onset, window.time_min.size, self._dynamics(window)
+        times, first, rows, dynamics = window.time_min, window.first_onset, window.time_min.size, self.dynamics(window)
         full = self._scan_rows(times, dynamics, first, rows)
         if not full.stands_out:
             return full, full
@@ -101,7 +101,7 @@ class GlrScan:
         arrays = (full.onset_min, full.size, full.ratio, full.information)
         return early, Scan(rows, *(item[before:] for item in arrays))
 
-    def _dynamics(self, window: Window) -> ErrorDynamics:
+    def dynamics(self, window: Window) -> ErrorDynamics:
         """Error dynamics of the filter about its run over the window."""
         inputs = np.hstack([window.inputs, np.zeros((window.time_min.size, 2 * self._lower.size))])
         return self._errors.dynamics(

@@ -221,7 +221,7 @@ class Suspicion:
         self._follow(suspects[0])
         return publications
 
-    def add(self, time_min: float, inputs: Sequence[float], values: list[float]) -> list[float]:
+    def add(self, time_min: float, inputs: Sequence[float], values: Sequence[float]) -> Sequence[float]:
         """Add a row; returns its outputs of the model."""
         measured = self._model_outputs(values)
         if self._rows and time_min <= self._rows[-1][0]:  # the plant's clock was set back
@@ -237,7 +237,7 @@ class Suspicion:
             self._isolation = Isolation(reference.equations, reference.plant_noise, self._config.isolation_rows)
         return self._isolation
 
-    def _model_outputs(self, values: list[float]) -> list[float]:
+    def _model_outputs(self, values: Sequence[float]) -> Sequence[float]:
         """Outputs of the model; NaN for those that are not monitored."""
         if self._all_watched:
             return values
@@ -264,7 +264,7 @@ class Suspicion:
         self._output, self._cause = output, cause
 
     def _publish_reconstruction(
-        self, time_ns: int, inputs: Sequence[float], measured: list[float], values: list[float], units: list[str]
+        self, time_ns: int, inputs: Sequence[float], measured: Sequence[float], values: list[float], units: list[str]
     ) -> list[Publication]:
         if self._reconstruction is None:
             return []

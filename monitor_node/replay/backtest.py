@@ -1,6 +1,6 @@
 """Back-test: run the monitor's core over a recording at full speed."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -113,8 +113,10 @@ def train(
     """
     monitor = _make_monitor(config, zero_ns, model)
     monitor.pipeline.open_training()
-    for message in _samples(messages, config.plant):
-        monitor.on_message(message, message.received_ns)
+    prefix = keys.key(config.plant, keys.SAMPLE, "")
+    for message in messages:
+        if message.key.startswith(prefix):
+            monitor.on_message(message, message.received_ns)
     monitor.finish()
     monitor.pipeline.end_training(monitor.last_ns or 0)
     return TrainedPlant(monitor.pipeline.training_rows, monitor.pipeline.state, [*monitor.notes])
@@ -159,8 +161,9 @@ def run(
     def keep(publications: list[Publication]) -> None:
         alarms.extend(item.message for item in publications if isinstance(item.message, Alarm))
 
-    for message in _samples(messages, config.plant):
-        if publications := monitor.on_message(message, message.received_ns):
+    prefix = keys.key(config.plant, keys.SAMPLE, "")
+    for message in messages:
+        if message.key.startswith(prefix) and (publications := monitor.on_message(message, message.received_ns)):
             keep(publications)
         if first_ns is None:
             first_ns = monitor.first_ns
@@ -180,7 +183,7 @@ def run(
         notes=[*(trained.notes if trained is not None else ()), *monitor.notes],
         left_out=monitor.excluded_signals,
         refused_trainings=monitor.refused_trainings,
-        reference=monitor.reference or None,
+        reference=monitor.pipeline.newest_reference or None,
         noise_levels=monitor.noise_levels,
         baseline=monitor.baseline,
         training_rows=monitor.pipeline.training_rows if trained is None else trained.rows,
@@ -191,9 +194,4 @@ def run(
 def _make_monitor(config: MonitorConfig, zero_ns: int, model: ProcessModel | None) -> Monitor:
     if model is None:
         config, model = load_process(config, zero_ns)
-    return Monitor(config, start_ns=0, points=False, model=model, diagnose=find_deviations)
-
-
-def _samples(messages: Iterable[Encoded], plant: str) -> Iterator[Encoded]:
-    prefix = keys.key(plant, keys.SAMPLE, "")
-    return (message for message in messages if message.key.startswith(prefix))
+    return Monitor(config, start_ns=0, points=False, model=model, diagnose=find_deviations, power=True)

@@ -273,6 +273,8 @@ class SpikeCheck(SignalCheck):
         self.limits = np.full(len(self.outputs), np.inf)
         """Limit of each output, within which a residual is no spike; infinite without a check."""
         self._none = (False,) * len(self.outputs)
+        self._is_quiet = False
+        self._quiet_limits: list[float] = []
 
     @property
     def state(self) -> list[SpikeState | None]:
@@ -317,6 +319,13 @@ class SpikeCheck(SignalCheck):
     def _set_limits(self) -> None:
         for index, spike in enumerate(self._spikes):
             self.limits[index] = np.inf if spike is None else spike.limit
+        self._note_quiet()
+
+    def _note_quiet(self) -> None:
+        """Note that residuals within the limits would change nothing."""
+        self._quiet_limits = self.limits.tolist()
+        rules = [alarm.memory.rule for alarm in self._alarms]
+        self._is_quiet = self.is_normal and not any(rule.standing or rule.recent for rule in rules)
 
     @property
     def is_normal(self) -> bool:
@@ -328,6 +337,9 @@ class SpikeCheck(SignalCheck):
     ) -> Flags:
         """See `SignalCheck`."""
         flags, is_moved = self._none, self.board.has_unexplained
+        is_quiet = self._is_quiet and not is_moved
+        if is_quiet and not any(abs(size) > limit for size, limit in zip(e, self._quiet_limits, strict=True)):
+            return flags
         for index, spike in enumerate(self._spikes):
             if spike is None or not isfinite(e[index]):
                 continue
@@ -347,6 +359,7 @@ class SpikeCheck(SignalCheck):
                 if rate is not None:
                     text += f"; {count} spikes in {rate.window_min:.3g} min, where {rate.usual:.2g} are usual"
                 publications += self.judge(alarm, time_ns, judgement, "sd", text, name, cause=self.name)
+        self._note_quiet()
         return flags
 
     def on_gap(self) -> None:

@@ -182,6 +182,14 @@ class SignalChecks:
                 check.restore(state.others[check.name])
         self.silence.arm(now_ns)
 
+    def restore_limits(self, state: SignalChecksState) -> None:
+        """Restore what was learned in a training; the data timeouts stay as they are."""
+        for check in self._checks:
+            if check.name in FIELDS and check is not self.silence:
+                check.restore(getattr(state, FIELDS[check.name]))
+            elif check.name in state.others:
+                check.restore(state.others[check.name])
+
     # --- rows ------------------------------------------------------------------------------------------------
 
     def restart(self) -> None:

@@ -149,7 +149,18 @@ def _movement(numbers: Any) -> float:
     return movement(numbers[0])
 
 
+@jit
+def _take_all(numbers: Any, values: NDArray[np.float64], resolutions: NDArray[np.float64]) -> bool:
+    found = False
+    for i in range(values.size):
+        if np.isfinite(values[i]):
+            take_reading(numbers[i], quantise(values[i], resolutions[i]))
+            found = found or is_stuck(numbers[i])
+    return found
+
+
 _TAKE, _ALLOWED, _MOVEMENT = Entry(_take), Entry(_allowed_readings), Entry(_movement)
+_TAKE_ALL = Entry(_take_all)
 
 
 class StuckState(StoredState, frozen=True):
@@ -281,9 +292,12 @@ class Stuck:
         """
         if not abs(value) < LARGEST_VALUE:
             finite(value)
-        if self._learning:
-            self._end_learning()
+        self.end_learning()
         self._take(value)
+        return self.judge()
+
+    def judge(self) -> Judgement:
+        """Evaluate the newest reading."""
         p = self.numbers[0]
         equal = float(p["repeats"]) + 1.0
         limit: float = _ALLOWED.call(self.numbers) if equal > 1.0 else float(p["limit"])
@@ -291,8 +305,7 @@ class Stuck:
 
     def restart(self) -> None:
         """Drop the last readings, as after a restart of the plant; the limit stays."""
-        if self._learning:
-            self._end_learning()
+        self.end_learning()
         p = self.numbers[0]
         p["last"], p["repeats"], p["step_count"] = nan, 0, 0
 
@@ -308,8 +321,10 @@ class Stuck:
         self._runs, self._learning = dict(runs), learning
         self.numbers["limit"] = longest_normal_run(self._runs, self._arl0)
 
-    def _end_learning(self) -> None:
-        """Count the last run of the training, and compute the limit."""
+    def end_learning(self) -> None:
+        """End the training, if it lasts: count its last run, and compute the limit."""
+        if not self._learning:
+            return
         self._count_run(int(self.numbers["repeats"][0]))
         self._resume(self._runs, learning=False)
 
@@ -384,7 +399,8 @@ class StuckCheck(SignalCheck):
         self._alarms = [
             board.declare(self.name, name, without_on_delay=True, names_cause=True) for name in self.outputs
         ]
-        self._resolutions = [config.resolution.get(name, 0.0) for name in self.outputs]
+        self._resolutions = np.array([config.resolution.get(name, 0.0) for name in self.outputs])
+        self._watching = False
         self.numbers = np.zeros(len(self.outputs), STUCK)
         self._stuck: list[Stuck] = []
         self._note_alarms()
@@ -397,11 +413,13 @@ class StuckCheck(SignalCheck):
     def restore(self, state: list[StuckState]) -> None:
         """See `SignalCheck`."""
         self._stuck = [Stuck.from_state(item, self.numbers[i : i + 1]) for i, item in enumerate(state)]
+        self._watching = False
         self._note_alarms()
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """See `SignalCheck`."""
         self._stuck = [Stuck(arl0, self.numbers[i : i + 1]) for i in range(len(values))]
+        self._watching = False
         self._note_alarms()
         for stuck, readings, step in zip(self._stuck, values, self._resolutions, strict=True):
             for reading in readings:
@@ -411,11 +429,17 @@ class StuckCheck(SignalCheck):
     def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
         """See `SignalCheck`."""
         publications: list[Publication] = []
+        if not self._watching:
+            for stuck in self._stuck:
+                stuck.end_learning()
+            self._watching = True
+        found = _TAKE_ALL.call(self.numbers, np.array(values), self._resolutions)
+        if not (found or self._counting):
+            return publications
         for index, value in enumerate(values):
             if not isfinite(value):
                 continue
-            step = self._resolutions[index]
-            alarm, judgement = self._alarms[index], self._stuck[index].update(quantise(value, step) if step else value)
+            alarm, judgement = self._alarms[index], self._stuck[index].judge()
             if judgement.out or alarm.memory.rule.standing or alarm.memory.rule.recent:
                 name, times = self.outputs[index], judgement.statistic
                 reading = format_quantity(value, units[index], ".6g")
@@ -445,3 +469,4 @@ class StuckCheck(SignalCheck):
 
     def _note_alarms(self) -> None:
         self._invalid = [alarm.memory.rule.standing for alarm in self._alarms]
+        self._counting = any(alarm.memory.rule.standing or alarm.memory.rule.recent for alarm in self._alarms)

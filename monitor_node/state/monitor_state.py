@@ -19,6 +19,8 @@ from reactorwatch.process import EFFECTS_OF
 from reactorwatch.process.extended_model import extended_model_of, is_complete
 from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.spc.charts.catalogue import CHARTS
+from reactorwatch.spc.value_chart import ValueChart
 from reactorwatch.stored_state import StoredState
 
 MAGIC = b"reactorwatch monitor"
@@ -34,7 +36,7 @@ TRAINING = ("training_min", "training_rows")
 """Settings that are compared only where they are stated."""
 
 
-ROLES = ("setpoints", "modes", "labels", "bounds", "resolution")
+ROLES = ("setpoints", "modes", "startup_modes", "labels", "bounds", "resolution")
 """Settings of signals that a state has only where there are any; earlier versions had none."""
 
 
@@ -95,6 +97,10 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
     for name in ROLES:
         if not fields[name]:
             del fields[name]
+    for kind in CHARTS:
+        if issubclass(kind, ValueChart) and kind.name not in config.charts:  # earlier versions had none
+            for setting in kind.settings:
+                del fields[setting.key]
     if model is not None:
         del fields["units"]  # the equations have their own
     fields |= {"points": points, "equations": "" if model is None else fingerprint(model)}

@@ -15,6 +15,7 @@ import typer
 from reactorwatch import __version__
 from reactorwatch.cli import (
     alarm,
+    baseline,
     causes,
     charts,
     compilation,
@@ -56,6 +57,7 @@ GROUPS = (
     site,
     playback,
     alarm,
+    baseline,
     files,
     recordings,
     studies,

@@ -37,6 +37,7 @@ MESSAGES: tuple[type[Message], ...] = (
     messages.AlarmCommand,
     messages.ShelveAlarm,
     messages.ListAlarms,
+    messages.BaselineCommand,
     messages.ReplayCommand,
     messages.CommandReply,
 )

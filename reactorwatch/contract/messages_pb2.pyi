@@ -340,20 +340,22 @@ class Health(_message.Message):
     def __init__(self, time_ns: _Optional[int] = ..., node: _Optional[str] = ..., version: _Optional[str] = ..., phase: _Optional[str] = ..., uptime_s: _Optional[float] = ..., received: _Optional[int] = ..., lost: _Optional[int] = ..., late: _Optional[int] = ..., refused: _Optional[int] = ..., refused_by_reason: _Optional[_Mapping[str, int]] = ..., lag_ms: _Optional[float] = ..., duplicated: _Optional[int] = ..., out_of_order: _Optional[int] = ..., published: _Optional[int] = ..., rows: _Optional[int] = ..., incomplete_rows: _Optional[int] = ..., heard_from_ns: _Optional[_Mapping[str, int]] = ..., not_stored: _Optional[int] = ..., stalls: _Optional[int] = ..., reference: _Optional[str] = ..., training: _Optional[float] = ..., failures: _Optional[_Mapping[str, int]] = ...) -> None: ...
 
 class Baseline(_message.Message):
-    __slots__ = ("time_ns", "what", "by", "why", "id", "model")
+    __slots__ = ("time_ns", "what", "by", "why", "id", "model", "restored")
     TIME_NS_FIELD_NUMBER: _ClassVar[int]
     WHAT_FIELD_NUMBER: _ClassVar[int]
     BY_FIELD_NUMBER: _ClassVar[int]
     WHY_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
     MODEL_FIELD_NUMBER: _ClassVar[int]
+    RESTORED_FIELD_NUMBER: _ClassVar[int]
     time_ns: int
     what: str
     by: str
     why: str
     id: int
     model: str
-    def __init__(self, time_ns: _Optional[int] = ..., what: _Optional[str] = ..., by: _Optional[str] = ..., why: _Optional[str] = ..., id: _Optional[int] = ..., model: _Optional[str] = ...) -> None: ...
+    restored: int
+    def __init__(self, time_ns: _Optional[int] = ..., what: _Optional[str] = ..., by: _Optional[str] = ..., why: _Optional[str] = ..., id: _Optional[int] = ..., model: _Optional[str] = ..., restored: _Optional[int] = ...) -> None: ...
 
 class Promise(_message.Message):
     __slots__ = ("time_ns", "expected", "expected_90", "checked_rows", "found_in_training", "expected_in_training", "kept", "can_keep_per_30_days", "text", "power", "rows", "found", "expected_so_far", "drifted")
@@ -487,6 +489,18 @@ class ListAlarms(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
 
+class BaselineCommand(_message.Message):
+    __slots__ = ("what", "by", "why", "id")
+    WHAT_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
+    WHY_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    what: str
+    by: str
+    why: str
+    id: int
+    def __init__(self, what: _Optional[str] = ..., by: _Optional[str] = ..., why: _Optional[str] = ..., id: _Optional[int] = ...) -> None: ...
+
 class ReplayCommand(_message.Message):
     __slots__ = ("rows", "rate", "by")
     ROWS_FIELD_NUMBER: _ClassVar[int]
@@ -498,11 +512,13 @@ class ReplayCommand(_message.Message):
     def __init__(self, rows: _Optional[int] = ..., rate: _Optional[float] = ..., by: _Optional[str] = ...) -> None: ...
 
 class CommandReply(_message.Message):
-    __slots__ = ("accepted", "text", "alarms")
+    __slots__ = ("accepted", "text", "alarms", "baselines")
     ACCEPTED_FIELD_NUMBER: _ClassVar[int]
     TEXT_FIELD_NUMBER: _ClassVar[int]
     ALARMS_FIELD_NUMBER: _ClassVar[int]
+    BASELINES_FIELD_NUMBER: _ClassVar[int]
     accepted: bool
     text: str
     alarms: _containers.RepeatedCompositeFieldContainer[Alarm]
-    def __init__(self, accepted: bool = ..., text: _Optional[str] = ..., alarms: _Optional[_Iterable[_Union[Alarm, _Mapping]]] = ...) -> None: ...
+    baselines: _containers.RepeatedCompositeFieldContainer[Baseline]
+    def __init__(self, accepted: bool = ..., text: _Optional[str] = ..., alarms: _Optional[_Iterable[_Union[Alarm, _Mapping]]] = ..., baselines: _Optional[_Iterable[_Union[Baseline, _Mapping]]] = ...) -> None: ...

@@ -140,6 +140,20 @@ class RecursiveLeastSquares(Recursion):
         self._tile[n : 2 * n, 0] = self._factor() @ theta
         self._tile[4 * n : 5 * n, 0] = 0.0
 
+    def raise_information(self, factor: float) -> None:
+        """Count the rows so far as more, so that rows to come change the parameters less.
+
+        Args:
+            factor: number of rows for one, at least 1.
+
+        Raises:
+            ValueError: the factor is below 1.
+        """
+        if not 1.0 <= factor < math.inf:
+            raise ValueError(f"factor must be a number from 1 on, got {factor}")
+        n = self._parameters
+        self._tile[2 * n : 3 * n, 0] *= factor
+
     def raise_forgetting(self, forgetting: float) -> None:
         """Raise the forgetting factor from here on, for a recursion that starts with poor parameters.
 

@@ -107,10 +107,10 @@ class ExtendedModel:
         Raises:
             InputError: there is no such model, or it cannot have these parameters or effects.
         """
-        model = self._build_extended(models) if self.equations is None else self.equations
+        model = self._build_from(models) if self.equations is None else self.equations
         return replace(model, uncertain=self.uncertain) if self.uncertain else model
 
-    def _build_extended(self, models: Sequence[Callable[[], ProcessModel]]) -> ProcessModel:
+    def _build_from(self, models: Sequence[Callable[[], ProcessModel]]) -> ProcessModel:
         nominal = {item.name: item for item in (make() for make in models)}
         if self.name not in nominal:
             raise InputError(f"unknown model {self.name!r} (valid: {', '.join(nominal)})")

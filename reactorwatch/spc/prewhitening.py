@@ -15,6 +15,7 @@ sensitive to their errors; the size of these is stored beside them, and limits a
 `false_alarm_budget`).
 """
 
+from collections.abc import Sequence
 from math import inf, nan
 from typing import Any
 
@@ -221,7 +222,27 @@ def _innovation(numbers: Any, z: float) -> float:
     return innovation(numbers[0], z)
 
 
-_EXPECTED_VALUE, _INNOVATION = Entry(_expected_value), Entry(_innovation)
+@jit
+def _innovations(numbers: Any, z: Array) -> int:
+    for i in range(z.size):
+        z[i] = innovation(numbers[i], z[i])
+    return int(z.size)
+
+
+_EXPECTED_VALUE, _INNOVATION, _INNOVATIONS = Entry(_expected_value), Entry(_innovation), Entry(_innovations)
+
+
+def innovations(numbers: NDArray[np.void], z: Sequence[float]) -> list[float]:
+    """Innovations of the next values of several filters, see `Prewhitener.update`.
+
+    Args:
+        numbers: numbers of the filters, shape (filters,).
+        z: the next value of each; NaN if it is missing.
+    """
+    values = np.array(z)
+    _INNOVATIONS.call(numbers, values)
+    e: list[float] = values.tolist()
+    return e
 
 
 class PrewhitenerState(StoredState, frozen=True):

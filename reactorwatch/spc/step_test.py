@@ -20,7 +20,7 @@ The test computes the innovations itself, of all rows: a row that another stage 
 the first row of a step.
 """
 
-from math import ceil, log, nan, sqrt
+from math import log, nan, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,9 +52,8 @@ HYPOTHESES = ONSETS - FEWEST_LATER
 ROWS = ONSETS + LARGEST_ORDER
 """Rows that may have the outlier: the response to one goes on after it."""
 
-TAIL_SHARE, LEAST_TAIL, CLUSTER = 0.05, 10, 4.0
-"""Share of the training's largest statistics from which their tail is estimated, their least number, and the number of
-successive ones that come from the same innovations."""
+FEWEST_PEAKS = 5
+"""Fewest peaks of the training's statistics from which their tail is estimated."""
 
 STEP_TEST = np.dtype(
     [
@@ -257,6 +256,19 @@ class StepTests:
         _UPDATE.call(self._numbers, np.ascontiguousarray(z), self._statistics)
         return self._statistics.copy()
 
+    def sensitivity(self, signal: int) -> float:
+        """Statistic after a lasting step of one unit of a signal, without noise: what no outlier explains of it."""
+        step = self._numbers[signal]["response"][:ONSETS]
+        outlier, explained = np.diff(step, prepend=0.0), 0.0
+        for row in range(ONSETS):
+            shape = np.r_[np.zeros(row), outlier[: ONSETS - row]]
+            explained = max(explained, float(step @ shape) ** 2 / max(float(shape @ shape), 1e-300))
+        return sqrt(max(float(step @ step) - explained, 0.0))
+
+    def limit(self, signal: int) -> float:
+        """Limit of the statistic of a signal."""
+        return float(self._numbers[signal]["limit"])
+
     def restart(self) -> None:
         """Forget the rows seen."""
         self._numbers["recent"], self._numbers["whitener"]["count"] = nan, 0
@@ -276,7 +288,10 @@ def step_response(residual: Array, learned: Prewhitening) -> Array:
 
 
 def design_limit(statistics: Array, learned: Prewhitening, arl0: float) -> float:
-    """Limit of the statistic: that of normal innovations, or the one that the tail of the training's asks for.
+    """Limit of the statistic: that of normal innovations, or the one that the training's statistics ask for.
+
+    The squares of the larger half of their peaks, one a block of `ONSETS` rows, are extrapolated exponentially. So are
+    those of normal values; where tails are heavier, as at moves of an input, peaks are larger, and the limit follows.
 
     Args:
         statistics: statistics of the training, shape (rows,); NaN where there is none.
@@ -284,10 +299,11 @@ def design_limit(statistics: Array, learned: Prewhitening, arl0: float) -> float
         arl0: run length without a fault, in rows.
     """
     normal = false_alarm_budget.widen_limit(-float(ndtri(0.5 / (arl0 * HYPOTHESES))), 1.0, learned)
-    energies = np.sort(statistics[np.isfinite(statistics)] ** 2)
-    tail = max(ceil(TAIL_SHARE * energies.size), LEAST_TAIL)
-    if energies.size < 2 * tail:
+    blocks = np.array_split(np.nan_to_num(statistics) ** 2, max(statistics.size // ONSETS, 1))
+    largest = np.sort([float(block.max()) for block in blocks if block.size])
+    upper = len(largest) // 2
+    if upper < FEWEST_PEAKS:
         return normal
-    threshold, excess = float(energies[-tail - 1]), energies[-tail:] - energies[-tail - 1]
-    scale = float(excess.mean()) * (1.0 + 1.0 / sqrt(tail / CLUSTER))
-    return max(normal, sqrt(threshold + scale * max(0.0, log(arl0 * tail / energies.size))))
+    threshold, excess = largest[-upper - 1], largest[-upper:] - largest[-upper - 1]
+    scale = float(excess.mean()) * (1.0 + 1.0 / sqrt(upper))
+    return max(normal, sqrt(threshold + scale * max(0.0, log(arl0 * upper / statistics.size))))

@@ -30,6 +30,9 @@ from reactorwatch.spc.prewhitening import LARGEST_ORDER, Prewhitening
 
 DRAWS = 400
 CONFIDENCE = 0.9
+QUANTILE = 0.93
+"""Quantile that is taken as the bound with this confidence: rates by tails alone are good to some percent."""
+
 
 MOST_TURNED = 8
 """Largest number of signals for which errors of correlations are drawn; of more, the limit has them on average."""

@@ -50,6 +50,11 @@ class ValueChart(Chart):
     def design(cls, baseline: ValueBaseline) -> Self:
         """The chart for a training; there must be no obstacle to it."""
 
+    @classmethod
+    @abstractmethod
+    def relative_rates(cls, baseline: ValueBaseline) -> Array:
+        """Rate of false alarms by the errors of the training, in shares of one signal's alarm, shape (draws,)."""
+
     @abstractmethod
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (signals,)."""

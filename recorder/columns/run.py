@@ -123,12 +123,14 @@ class HealthReport(NamedTuple):
         phase: phase of the node, in a word.
         lag_ms: time from receipt to the end of processing, in milliseconds.
         counts: number of problems, by kind.
+        reference: reference by which a monitor judges rows; empty for other nodes.
     """
 
     time_ns: int
     phase: str
     lag_ms: float
     counts: Mapping[str, int]
+    reference: str = ""
 
 
 class PromiseReport(NamedTuple):
@@ -170,6 +172,7 @@ class SegmentContext:
         alarm_states: state of each alarm that was published.
         suspects_ns: time of the last suspects.
         onset_ns: onset of the first fault; None if there was none.
+        reference: reference by which rows are judged; empty if unknown.
     """
 
     first_ns: int | None = None
@@ -177,6 +180,7 @@ class SegmentContext:
     alarm_states: Mapping[str, int] = field(default_factory=dict)
     suspects_ns: int | None = None
     onset_ns: int | None = None
+    reference: str = ""
 
 
 @dataclass(frozen=True)
@@ -187,7 +191,8 @@ class RunColumns:
         plant: name of the plant; empty without messages.
         units: units by signal.
         samples: samples by signal.
-        estimates: predictions by signal.
+        estimates: predictions by signal, of the reference that judges.
+        estimates_beside: predictions by the recursive ARX model beside it, by signal.
         charts: chart points by chart and signal, such as `ewma/T`.
         alarms: changes of alarms in order of time.
         faults: changes of faults in order of time.
@@ -216,6 +221,13 @@ class RunColumns:
     context: SegmentContext = SegmentContext()
     given_zero_ns: int | None = None
     process: Process | None = None
+    estimates_beside: dict[str, EstimateColumns] = field(default_factory=dict)
+
+    @property
+    def reference(self) -> str:
+        """Reference by which the newest rows are judged: `equations`, `black-box` or `arx`; empty if unknown."""
+        named = [item.reference for item in self.health.get("monitor", ()) if item.reference]
+        return named[-1] if named else self.context.reference
 
     @property
     def span_ns(self) -> tuple[int, int]:

@@ -192,14 +192,16 @@ class RunReader:
             unit = published.get((kind, name), "")
             return _convert(columns, unit, sampled.get(name.partition("/")[0]) or unit)
 
+        estimates = {
+            name: in_unit(EstimateColumns(*columns), keys.ESTIMATE, name) for name, columns in of_kind(keys.ESTIMATE)
+        }
+        beside = {name: name.removesuffix(BESIDE) for name in estimates if name.endswith(BESIDE)}
         run = RunColumns(
             plant=self._plant,
             units={**{name: unit for (_, name), unit in published.items()}, **sampled},
             samples=samples,
-            estimates={
-                name: in_unit(EstimateColumns(*columns), keys.ESTIMATE, name)
-                for name, columns in of_kind(keys.ESTIMATE)
-            },
+            estimates={name: columns for name, columns in estimates.items() if name not in beside},
+            estimates_beside={signal: estimates[name] for name, signal in beside.items()},
             charts={name: ChartColumns(*columns) for name, columns in of_kind(keys.CHART)},
             alarms=tuple(sorted(self._alarms, key=lambda change: change.time_ns)),
             faults=tuple(sorted(self._faults, key=lambda change: change.time_ns)),
@@ -249,6 +251,7 @@ def _next_context(run: RunColumns) -> SegmentContext:
             (change.time_ns for change in run.alarms if change.event == SUSPECTED), default=before.suspects_ns
         ),
         onset_ns=next(onsets, None) if before.onset_ns is None else before.onset_ns,
+        reference=run.reference,
     )
 
 
@@ -276,6 +279,9 @@ def _update_statistics(before: SignalStatistics | None, item: SampleColumns) -> 
 
 _NOTHING = SignalStatistics(0, float("nan"), float("inf"), -float("inf"))
 
+BESIDE = "/arx"
+"""End of the names of predictions by the recursive ARX model beside another reference."""
+
 
 _Dated = TypeVar("_Dated", Snapshot, HealthReport, PromiseReport)
 
@@ -290,7 +296,7 @@ def _purpose(message: messages.ModelSnapshot) -> str:
     """Purpose of a model."""
     if message.structure == EQUATIONS:
         return EQUATIONS
-    if message.reference:
+    if message.reference and (message.held or message.structure != "arx"):  # the recursive ARX model adapts
         return REFERENCE
     return FROZEN if message.held else ADAPTIVE
 
@@ -302,7 +308,7 @@ def _snapshot(message: messages.ModelSnapshot, time_ns: int) -> Snapshot:
 
 def _report(message: messages.Health, time_ns: int) -> HealthReport:
     counts = {name: getattr(message, name) for name in ("lost", "late", "refused", "duplicated", "out_of_order")}
-    return HealthReport(time_ns, message.phase, message.lag_ms, counts)
+    return HealthReport(time_ns, message.phase, message.lag_ms, counts, message.reference)
 
 
 def _promise(message: messages.Promise, time_ns: int) -> PromiseReport:

@@ -13,6 +13,7 @@ from recorder.panels.base import (
     QUIET,
     RESIDUAL,
     SETPOINT,
+    SEVERAL,
     Panel,
     Series,
     TimePlot,
@@ -22,6 +23,8 @@ from recorder.panels.base import (
 
 _ROLES = ("output", "setpoint", "input", "mode", "label")
 """Roles in the order of their plots."""
+BESIDE = SEVERAL[3]
+"""Colour of predictions that do not judge."""
 _COLOURS = {"setpoint": SETPOINT, "input": INPUT, "mode": QUIET, "label": QUIET}
 
 
@@ -84,12 +87,20 @@ def _plot(run: RunColumns, name: str, role: str, setpoints: Sequence[str]) -> Ti
             Series("upper limit", estimated.time_ns, estimated.upper_limit, LIMIT, width=1.0, legend="limits"),
             Series("lower limit", estimated.time_ns, estimated.lower_limit, LIMIT, width=1.0, legend="limits"),
             *series,
-            Series("predicted", estimated.time_ns, estimated.prediction, PREDICTED, width=1.0),
+            Series("predicted", estimated.time_ns, estimated.prediction, PREDICTED, width=1.0, legend=_judge(run)),
         ]
+    if (beside := run.estimates_beside.get(name)) is not None:
+        label = "predicted by arx, which does not judge"
+        series.append(Series("predicted beside", beside.time_ns, beside.prediction, BESIDE, width=0.8, legend=label))
     if rebuilt is not None:
         series.append(Series("reconstructed", rebuilt.time_ns, rebuilt.value, RESIDUAL, width=1.5))
     unit = run.units.get(name, "")
     return TimePlot(signal_title(name, unit, run.process), unit, tuple(series))
+
+
+def _judge(run: RunColumns) -> str:
+    """Legend of the predictions by which rows are judged."""
+    return f"predicted by {run.reference}, which judges" if run.reference else "predicted"
 
 
 PANEL = Panel("Overview", draw, arranged="beside")

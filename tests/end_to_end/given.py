@@ -9,7 +9,6 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from plant_node.config import PlantConfig
-from plant_node.examples import make_example
 from plant_node.record import simulate_record
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
@@ -26,8 +25,8 @@ NARROW = {"kind": "random-steps", "low": 102.41, "high": 104.41}
 
 
 def _record(path: Path) -> None:
-    """The sample record `leak`."""
-    write_table(path, make_example("leak", 3)[0])
+    """A record with a leak after the time of a training."""
+    write_table(path, simulate_record(PlantConfig(seed=3, faults=(LEAK,)), 1500))
 
 
 def _renamed_record(path: Path) -> None:

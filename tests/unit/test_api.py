@@ -14,6 +14,7 @@ import pytest
 import reactorwatch as rw
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.api.diagnosis import DiagnosisResult
 from reactorwatch.records.record import Record
 
 LEAK_MIN = 40.0
@@ -44,8 +45,14 @@ def test_another_name_is_no_attribute() -> None:
         rw.pipeline  # noqa: B018 # the access is what is tested
 
 
-def test_a_diagnosis_names_the_leak_and_its_extended_model_simulates_it(leaking: Record, tmp_path: Path) -> None:
-    found = rw.diagnose(leaking)
+@pytest.fixture(scope="module")
+def found(leaking: Record) -> DiagnosisResult:
+    return rw.diagnose(leaking)
+
+
+def test_a_diagnosis_names_the_leak_and_its_extended_model_simulates_it(
+    leaking: Record, found: DiagnosisResult, tmp_path: Path
+) -> None:
     assert (found.verdict, found.causes[0].cause) == ("named", "coolant_flow")
     before = np.sqrt(np.mean((rw.simulate(leaking).columns["T"] - leaking.columns["T"]) ** 2))
     after = np.sqrt(np.mean((rw.simulate(leaking, found.extended).columns["T"] - leaking.columns["T"]) ** 2))
@@ -56,7 +63,7 @@ def test_a_diagnosis_names_the_leak_and_its_extended_model_simulates_it(leaking:
 
 
 def test_a_backtest_and_a_monitor_that_is_fed_row_by_row_raise_the_same_alarms(leaking: Record) -> None:
-    settings: dict[str, Any] = {"training_min": 20.0, "isolation": False}
+    settings: dict[str, Any] = {"training_min": 20.0, "isolation": False, "diagnose_training": False}
     result = rw.backtest(leaking, **settings)
     assert result.alarms
     assert result.alarms[0].raised_min >= LEAK_MIN
@@ -71,9 +78,8 @@ def test_a_backtest_and_a_monitor_that_is_fed_row_by_row_raise_the_same_alarms(l
     assert raised == [(item.alarm, item.raised_min) for item in result.alarms]
 
 
-def test_the_model_that_a_diagnosis_extended_judges_without_alarm(leaking: Record) -> None:
-    extended = rw.diagnose(leaking).extended
-    assert not rw.backtest(leaking, extended, training_min=20.0).alarms
+def test_the_model_that_a_diagnosis_extended_judges_without_alarm(leaking: Record, found: DiagnosisResult) -> None:
+    assert not rw.backtest(leaking, found.extended, training_min=20.0, diagnose_training=False).alarms
 
 
 def test_identification_gives_its_fit_under_both_names(leaking: Record) -> None:

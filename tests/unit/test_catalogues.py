@@ -131,7 +131,7 @@ def test_one_file_and_one_line_make_a_chart_and_a_signal_check_that_back_tests_r
     columns["T"][time_min >= 50.0] += 25.0
     rows = np.column_stack([time_min, columns["qc"], columns["C"], columns["T"]])
     np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header="time_min,qc,C,T", comments="", fmt="%.17g")
-    settings = 'training_min = 30\ncharts = ["moving_range"]\nmoving_range_factor = 1.1\n'
+    settings = 'training_min = 30\ncharts = ["moving_range"]\nmoving_range_factor = 1.1\ndiagnose_training = false\n'
     (tmp_path / "settings.toml").write_text(f"[monitor]\n{settings}", encoding="utf-8")
     told = run(sources, "backtest", str(tmp_path / "run.csv"), "--config", str(tmp_path / "settings.toml"))
     assert "moving_range/T" in told

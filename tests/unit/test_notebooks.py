@@ -26,10 +26,11 @@ def record() -> rw.Record:
     return rw.Record(**measured_fields(measured) | {"name": "leak <1>.csv"})
 
 
+WATCH: dict[str, Any] = {"training_min": 20.0, "isolation": False, "diagnose_training": False}
 RESULTS: dict[str, Callable[[rw.Record], Any]] = {
     "record": lambda record: record,
     "simulation": rw.simulate,
-    "backtest": lambda record: rw.backtest(record, training_min=20.0, isolation=False),
+    "backtest": lambda record: rw.backtest(record, **WATCH),
     "diagnosis": rw.diagnose,
     "identification": lambda record: rw.identify(record, "T", model="arx", order=2),
 }
@@ -128,7 +129,7 @@ def sources(record: rw.Record) -> Iterator[tuple[str, Any, str]]:
 def test_a_monitor_takes_rows_from_anywhere_with_the_same_alarms(record: rw.Record, results: dict[str, Any]) -> None:
     expected = [(item.alarm, item.raised_min) for item in results["backtest"].alarms]
     for name, source, time in sources(record):
-        monitor = rw.Monitor(training_min=20.0, isolation=False)
+        monitor = rw.Monitor(**WATCH)
         changes = [change for change in monitor.feed(source, time) if change.event == "raised"]
         found = [(change.alarm, round(change.time_min, 6)) for change in changes]
         assert found == [(alarm, round(minute, 6)) for alarm, minute in expected], name

@@ -30,6 +30,8 @@ ALARM_COMMANDS = (*PLANT_ALARM_COMMANDS, keys.ACKNOWLEDGE_RECORDER)
 """Commands of an operator for alarms of the plant and of the recorder."""
 ALARM_ENGINEERING = ("suppress", "unsuppress", "take_out_of_service", "return_to_service")
 """Commands of an engineer: they hide alarms until a second command shows them again."""
+BASELINE_COMMANDS = ("baseline",)
+"""Commands of an engineer: they change what a plant is judged by."""
 LISTS = ("list_alarms", keys.LIST_RECORDER_ALARMS)
 """Commands that change nothing."""
 
@@ -74,7 +76,7 @@ ROLES = (
             f"{keys.BASELINE}/monitor",
             f"{keys.PROMISE}/monitor",
         ),
-        answers=(*PLANT_ALARM_COMMANDS, *ALARM_ENGINEERING, "list_alarms"),
+        answers=(*PLANT_ALARM_COMMANDS, *ALARM_ENGINEERING, *BASELINE_COMMANDS, "list_alarms"),
     ),
     Role(
         "recorder",
@@ -83,7 +85,7 @@ ROLES = (
         answers=(keys.ACKNOWLEDGE_RECORDER, keys.LIST_RECORDER_ALARMS),
     ),
     Role("operator", asks=(*LISTS, *ALARM_COMMANDS)),
-    Role("engineer", asks=(*LISTS, *ALARM_COMMANDS, *ALARM_ENGINEERING, *PLANT_COMMANDS)),
+    Role("engineer", asks=(*LISTS, *ALARM_COMMANDS, *ALARM_ENGINEERING, *BASELINE_COMMANDS, *PLANT_COMMANDS)),
     Role("viewer"),
 )
 """All roles with certificates, except the router."""

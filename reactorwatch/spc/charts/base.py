@@ -115,6 +115,17 @@ class Chart(ABC):
     settings: ClassVar[tuple[Setting, ...]] = ()
 
     @classmethod
+    def detector(cls, baseline: Baseline) -> "tuple[float, float, Array] | None":
+        """Weight, limit in standard deviations of the average, and whitening matrix of the chart as a moving average.
+
+        None: it is none, and the power of the monitor is stated without it.
+
+        Args:
+            baseline: training of the chart's signals, as for its design.
+        """
+        return None
+
+    @classmethod
     @abstractmethod
     def from_state(cls, state: Any) -> Self:
         """Resume a chart, bit for bit, from its state.

@@ -103,6 +103,12 @@ class Ewma(CompiledChart):
         (learned,), weight = baseline.learned, baseline.settings["ewma_weight"]
         return relative_rate(ewma_limit(baseline.arl0, weight), weight, learned, errors)
 
+    @classmethod
+    def detector(cls, baseline: Baseline) -> tuple[float, float, Array] | None:
+        """See `Chart`."""
+        (learned,), (sd,), weight = baseline.learned, baseline.memory_sd, baseline.settings["ewma_weight"]
+        return weight, sd * designed_limit(baseline.arl0, weight, learned), np.eye(1)
+
     def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`: as the lasting shift of the signal that would look like this."""
         size = abs(judgement.statistic) * signal.scale / signal.passed

@@ -8,6 +8,7 @@ Technometrics 34(1). With d = x - mean, S the covariance of x and lambda the wei
 where Sz is the covariance of z in the long run. z is kept in coordinates in which S is the unit matrix.
 """
 
+from math import sqrt
 from typing import Self
 
 import numpy as np
@@ -103,6 +104,12 @@ class Mewma(JointChart):
     def relative_rates(cls, baseline: Baseline, errors: TrainingErrors) -> Array:
         """See `JointChart`."""
         return joint_rates(1.0 / baseline.arl0, baseline.settings["mewma_weight"], baseline, errors)
+
+    @classmethod
+    def detector(cls, baseline: Baseline) -> tuple[float, float, Array] | None:
+        """See `Chart`."""
+        chart = cls.design(baseline)
+        return chart.weight, sqrt(chart.limit), chart.whitening.matrix
 
     @classmethod
     def from_state(cls, state: MewmaState) -> "Mewma":

@@ -23,7 +23,8 @@ covariance of the others, and the averages of these residuals give
   Statist. Appl. Genet. Mol. Biol. 3), which moderates each and adds degrees of freedom.
 
 The limit is that of an EWMA of known variance for the run length of one signal's alarm, at the same tail of Student's
-distribution with the degrees of freedom; and it is not below the largest of the averages of the training.
+distribution with the degrees of freedom. Where less than one false alarm is promised in the rows of the training, it is
+not below the largest of their averages.
 """
 
 from collections.abc import Sequence
@@ -38,6 +39,7 @@ from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Setting, positive, vector
 from reactorwatch.spc.run_length.design import ewma_limit
+from reactorwatch.spc.training_errors import TrainingErrors
 from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
 from reactorwatch.stored_state import pack_numbers, unpack_numbers
 
@@ -49,9 +51,6 @@ SHRINKAGE = 0.01
 
 LONGEST_LAG = 10.0
 """Longest lag of the averages' autocorrelation, in units of their memory (rows divided by weight)."""
-
-MOST_FREEDOM = 1e4
-"""Degrees of freedom of the prior where the variances do not differ more than by chance."""
 
 MOST_MISSING = 0.5
 """Share of missing signals of a row beyond which it is skipped."""
@@ -135,17 +134,22 @@ class ResidualSpace(ValueChart):
     @classmethod
     def design(cls, baseline: ValueBaseline) -> Self:
         """See `ValueChart`; `residual_space_weight` is the weight of the newest row."""
-        weight, scale = baseline.settings["residual_space_weight"], baseline.values.std(axis=0, ddof=1)
-        scaled = baseline.values / scale
-        held_out = held_out_residuals(scaled)
-        averages = average_rows(held_out, weight)
-        white = np.mean(held_out**2, axis=0) * weight / (2.0 - weight)
-        ratios, freedom = moderate(np.mean(averages**2, axis=0) / white, degrees_of_freedom(averages, weight))
-        sds = np.sqrt(white * np.maximum(ratios, 1.0))
+        scale = baseline.values.std(axis=0, ddof=1)
+        scaled, weight = baseline.values / scale, baseline.settings["residual_space_weight"]
+        sds, freedom, largest = held_out_deviations(scaled, weight)
         centre, matrix = adjustment(scaled)
-        tail = float(special.ndtr(-ewma_limit(baseline.arl0, weight)))
-        limit = max(-float(special.stdtrit(freedom, tail)), float(np.max(np.abs(averages) / sds)))
+        limit = limit_of(baseline, freedom, largest)
         return cls(baseline.names, centre * scale, matrix / sds[:, None] / scale, weight, limit)
+
+    @classmethod
+    def relative_rates(cls, baseline: ValueBaseline) -> Array:
+        """See `ValueChart`: an average whose variance is off crosses the limit more or less often."""
+        scale, weight = baseline.values.std(axis=0, ddof=1), baseline.settings["residual_space_weight"]
+        _, freedom, largest = held_out_deviations(baseline.values / scale, weight)
+        known, limit = ewma_limit(baseline.arl0, weight), limit_of(baseline, freedom, largest)
+        errors = TrainingErrors.draw(len(baseline.names)).scale
+        chi2 = 2.0 * special.gammainccinv(0.5 * freedom, special.ndtr(-errors))
+        return np.asarray(np.sum(special.ndtr(-limit * np.sqrt(chi2 / freedom)), axis=1) / special.ndtr(-known))
 
     @classmethod
     def from_state(cls, state: ResidualSpaceState) -> Self:
@@ -208,6 +212,19 @@ class ResidualSpace(ValueChart):
         self._averages[:] = 0.0
 
 
+def limit_of(baseline: ValueBaseline, freedom: float, largest: float) -> float:
+    """Limit of the averages.
+
+    Args:
+        baseline: training of the signals.
+        freedom: degrees of freedom of the averages' variances.
+        largest: largest average of the training.
+    """
+    tail = float(special.ndtr(-ewma_limit(baseline.arl0, baseline.settings["residual_space_weight"])))
+    limit = -float(special.stdtrit(freedom, tail))
+    return max(limit, largest) if baseline.values.size < baseline.arl0 else limit
+
+
 def adjustment(rows: Array) -> tuple[Array, Array]:
     """Means of signals, and the matrix from their deviations to the residuals w.
 
@@ -233,6 +250,21 @@ def held_out_residuals(rows: Array) -> Array:
         centre, matrix = adjustment(np.concatenate([rows[:first], rows[end:]]))
         residuals[first:end] = (rows[first:end] - centre) @ matrix.T
     return residuals
+
+
+def held_out_deviations(scaled: Array, weight: float) -> tuple[Array, float, float]:
+    """Standard deviations of the averages, shape (p,), their degrees of freedom, and the largest average in them.
+
+    Args:
+        scaled: scaled signals, shape (rows, p).
+        weight: lambda.
+    """
+    residuals = held_out_residuals(scaled)
+    averages = average_rows(residuals, weight)
+    white = np.mean(residuals**2, axis=0) * weight / (2.0 - weight)
+    ratios, freedom = moderate(np.mean(averages**2, axis=0) / white, degrees_of_freedom(averages, weight))
+    sds = np.sqrt(white * np.maximum(ratios, 1.0))
+    return sds, freedom, float(np.max(np.abs(averages) / sds))
 
 
 def average_rows(residuals: Array, weight: float) -> Array:
@@ -276,8 +308,8 @@ def moderate(ratios: Array, freedom: float) -> tuple[Array, float]:
 
     logs = np.log(ratios) - special.digamma(freedom / 2) + np.log(freedom / 2)
     excess = float(np.var(logs, ddof=1)) - float(special.polygamma(1, freedom / 2))
-    prior, least = MOST_FREEDOM, float(special.polygamma(1, MOST_FREEDOM / 2))
-    if excess > least:
-        prior = 2.0 * float(optimize.brentq(lambda x: float(special.polygamma(1, x)) - excess, 1e-3, MOST_FREEDOM))
+    prior = (ratios.size - 1) * freedom  # of the other signals' mean squares, if all true ratios are equal
+    if excess > float(special.polygamma(1, prior / 2)):
+        prior = 2.0 * float(optimize.brentq(lambda x: float(special.polygamma(1, x)) - excess, 1e-3, prior / 2))
     centre = float(np.exp(logs.mean() + special.digamma(prior / 2) - np.log(prior / 2)))
     return np.asarray((prior * centre + freedom * ratios) / (prior + freedom)), prior + freedom

@@ -124,6 +124,11 @@ class Shewhart(CompiledChart):
         (learned,) = baseline.learned
         return cls(0.0, 1.0, designed_width(baseline.point_probability, learned))
 
+    @classmethod
+    def detector(cls, baseline: Baseline) -> tuple[float, float, Array] | None:
+        """See `Chart`."""
+        return 1.0, designed_width(baseline.point_probability, baseline.learned[0]), np.eye(1)
+
     def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`."""
         size, allowed = abs(judgement.statistic) * signal.scale, judgement.upper_limit * signal.scale

@@ -8,6 +8,7 @@ pair of them is impossible. With d = x - mean and S the covariance, both known,
 T2 of independent normal vectors is chi-square with as many degrees of freedom as there are signals.
 """
 
+from math import sqrt
 from typing import Self
 
 import numpy as np
@@ -56,6 +57,12 @@ class T2(JointChart):
         """See `JointChart`."""
         limit = joint_limit(1.0 / baseline.point_probability, 1.0, baseline.learned, len(baseline.e))
         return cls(np.zeros(len(baseline.learned)), correlation(baseline.e), limit)
+
+    @classmethod
+    def detector(cls, baseline: Baseline) -> tuple[float, float, Array] | None:
+        """See `Chart`."""
+        chart = cls.design(baseline)
+        return 1.0, sqrt(chart.limit), chart.whitening.matrix
 
     @classmethod
     def from_state(cls, state: T2State) -> "T2":

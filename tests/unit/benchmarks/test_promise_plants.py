@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from benchmarks.promise import plants
-from benchmarks.promise.__main__ import poisson_interval
+from benchmarks.promise.__main__ import (
+    Outcome,
+    Plant,
+    delay,
+    poisson_interval,
+    print_counts,
+    print_delays,
+    share_interval,
+)
 from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
 from plant_node.record import simulate_record
 from reactorwatch.process.library.cstr.model import cstr
@@ -67,3 +75,29 @@ def test_the_interval_of_a_count_is_that_of_garwood() -> None:
     """Table of Garwood (1936), Fiducial limits for the Poisson distribution, Biometrika 28: 3 and 0 events."""
     assert poisson_interval(3) == pytest.approx((0.619, 8.767), abs=1e-3)
     assert poisson_interval(0) == pytest.approx((0.0, 3.689), abs=1e-3)
+
+
+def test_the_interval_of_a_share_is_that_of_clopper_and_pearson() -> None:
+    assert share_interval(8, 10) == pytest.approx((0.4439, 0.9748), abs=1e-4)
+    assert share_interval(10, 10) == pytest.approx((0.6915, 1.0), abs=1e-4)
+    assert share_interval(0, 10)[0] == 0.0
+
+
+def test_the_delay_is_that_of_the_first_alarm_after_the_onset() -> None:
+    assert delay(Outcome([120.0, 401.5, 430.0], 0.1, True)) == pytest.approx(1.5)
+    assert delay(Outcome([120.0], 0.1, True)) == np.inf
+
+
+def test_the_tables_count_alarms_by_input_and_plants_whose_promise_is_not_kept(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    watched = [Plant(0, 0), Plant(0, 1), Plant(1, 2)]
+    outcomes = iter([Outcome([1.0, 2.0], 0.25, True), Outcome([], 0.25, False), Outcome([3.0], 0.5, True)])
+    print_counts("a rate", watched, outcomes)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2] == "| reaction 3 % slower | 2 + 0 + 0 | 0.5 | 1 |"
+    assert lines[4].startswith("| all | 3 (95 %: 0.6 to 8.8) | 1 | 1 of 3 |")
+    print_delays([Plant(5, 0, is_faulty=True)] * 2, iter([Outcome([401.0], 0.0, True), Outcome([], 0.0, True)]))
+    assert capsys.readouterr().out.endswith(
+        "1 of 2 seen within 10 min (95 %: 1 to 99 %), median inf min; unseen: feed that wanders.\n"
+    )

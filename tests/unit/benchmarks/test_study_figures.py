@@ -72,7 +72,8 @@ def test_the_page_in_the_docs_has_every_entry_once_and_no_other() -> None:
 
 def test_a_fault_is_added_to_a_measured_record_and_both_watch_it(tmp_path: Path, daisy_csv: Path) -> None:
     """The reactor's record alone; the entry says which records are not in the folder by leaving them out."""
-    (tmp_path / "daisy_cstr.csv").symlink_to(daisy_csv)
+    lines = daisy_csv.read_text(encoding="utf-8").splitlines(keepends=True)
+    (tmp_path / "daisy_cstr.csv").write_text("".join(lines[:2501]), encoding="utf-8")
     with canvas.paper(tmp_path / "measured.png", 400) as drawing:
         finding = measured_figure(tmp_path).draw(Study(1), drawing)
     rows = re.findall(r"^\| (.*?) \| (none|step|drift) \|", finding.text, re.MULTILINE)

@@ -73,7 +73,7 @@ def test_no_row_is_identified_from_rows_of_another_run(whole: Record, model: str
 
 @pytest.mark.parametrize("back_min", [0.25, 60.0, 60.05])
 def test_a_back_test_raises_the_same_alarms_after_the_clock_was_set_back(whole: Record, back_min: float) -> None:
-    settings = MonitorConfig(isolation=False)
+    settings = MonitorConfig(isolation=False, diagnose_training=False)
     straight, back = (
         watch((encode(item) for item in samples_of(record, "cstr")), settings)
         for record in (whole, cut(whole, back_min))

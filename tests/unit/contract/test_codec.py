@@ -90,6 +90,7 @@ def test_what_is_published_has_its_time_as_field_one() -> None:
         "AlarmCommand",
         "ShelveAlarm",
         "ListAlarms",
+        "BaselineCommand",
         "ReplayCommand",
     }
     for kind in MESSAGES:

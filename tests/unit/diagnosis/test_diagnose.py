@@ -81,7 +81,9 @@ def test_a_tolerance_decides_what_matters_in_practice() -> None:
 
 
 def test_the_measured_record_differs_from_the_simulation_by_what_an_integrator_does(daisy_csv: Path) -> None:
-    found = diagnose(read_csv(daisy_csv), cstr())
+    record = read_csv(daisy_csv)
+    first = {name: values[:1000] for name, values in record.columns.items()}
+    found = diagnose(replace(record, time_min=record.time_min[:1000], columns=first), cstr())
     assert (found.significant, found.practical, found.location) == (True, False, "timing")
 
 

@@ -1,10 +1,12 @@
 """Plants of many signals without equations: the residual space is their chart, and names where a disturbance enters."""
 
+import pickle
+
 import msgspec
 import numpy as np
 import pytest
 
-from monitor_node.config import CHARTS_OF_MANY, USUAL_CHARTS, MonitorConfig
+from monitor_node.config import CHARTS_OF_MANY, USUAL_CHARTS, DefaultCharts, MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm
@@ -50,7 +52,7 @@ def raised(said: list[Publication]) -> list[Alarm]:
     [
         (settings(), CHARTS_OF_MANY),
         (settings(7), USUAL_CHARTS),
-        (settings(7, inputs=("u",)), CHARTS_OF_MANY),
+        (settings(7, inputs=("u", "v")), USUAL_CHARTS),
         (settings(process="plant.toml"), USUAL_CHARTS),
         (settings(process="plant.toml", reference="arx"), CHARTS_OF_MANY),
         (settings(charts=("cusum",)), ("cusum",)),
@@ -61,7 +63,12 @@ def raised(said: list[Publication]) -> list[Alarm]:
 def test_many_signals_without_equations_have_charts_of_their_own_where_none_are_named(
     config: MonitorConfig, charts: tuple[str, ...]
 ) -> None:
+    """So too after another process has got the settings, where signals may be named later."""
     assert config.charts == charts
+    sent = pickle.loads(pickle.dumps(config))
+    assert sent.charts == charts
+    few = msgspec.structs.replace(sent, outputs=("a",), priorities={})
+    assert few.charts == (USUAL_CHARTS if isinstance(config.charts, DefaultCharts) else charts)
 
 
 @pytest.mark.parametrize("faulty", [0, 6])
@@ -103,6 +110,15 @@ def test_missing_values_neither_blind_the_chart_nor_raise_it() -> None:
     joint = [alarm for alarm in alarms if alarm.alarm == "residual_space/all"]
     assert [alarm.contributions[0].signal for alarm in joint] == ["y3"]
     assert joint[0].time_ns > (TRAINING + 200) * 6 * 10**9
+
+
+def test_lost_rows_do_not_blind_the_chart() -> None:
+    """Every third row is lost, so there are never the rows before that the identified models need."""
+    values = plant(TRAINING + 240, TRAINING + 150, 2)
+    values[:, TRAINING::3] = np.nan
+    (alarm,) = raised(watch(Monitor(settings(), 0, points=False), values))
+    assert alarm.alarm == "residual_space/all"
+    assert alarm.contributions[0].signal == "y2"
 
 
 def test_after_a_training_too_short_for_the_chart_each_output_has_its_own() -> None:

@@ -128,7 +128,7 @@ def test_rates_in_words(rate: float, words: str) -> None:
 
 def test_a_back_test_has_the_promise_for_the_rows_it_judged() -> None:
     time_min, columns = sound_run(80.0, seed=3)
-    found = rw.backtest(Record(time_min, columns, "sound"), training_min=60.0, isolation=False)
+    found = rw.backtest(Record(time_min, columns, "sound"), training_min=60.0, isolation=False, diagnose_training=False)
     assert found.promise is not None
     assert found.promise["expected"] == found.expected_false_alarms
     assert found.promise["expected"] < found.promise["expected_90"] < 0.01
@@ -140,5 +140,5 @@ def test_a_back_test_has_the_promise_for_the_rows_it_judged() -> None:
 
 def test_before_rows_are_judged_there_is_no_promise() -> None:
     time_min, columns = sound_run(50.0, seed=3)
-    found = rw.backtest(Record(time_min, columns, "short"), training_min=60.0, isolation=False)
+    found = rw.backtest(Record(time_min, columns, "short"), training_min=60.0, diagnose_training=False)
     assert (found.promise, found.power) == (None, [])

@@ -79,15 +79,20 @@ def test_a_thermowell_follows_the_temperature(m: float) -> None:
     assert np.all(np.abs(outputs(extend_cstr("temperature_lag", m)) - truth[:, [0, 2]]) < ERROR)
 
 
+@pytest.fixture(scope="module")
+def dense() -> tuple[Array, Array]:
+    """Times and concentrations of the plant, twenty to a row."""
+    fine: Array = np.round(np.arange(4000.0) * 0.005, 9)
+    return fine, run(nominal, START, np.repeat(FLOWS, 20), fine)[:, 0]
+
+
 @pytest.mark.parametrize(
     ("m", "rms", "worst"),
     [(0.05, 1e-4, 6e-4), (0.3, 1e-4, 6e-4), (1.0, 1e-4, 6e-4), (2.0, 1e-3, 4e-3), (3.0, 4e-3, 0.012)],
 )
-def test_an_analyser_shows_what_was_there(m: float, rms: float, worst: float) -> None:
+def test_an_analyser_shows_what_was_there(m: float, rms: float, worst: float, dense: tuple[Array, Array]) -> None:
     """Against the exact delay, with the coolant stepping every minute over its whole range; noise is 0.002 mol/l."""
-    fine: Array = np.round(np.arange(4000.0) * 0.005, 9)
-    dense = run(nominal, START, np.repeat(FLOWS, 20), fine)[:, 0]
-    off = outputs(extend_cstr("concentration_delay", m))[:, 0] - np.interp(TIMES - m, fine, dense)
+    off = outputs(extend_cstr("concentration_delay", m))[:, 0] - np.interp(TIMES - m, *dense)
     assert np.sqrt(np.mean(off**2)) < rms
     assert np.max(np.abs(off)) < worst
 

@@ -113,7 +113,15 @@ BOUNDED = [
 
 
 def test_every_table_with_bounds_is_tried() -> None:
-    assert {table for table, _, _ in BOUNDED} == {"bus", "plant", "monitor", "recorder", "diagnosis", "metrics"}
+    assert {table for table, _, _ in BOUNDED} == {
+        "bus",
+        "plant",
+        "monitor",
+        "fleet",
+        "recorder",
+        "diagnosis",
+        "metrics",
+    }
 
 
 @pytest.mark.parametrize(("table", "name", "bounds"), BOUNDED, ids=[f"{table}.{name}" for table, name, _ in BOUNDED])

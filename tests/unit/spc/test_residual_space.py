@@ -86,7 +86,7 @@ def test_ratios_are_moderated_as_much_as_their_own_spread_is_chance(prior: float
         assert total - freedom == pytest.approx(prior, rel=0.15)
         assert np.corrcoef(np.log(true), np.log(moderated))[0, 1] > 0.8
     else:
-        assert total > 10.0 * freedom
+        assert 10.0 * freedom < total <= count * freedom
         assert moderated == pytest.approx(2.0, rel=0.1)
 
 
@@ -107,6 +107,15 @@ def test_the_promise_is_kept_by_sound_plants_that_remember() -> None:
                 chart.restart()
     promised = 20 * rows * 8 / ARL0
     assert 0.2 * promised < raised < 1.5 * promised
+
+
+def test_false_alarms_by_the_errors_of_a_training_are_those_promised_on_average_and_more_for_the_unlucky() -> None:
+    """Student's limit holds on average over the errors of a variance, so the mean of the rates is one a signal."""
+    rng = np.random.default_rng(8)
+    baseline = ValueBaseline(NAMES, sound(rng, 400, rng.standard_normal((8, 2))), 200.0, {"residual_space_weight": 0.1})
+    rates = ResidualSpace.relative_rates(baseline)
+    assert np.mean(rates) == pytest.approx(8.0, rel=0.1)
+    assert np.quantile(rates, 0.9) > 1.1 * np.mean(rates)
 
 
 @pytest.mark.parametrize("faulty", [0, 7, 19])

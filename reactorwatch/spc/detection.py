@@ -1,0 +1,184 @@
+"""Smallest deviations that charts detect in time, from what a deviation of unit size does to their signals.
+
+A deviation moves the mean of the prewhitened residuals to a m(k) in row k, with a its size: residuals are linear in it.
+An average of weight lambda is a first-order autoregression about its own smoothed mean, in units of its standard
+deviation, and crosses its limit L in a row in which it was within it before with the probability
+
+    h(u) = P(A' > u | A and all before it <= u),      u = L - |a M(k)|,
+
+A and A' being neighbours of that autoregression, as if M had been there for long. The chance to miss is the product of
+1 - h over the rows, and no more than the chance that the largest |a M| alone is missed, which counts where M rises
+faster than the average forgets. Where an alarm takes several points, h is the rate of that rule. Of several charts the
+one that misses least counts, as all see the same noise.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy import linalg, special
+from scipy.signal import lfilter
+
+from reactorwatch.arrays import Array
+from reactorwatch.spc.m_of_n import false_alarm_rate
+
+POWER = 0.9
+"""Share of the cases in which a deviation is seen in time."""
+
+_NODES, _LATE_NODES, _STEPS = 40, 8, 24
+_LOWEST, _HIGHEST = -4.0, 9.0
+_LEAST_HAZARD, _MOST_HAZARD = 1e-15, 1.0 - 1e-9
+_RARE = 4.0
+"""Distance from the limit, in standard deviations, from which on a crossing does not depend on rows before the last."""
+
+
+class Detector(NamedTuple):
+    """A chart as a moving average with a limit.
+
+    Attributes:
+        signals: indices of the signals that it looks at.
+        matrix: map that makes them independent with unit variance, shape (p, p).
+        weight: weight of the newest row.
+        level: limit of the average's length, in its standard deviations.
+        rule: points that raise the alarm, and the number of points among which they count.
+    """
+
+    signals: tuple[int, ...]
+    matrix: Array
+    weight: float
+    level: float
+    rule: tuple[int, int] = (1, 1)
+
+
+class _Path(NamedTuple):
+    """Sizes of an average's mean under a unit deviation, with the rows that each stands for.
+
+    Attributes:
+        mean: shape (deviations, onsets, nodes).
+        rows: number of rows within each horizon, shape (horizons, nodes).
+    """
+
+    mean: Array
+    rows: Array
+
+
+def smallest_sizes(paths: Array, detectors: Sequence[Detector], horizons: Sequence[float], ramp_rows: float) -> Array:
+    """Smallest sizes that are seen within some horizons, shape (deviations, horizons); infinite: none is.
+
+    Args:
+        paths: mean of each signal by row after the onset of a unit step, shape (deviations, onsets, rows, signals).
+        detectors: the charts.
+        horizons: numbers of rows.
+        ramp_rows: rows in which a ramp reaches the unit size; 0: the deviations are steps.
+    """
+    shape = (paths.shape[0], len(horizons))
+    if not detectors or not paths.size:
+        return np.full(shape, np.inf)
+    charts = [(item, _chart_path(paths, item, horizons, ramp_rows)) for item in detectors]
+    largest = max(float(path.mean.max(initial=0.0)) for _, path in charts)
+    if not largest:
+        return np.full(shape, np.inf)
+    log_size = np.full(shape, -np.log(largest))
+    low, high = log_size - 5.0, log_size + 20.0
+    for _ in range(_STEPS):
+        middle = 0.5 * (low + high)
+        log_missed = np.min([_miss_log_probability(chart, path, np.exp(middle)) for chart, path in charts], axis=0)
+        seen = 1.0 - np.exp(log_missed).mean(axis=2) >= POWER
+        low, high = np.where(seen, low, middle), np.where(seen, middle, high)
+    return np.where(high >= log_size + 19.9, np.inf, np.exp(high))
+
+
+def _chart_path(paths: Array, chart: Detector, horizons: Sequence[float], ramp_rows: float) -> _Path:
+    """Path of a chart's average: in its rows, and beyond them by those of their later half."""
+    signals = paths[..., list(chart.signals)] @ chart.matrix.T
+    rows = signals.shape[2]
+    later = signals[:, :, rows // 2 :]
+    if ramp_rows:
+        signals = np.cumsum(signals, axis=2) / ramp_rows
+    unit = sqrt(chart.weight / (2.0 - chart.weight))
+    smoothed = lfilter([chart.weight / unit], [1.0, chart.weight - 1.0], signals, axis=2)
+    nodes = np.unique(np.geomspace(1.0, rows, _NODES).round().astype(int))
+    ends = np.concatenate([0.5 * (nodes[1:] + nodes[:-1] + 1), [rows + 1.0]])
+    starts = np.concatenate([[1.0], ends[:-1]])
+    counts = [np.clip(np.minimum(ends, horizon + 1.0) - starts, 0.0, None) for horizon in horizons]
+    beyond = np.array([max(horizon - rows, 0.0) for horizon in horizons])
+    if ramp_rows:
+        times = rows + np.outer(beyond, (np.arange(_LATE_NODES) + 0.5) / _LATE_NODES)
+        slope = later.mean(axis=2) / (ramp_rows * unit)
+        end = signals[:, :, -1] / unit
+        late = end[:, :, None] + slope[:, :, None] * (times.ravel()[None, None, :, None] - rows)
+        late_size = np.linalg.norm(late, axis=3)
+        late_rows = np.zeros((len(horizons), times.size))
+        for index, count in enumerate(beyond):
+            late_rows[index, index * _LATE_NODES : (index + 1) * _LATE_NODES] = count / _LATE_NODES
+    else:
+        shares = (np.arange(_LATE_NODES) + 0.5) / _LATE_NODES
+        sizes = np.linalg.norm(smoothed[:, :, rows // 2 :], axis=3)
+        late_size = np.moveaxis(np.quantile(sizes, shares, axis=2), 0, 2)
+        late_rows = np.repeat(beyond[:, None] / _LATE_NODES, _LATE_NODES, axis=1)
+    mean = np.concatenate([np.linalg.norm(smoothed[:, :, nodes - 1], axis=3), late_size], axis=2)
+    return _Path(mean, np.hstack([np.array(counts), late_rows]))
+
+
+def _miss_log_probability(chart: Detector, path: _Path, sizes: Array) -> Array:
+    """Logarithm of the probability of a miss, shape (deviations, horizons, onsets).
+
+    Args:
+        chart: the chart.
+        path: path of its average.
+        sizes: sizes of the deviations, shape (deviations, horizons).
+    """
+    moved = sizes[:, :, None, None] * path.mean[:, None]
+    distance = chart.level - np.sqrt(moved**2 + (len(chart.signals) - 1.0))
+    grid, log_within = _log_within(chart.weight, *chart.rule)
+    step = grid[1] - grid[0]
+    place = np.clip((distance - grid[0]) / step, 0.0, grid.size - 1.001)
+    index = place.astype(int)
+    share = place - index
+    log_hazard = np.log(-log_within)
+    values = -np.exp(log_hazard[index] * (1.0 - share) + log_hazard[index + 1] * share)
+    log_missed = np.asarray(np.einsum("dhon,hn->dho", values, path.rows))
+    if chart.rule == (1, 1):
+        nearest = np.where(path.rows[:, None, :] > 0.0, distance, np.inf).min(axis=3)
+        log_missed = np.minimum(log_missed, special.log_ndtr(nearest))
+    return log_missed
+
+
+@cache
+def _log_within(weight: float, count: int, window: int) -> tuple[Array, Array]:
+    """Grid of distances u from the limit, and the logarithm of the probability to stay within it for one row."""
+    grid = np.linspace(_LOWEST, _HIGHEST, 53)
+    if count > 1:
+        rates = [false_alarm_rate(count, window, float(p)) for p in np.clip(special.ndtr(-grid), 1e-12, 1.0)]
+        return grid, np.log1p(-np.clip(rates, _LEAST_HAZARD, _MOST_HAZARD))
+    kept, spread = 1.0 - weight, sqrt(weight * (2.0 - weight))
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    before = _LOWEST - 3.0 + 0.5 * (grid[:, None] - _LOWEST + 3.0) * (nodes + 1.0)
+    scaled = 0.5 * (grid[:, None] - _LOWEST + 3.0) * weights
+    density = np.exp(-0.5 * before**2) / np.sqrt(2.0 * np.pi) * scaled
+    crossing = np.sum(density * special.ndtr(-(grid[:, None] - kept * before) / spread), axis=1)
+    log_within = np.log1p(-np.clip(crossing / np.maximum(density.sum(axis=1), 1e-300), _LEAST_HAZARD, _MOST_HAZARD))
+    if weight < 1.0:
+        near = grid <= _RARE
+        log_within[near] = np.log(_remaining_shares(grid[near], kept, spread))
+    return grid, log_within
+
+
+def _remaining_shares(limits: Array, kept: float, spread: float) -> Array:
+    """Share of a stationary autoregression that stays below each limit for one row, having stayed for long.
+
+    The largest eigenvalue of the transitions below the limit, which reversibility makes symmetric.
+    """
+    cell = min(0.1, 0.5 * spread)
+    lowest = _LOWEST - 2.0
+    shares = []
+    for limit in limits.tolist():
+        at = np.arange(limit - 0.5 * cell, lowest, -cell)
+        ends = at[:, None] - kept * at[None, :]
+        transitions = np.exp(-0.5 * (ends / spread) ** 2 - 0.25 * (at[None, :] ** 2 - at[:, None] ** 2))
+        transitions *= cell / (spread * sqrt(2.0 * np.pi))
+        last = len(at) - 1
+        shares.append(float(linalg.eigh(transitions, eigvals_only=True, subset_by_index=(last, last))[0]))
+    return np.clip(shares, 1.0 - _MOST_HAZARD, 1.0 - _LEAST_HAZARD)
