@@ -216,19 +216,19 @@ class _OfValues:
 
     Args:
         values: the chart.
-        signals: names of the signals of a row, the inputs first.
+        config: configuration of the monitor.
     """
 
-    def __init__(self, values: ValueChart, signals: Sequence[str]) -> None:
-        self._chart = values
-        self._indices = [signals.index(name) for name in values.names]
+    def __init__(self, values: ValueChart, config: MonitorConfig) -> None:
+        self._chart, self._has_inputs = values, bool(config.inputs)
+        self._indices = [config.signals.index(name) for name in values.names]
 
     def to_bytes(self) -> bytes:
         return self._chart.state.to_bytes()
 
     def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
-        """Update with a row; a row that the reference does not predict at all is skipped."""
-        if True not in row.known:
+        """Update with a row; one that is not predicted at all is skipped, since inputs may be beyond the training."""
+        if self._has_inputs and True not in row.known:
             return None
         outputs: Sequence[float] = row.values
         if True in row.withheld:
@@ -395,7 +395,7 @@ class ChartWatch:
             if issubclass(kind, SignalChart):
                 return _of_each(kind, [kind.design(baseline.of([index])) for index in range(len(config.outputs))])
             if issubclass(kind, ValueChart):
-                return _OfValues(kind.design(self._value_baseline(values, arl0)), config.signals)
+                return _OfValues(kind.design(self._value_baseline(values, arl0)), config)
             assert issubclass(kind, JointChart)
             return _OfAll(kind.design(baseline.of(np.flatnonzero(self._evaluated).tolist())), self._evaluated)
 
@@ -493,7 +493,7 @@ class ChartWatch:
             if issubclass(kind, ValueChart):
                 of_values = kind.from_state(kind.State.from_bytes(data))
                 self._signals = of_values.names
-                return _OfValues(of_values, self._config.signals)
+                return _OfValues(of_values, self._config)
             assert issubclass(kind, JointChart)
             return _OfAll(kind.from_state(kind.State.from_bytes(data)), self._evaluated)
 

@@ -112,6 +112,15 @@ def test_missing_values_neither_blind_the_chart_nor_raise_it() -> None:
     assert joint[0].time_ns > (TRAINING + 200) * 6 * 10**9
 
 
+def test_lost_rows_do_not_blind_the_chart() -> None:
+    """Every third row is lost, so there are never the rows before that the identified models need."""
+    values = plant(TRAINING + 240, TRAINING + 150, 2)
+    values[:, TRAINING::3] = np.nan
+    (alarm,) = raised(watch(Monitor(settings(), 0, points=False), values))
+    assert alarm.alarm == "residual_space/all"
+    assert alarm.contributions[0].signal == "y2"
+
+
 def test_after_a_training_too_short_for_the_chart_each_output_has_its_own() -> None:
     """The reason is in the notes, and a stored state knows which charts there are."""
     values = plant(90 + 130)
