@@ -18,7 +18,6 @@ OF_OUTPUTS = {"T.bias": "temperature_bias", "C.bias": "concentration_bias"}
 CASES = [
     ("equations", "coolant_flow"),
     ("equations", "temperature_bias"),
-    ("black-box", "T.bias"),
     ("arx", "T.bias"),
 ]
 
