@@ -1,7 +1,6 @@
 """A diagnosis takes no more filter runs and linearisations than people wait for; seconds depend on the machine."""
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
@@ -22,7 +21,7 @@ class Effort:
 
 
 @pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Counter[str]]:
+def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     counts: Counter[str] = Counter()
     run, linearise = Filter.run_batched, ErrorLinearization.dynamics
 
