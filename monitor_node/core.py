@@ -31,6 +31,7 @@ from monitor_node.ingest.sample_units import make_sample_units
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from monitor_node.pipeline import PlantPipeline
 from monitor_node.process_settings import order_inputs
+from monitor_node.promise_stage import PromiseStage
 from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
 from monitor_node.training_check import check_training
@@ -579,8 +580,9 @@ class Monitor:
             failures=self.failures,
             changes=self._changes,
             diagnose=self._diagnose,
-            check=check_training,
-            power=self._power,
+            promises=PromiseStage(
+                self.config, self.failures, check=check_training, states_power=self._power, points=self._points
+            ),
         )
 
     def _contain(self, stage: str, error: Exception) -> None:

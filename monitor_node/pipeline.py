@@ -41,7 +41,7 @@ from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.operating_modes import OperatingModes, key_of
 from monitor_node.operation import Operation
 from monitor_node.power import Watch
-from monitor_node.promise_stage import CheckTraining, PromiseStage
+from monitor_node.promise_stage import PromiseStage
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.shift_stage import NAME as SHIFT
 from monitor_node.shift_stage import ShiftWatch
@@ -105,8 +105,7 @@ class PlantPipeline:
         failures: counter of errors in the search for causes; None: a new one.
         changes: changes of the baseline to come.
         diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`.
-        check: judges the training by itself; None: that is not done.
-        power: True to state the deviations that would be seen.
+        promises: stage of the promise of false alarms; None: one that checks and states nothing more.
 
     Raises:
         InputError: the settings ask for a process model that does not fit the plant's signals.
@@ -133,16 +132,14 @@ class PlantPipeline:
         failures: Failures | None = None,
         changes: deque[ScheduledChange] | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
-        check: CheckTraining | None = None,
-        power: bool = False,
+        promises: PromiseStage | None = None,
     ) -> None:
         self._config = config
-        self._states_power = power
         self._units = [config.units.get(name, "") for name in config.outputs]
         self._update = ModelUpdate(config, deque() if changes is None else changes)
         self._diagnose = diagnose
         self._failures = Failures() if failures is None else failures
-        self.promises = PromiseStage(config, self._failures, check=check, points=points)
+        self.promises = promises or PromiseStage(config, self._failures, points=points)
         self._board = board
         self._points = points
         self.model = _model(config, model)
@@ -878,7 +875,7 @@ class PlantPipeline:
         rates += self.signals.relative_rates(trained.learned, self._evaluated, arl0, errors)
         rates += self._drift.chance_alarms(self._evaluated) + self._count_step_tests
         watch = None
-        if self._states_power:
+        if self.promises.states_power:
             watch = Watch(
                 self._config,
                 trained.reference,

@@ -153,7 +153,7 @@ def _deviations(watch: Watch, rows: TrainingState) -> list[Deviation]:
     if len(time_min) < 2 * FEWEST_ROWS:
         return []
     reference = watch.reference
-    if isinstance(reference, ProcessReference) and has_causes(watch.config, reference.model):
+    if isinstance(reference, ProcessReference) and has_causes(watch.config, reference.equations):
         return _causes(watch, reference, time_min, inputs, measured)
     if isinstance(reference, ProcessReference):
 
@@ -180,15 +180,15 @@ def _causes(
     watch: Watch, reference: ProcessReference, time_min: Array, inputs: Array, measured: Array
 ) -> list[Deviation]:
     """Causes of the catalogue, to first order about the filter's run over the training."""
-    model, effects = reference.model, causes_of(reference.model)
+    (model, noise), effects = reference.known_plant, causes_of(reference.equations)
     indices = output_indices(model, watch.config.outputs)
     outputs = np.full((len(time_min), len(model.outputs)), np.nan)
     outputs[:, indices] = measured
     newest = list(zip(time_min.tolist(), inputs.tolist(), outputs.tolist(), strict=True))
-    window = window_of(newest[-2 * MOST_ROWS :], Filter(model, reference.noise))
+    window = window_of(newest[-2 * MOST_ROWS :], Filter(model, noise))
     if window is None or window.time_min.size < 2 * FEWEST_ROWS:
         return []
-    dynamics = GlrScan(model, reference.noise, effects).dynamics(window)
+    dynamics = GlrScan(model, noise, effects).dynamics(window)
     sds = np.ones(len(model.outputs))
     sds[indices] = reference.typical_sd
     diagonal = np.ascontiguousarray(np.broadcast_to(np.diag(1.0 / sds), dynamics.whitening.shape))

@@ -37,6 +37,7 @@ class PromiseStage:
         config: settings of the monitor.
         failures: counter of errors, which leave the promise without what they concern.
         check: judges the training by itself; None: that is not done.
+        states_power: True to state the deviations that would be seen.
         points: True to publish each promise; False: only one that is not kept or no longer holds.
 
     Attributes:
@@ -44,7 +45,16 @@ class PromiseStage:
         alarm_rates: false alarms a row by the errors that the training may have made, shape (draws,), after its end.
     """
 
-    def __init__(self, config: MonitorConfig, failures: Failures, *, check: CheckTraining | None, points: bool) -> None:
+    def __init__(
+        self,
+        config: MonitorConfig,
+        failures: Failures,
+        *,
+        check: CheckTraining | None = None,
+        states_power: bool = False,
+        points: bool = True,
+    ) -> None:
+        self.states_power = states_power
         self._config, self._failures, self._check, self._points = config, failures, check, points
         self._watch: Watch | None = None
         self._published: Promise | None = None

@@ -206,6 +206,17 @@ class ProcessReference:
         return reference
 
     @property
+    def known_plant(self) -> tuple[ProcessModel, NoiseLevels]:
+        """Model and noise as if the constants were known: the filter's, with the disturbances alone beside the states.
+
+        Rows narrow what is not known of the constants, so soon the filter judges nearly as this one does.
+        """
+        disturbances = tuple(filter(is_disturbance, self.equations.uncertain))
+        model = widen_model(self.equations, disturbances, self._learned)
+        sds = dict(zip(self.model.state_names, self.noise.process_sd, strict=True))
+        return model, NoiseLevels(self.noise.measurement_sd, tuple(sds[name] for name in model.state_names))
+
+    @property
     def noise_levels(self) -> dict[str, dict[str, float]]:
         """Standard deviations by name: of each sensor in its unit, of each state in its unit per square root minute."""
         states, constant = enumerate(self.model.state_names), self.model.constant_states

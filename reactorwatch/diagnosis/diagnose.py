@@ -19,7 +19,7 @@ from reactorwatch.diagnosis.experiment.constraints import check_limits
 from reactorwatch.diagnosis.experiment.design import propose_experiment
 from reactorwatch.diagnosis.extended import extended_model
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.holdout import Errors, evaluate_holdout
+from reactorwatch.diagnosis.holdout import Errors, evaluate_holdout, is_near_noise
 from reactorwatch.diagnosis.integration_error import looks_like_integration
 from reactorwatch.diagnosis.lasting import LastingResult, prefer_lasting
 from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
@@ -63,9 +63,6 @@ SURE = 6.0
 MUCH_RESIDUAL, MUCH_RESIDUAL_OF_TWO = 30.0, 10.0
 """Minus the decimal logarithm of the p-value of whiteness: no right cause leaves so much, nor do two causes, which can
 imitate a third."""
-
-NEARLY = 1.15
-"""Ratio to the noise: a simulation with a smaller error explains what matters, even if its residual is not white."""
 
 KEPT_BYTES = 31_000_000
 
@@ -224,7 +221,7 @@ def _is_unknown(unknown: Localised, result: SearchResult, best: FittedHypothesis
         return better and bool(best.label)
     if not best.label or log_p >= (MUCH_RESIDUAL if len(best.label) == 1 else MUCH_RESIDUAL_OF_TWO):
         return True
-    return better or not _is_nearly_explained(result, evaluate_holdout(run, result.nominal, best)[1])
+    return better or not is_near_noise(evaluate_holdout(run, result.nominal, best)[1], _sensor_sd(result))
 
 
 def _may_be_unknown(result: SearchResult, best: FittedHypothesis, model: ProcessModel) -> bool:
@@ -256,10 +253,8 @@ def _seems_noisy(result: SearchResult, model: ProcessModel) -> bool:
     return max(shares) > NOISY_SHARE
 
 
-def _is_nearly_explained(result: SearchResult, after: Errors) -> bool:
-    """Return true if the simulation's errors on held-out rows are close to the noise."""
-    outputs = result.nominal.hypothesis.filter.model.output_names
-    return bool(np.all(after.simulation < NEARLY * result.noise.sensor_sd(outputs)))
+def _sensor_sd(result: SearchResult) -> Array:
+    return result.noise.sensor_sd(result.nominal.hypothesis.filter.model.output_names)
 
 
 def _keep_memory() -> None:

@@ -35,6 +35,10 @@ FEWEST_ROWS = 100
 """Smallest number of rows of a holdout; below it, those after gaps are evaluated, too."""
 
 
+NEARLY = 1.15
+"""Ratio to the noise: a simulation with a smaller error explains what matters, even if its residual is not white."""
+
+
 class Errors(NamedTuple):
     """Root mean square errors on held-out rows.
 
@@ -86,6 +90,11 @@ def evaluate_holdout(run: Run, nominal: FittedHypothesis, best: FittedHypothesis
     if best is nominal:
         return before, before
     return before, _errors(run, hidden, best.hypothesis.filter, best.hypothesis.signals(fit), offsets)
+
+
+def is_near_noise(errors: Errors, noise_sd: Array) -> bool:
+    """Return true if the simulation's errors on held-out rows are close to the sensors' noise, shape (n_y,)."""
+    return bool(np.all(errors.simulation < NEARLY * noise_sd))
 
 
 def _onsets(best: FittedHypothesis) -> list[float]:

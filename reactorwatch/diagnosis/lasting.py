@@ -27,7 +27,7 @@ from reactorwatch.diagnosis.fitting.fault_filter import (
 )
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
-from reactorwatch.diagnosis.holdout import evaluate_holdout, holdout_rows
+from reactorwatch.diagnosis.holdout import evaluate_holdout, holdout_rows, is_near_noise
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult
 from reactorwatch.kalman.error_dynamics import ErrorLinearization
@@ -90,7 +90,10 @@ def prefer_lasting(
         uncertain: standard deviations of its uncertain parameters.
     """
     run = search.run
-    drifting = evaluate_holdout(run, result.nominal, best)[1].simulation
+    errors = evaluate_holdout(run, result.nominal, best)[1]
+    if is_near_noise(errors, result.noise.sensor_sd(model.output_names)):
+        return None
+    drifting = errors.simulation
     fits = [fit_lasting(model, effect, uncertain, run) for effect in _likely_causes(search, result)]
     usable = [item for item in fits if item is not None]
     if not usable:

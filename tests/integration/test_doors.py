@@ -261,6 +261,7 @@ def answered(
     [
         ("monitor", "acknowledge", {"cstr/operator", "cstr/engineer"}),
         ("monitor", "suppress", {"cstr/engineer"}),
+        ("monitor", "baseline", {"cstr/engineer"}),
         ("plant", "set_input", {"cstr/engineer"}),
         ("plant", "inject_fault", {"cstr/engineer"}),
     ],

@@ -30,6 +30,9 @@ predicted gain is below the second."""
 MOST_STEPS = 12
 """Maximum number of steps of a fit."""
 
+MANY = 16
+"""Number of parameters beyond which most of their derivatives are 0 in most rows, as those of a curve's knots are."""
+
 _RUNAWAY = 1e100
 """Derivatives beyond this are useless: the filter has lost an unstable plant."""
 
@@ -145,7 +148,8 @@ class Hypothesis:
                 break
             weights = HUBER / np.maximum(np.abs(w), HUBER)
             weighted = g * np.sqrt(weights)[:, None]
-            information, gradient = weighted.T @ weighted + self._prior_information(), g.T @ (weights * w)
+            squares = signatures.gram_of_columns(weighted) if self.n_parameters > MANY else weighted.T @ weighted
+            information, gradient = squares + self._prior_information(), g.T @ (weights * w)
             for index, deviation, sd in zip(
                 self.constant_indices, self._deviations(best.parameters), self._constant_sds, strict=True
             ):

@@ -17,7 +17,9 @@ from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import PiecewiseLinear, hat_functions
 from reactorwatch.diagnosis.run import Run
 
-FEWEST_KNOTS, MOST_KNOTS = 3, 80
+COUNTS = (*range(3, 21), *range(22, 41, 2), *range(44, 81, 4))
+"""Numbers of knots that are compared; with many, one more or less is no difference."""
+
 GRID = 161
 """Knots of the fine grid."""
 
@@ -49,7 +51,7 @@ def select_knots(
     gradient = g.T @ huber_clip(fit.w[2:]).ravel() + information @ values
     information += _RIDGE * np.trace(information) / GRID * np.eye(GRID)
     promised: list[tuple[float, Array]] = []
-    for count in range(FEWEST_KNOTS, MOST_KNOTS + 1):
+    for count in COUNTS:
         on_grid = _on_grid(count)
         a = on_grid.T @ gradient
         parameters = _solve(on_grid.T @ information @ on_grid, a)

@@ -1,5 +1,7 @@
 """A sensor whose noise grows is named with size and onset, alone and beside a cause that changes the outputs."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from reactorwatch.diagnosis.report.page import as_page
 from reactorwatch.diagnosis.result import NAMED, NOMINAL, Diagnosis
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.process import effects_of
+from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.generic_effects import generic_effects
 from reactorwatch.process.library.three_tanks.model import three_tanks
 from reactorwatch.process.profiles import STEP
@@ -44,7 +47,8 @@ def test_a_noisier_sensor_is_named_with_its_further_noise_and_onset(noisier: Dia
     for name, truth, widest in (("size", 0.3, 0.05), ("onset", ONSET_MIN, 2.0)):
         said = cause.parameters[name]
         assert abs(said.value - truth) < 4.0 * said.sd < 4.0 * widest, name
-    assert noisier.extended_model is not None
+    extended = parse_extended_model(json.dumps(noisier.extended_model), (tank,), generic_effects(tank())).build((tank,))
+    assert extended.parameter("h.noise.size").value == cause.parameters["size"].value
 
 
 def test_its_report_says_so(noisier: Diagnosis) -> None:

@@ -9,6 +9,7 @@ from reactorwatch.contract.codec import Encoded, Publication, decode, encode_mes
 from reactorwatch.contract.messages_pb2 import (
     AlarmCommand,
     Audit,
+    BaselineCommand,
     ClearFault,
     CommandReply,
     InjectFault,
@@ -35,6 +36,7 @@ def asked(name: str, command: Message) -> Encoded:
         ("clear_fault", ClearFault(cause="coolant_flow", by="Anna")),
         ("acknowledge", AlarmCommand(alarm="shewhart/T", by="Anna")),
         ("shelve", ShelveAlarm(alarm="shewhart/T", by="Anna", minutes=5.0)),
+        ("baseline", BaselineCommand(what="relearn", by="Anna", why="new pump")),
         ("pause", ReplayCommand(by="Anna")),
     ],
 )
@@ -65,6 +67,7 @@ def test_what_cannot_be_read_is_recorded_without_its_content() -> None:
 
 def test_a_question_that_changes_nothing_is_not_recorded() -> None:
     assert audit(asked("list_alarms", ListAlarms()), CommandReply(accepted=True), 7) is None
+    assert audit(asked("baseline", BaselineCommand(what="list")), CommandReply(accepted=True), 7) is None
 
 
 class Obedient:

@@ -10,6 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
+from monitor_node.baseline.references import ProcessReference
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.baseline.uncertainty import Uncertain, describe_uncertain, find_uncertain
 from monitor_node.config import MonitorConfig
@@ -17,6 +18,7 @@ from monitor_node.core import Monitor
 from monitor_node.replay import backtest
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.diagnosis.result import NOMINAL
+from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.kalman.uncertain_model import is_disturbance
 from reactorwatch.process.extended_model import ExtendedModel
 from reactorwatch.process.library.cstr.model import cstr
@@ -113,3 +115,11 @@ def test_a_monitor_with_additional_states_resumes_bit_for_bit(uncertain: tuple[s
     resumed = Monitor(QUICK, 0)
     resumed.from_bytes(monitor.to_bytes())
     assert publish(resumed, messages[3 * 300 :]) == publish(monitor, messages[3 * 300 :])
+
+
+def test_the_power_is_stated_for_constants_that_rows_have_taught() -> None:
+    noise = NoiseLevels((0.002, 0.3), (0.1, 0.2, 0.0, 0.0, 0.0, 0.0, 0.4))
+    model = replace_model(cstr(), uncertain=(*UNCERTAIN, "wander T"))
+    known, levels = ProcessReference(model, ("C", "T"), noise).known_plant
+    assert known.state_names == ("C", "T", "T.wander")
+    assert levels == NoiseLevels((0.002, 0.3), (0.1, 0.2, 0.4))
