@@ -441,8 +441,6 @@ class ChartWatch:
         baseline, evaluated, found = self._baseline(learned, e, arl0), np.flatnonzero(self._evaluated).tolist(), []
         for name in self._chosen:
             kind = chart(name)
-            if issubclass(kind, ValueChart):
-                continue
             for group in [[index] for index in evaluated] if issubclass(kind, SignalChart) else [evaluated]:
                 average = kind.detector(baseline.of(group))
                 if average is not None:

@@ -97,7 +97,11 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         inputs: signals that drive the plant; none, one or several.
         outputs: signals that are predicted and monitored.
         setpoints: signals that controllers aim at; an alarm states their recent moves.
-        modes: signals that say how the plant is operated, such as a controller in manual; an alarm states unusual ones.
+        modes: signals that say how the plant is operated, such as a controller in manual: each mode has a baseline of
+            its own; one that the training has not seen is watched by the signal checks only. An alarm states unusual
+            ones.
+        startup_modes: values by mode in which the plant starts up or shuts down; they are watched by the signal checks
+            only.
         labels: signals that are carried along, and ignored.
         bounds: lowest and highest value by signal, in the unit in which it is judged; other values are not measured
             values, and an input at a bound is saturated, which an alarm states.
@@ -145,6 +149,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     outputs: tuple[str, ...] = DEFAULT_SIGNALS["outputs"]
     setpoints: tuple[str, ...] = ()
     modes: tuple[str, ...] = ()
+    startup_modes: dict[str, tuple[float, ...]] = msgspec.field(default_factory=dict)
     labels: tuple[str, ...] = ()
     bounds: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
     resolution: dict[str, float] = msgspec.field(default_factory=dict)
@@ -210,6 +215,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
         if self.process is not None and self.outputs == DEFAULT_SIGNALS["outputs"]:
             return  # the outputs are those of the process, which `watched_process` sets
+        for signal in self.startup_modes:
+            if signal not in self.modes:
+                raise ValueError(f"startup_modes are by mode, {self.modes}, got {signal!r}")
         for signal, (lower, upper) in self.bounds.items():
             if signal not in self.signals:
                 raise ValueError(f"bounds are by input and output, {self.signals}, got {signal!r}")

@@ -31,6 +31,7 @@ from monitor_node.ingest.sample_units import make_sample_units
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from monitor_node.pipeline import PlantPipeline
 from monitor_node.process_settings import order_inputs
+from monitor_node.promise_stage import PromiseStage
 from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
 from monitor_node.training_check import check_training
@@ -105,6 +106,7 @@ class Monitor:
         judged_by = self.pipeline.model
         self._sample_units = make_sample_units(config.units, {} if judged_by is None else judged_by.units)
         self._plain_units: dict[str, str] = {}  # newest unit by signal that needs no conversion
+        self._converted: set[str] = set()  # signals whose samples were converted
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -158,6 +160,9 @@ class Monitor:
                 return []
             if converted == unit:
                 self._plain_units[signal] = unit
+                self._converted.discard(signal)
+            else:
+                self._converted.add(signal)
             unit = converted
         index = self._indices.get(signal)
         if index is None:
@@ -403,7 +408,7 @@ class Monitor:
         """`waiting` for the first row, `training` or `watching`."""
         if self.first_ns is None:
             return "waiting"
-        return "watching" if self.pipeline.watching else "training"
+        return "watching" if self.pipeline.watching or not self.pipeline.is_judged else "training"
 
     @property
     def model(self) -> ProcessModel | None:
@@ -446,6 +451,11 @@ class Monitor:
         return self._watching_since_ns
 
     @property
+    def converts_samples(self) -> bool:
+        """True if samples come in other units than those in which they are judged."""
+        return bool(self._converted)
+
+    @property
     def unjudged_rows(self) -> int:
         """Number of rows that were not judged, see `PlantPipeline.unjudged_rows`."""
         return self.pipeline.unjudged_rows
@@ -458,7 +468,7 @@ class Monitor:
     @property
     def promise(self) -> Promise | None:
         """Promise of false alarms, as it is now; None before the end of the training."""
-        promise = self.pipeline.promise
+        promise = self.pipeline.promises.promise
         return None if promise is None else promise.message(self.last_ns or 0, self.pipeline.rows_watched)
 
     @property
@@ -570,8 +580,9 @@ class Monitor:
             failures=self.failures,
             changes=self._changes,
             diagnose=self._diagnose,
-            check=check_training,
-            power=self._power,
+            promises=PromiseStage(
+                self.config, self.failures, check=check_training, states_power=self._power, points=self._points
+            ),
         )
 
     def _contain(self, stage: str, error: Exception) -> None:

@@ -89,6 +89,11 @@ class Operation:
             state.changed_ns = time_ns
         state.value = value
 
+    @property
+    def values(self) -> dict[str, float]:
+        """Newest value of each mode and set point; NaN before the first."""
+        return {name: state.value for name, state in self._carried.items()}
+
     def on_restart(self) -> None:
         """Forget times: the plant's clock was set back, or the plant was restarted."""
         for name, state in self._carried.items():

@@ -10,20 +10,16 @@ after the training is charted as drift.
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from math import isfinite, nan
-from typing import TypeAlias
 
 import msgspec
 import numpy as np
-from msgspec.structs import replace
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.alarms.states import Event
 from monitor_node.baseline.arx_bank import ArxBank
 from monitor_node.baseline.black_box_reference import BlackBoxReference, BlackBoxReferenceState
 from monitor_node.baseline.commands import ACCEPT, RESTORE, TRAINED, check_command, is_command
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.predictor import ArxPredictor, arx_structure
-from monitor_node.baseline.promise import PlantPromise, PromiseState, TrainingCheck
 from monitor_node.baseline.references import (
     ArxReference,
     ArxReferenceState,
@@ -34,7 +30,7 @@ from monitor_node.baseline.references import (
 from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
-from monitor_node.chart_stage import ChartWatch, alarm_names, count_chance_alarms, has_values_only
+from monitor_node.chart_stage import ChartWatch, count_chance_alarms, has_values_only
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
@@ -42,25 +38,25 @@ from monitor_node.health import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import Interval, SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
+from monitor_node.operating_modes import OperatingModes, key_of
 from monitor_node.operation import Operation
-from monitor_node.power import Watch, state_power
+from monitor_node.power import Watch
+from monitor_node.promise_stage import PromiseStage
 from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.shift_stage import NAME as SHIFT
 from monitor_node.shift_stage import ShiftWatch
 from monitor_node.signal_checks.stage import SignalChecks
 from monitor_node.state.monitor_state import equations_text
-from monitor_node.state.pipeline_state import KeptBaseline, PipelineState, TrainedState
+from monitor_node.state.pipeline_state import KeptBaseline, ModeTraining, PipelineState, TrainedState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import (
-    Alarm,
     Baseline,
     BaselineCommand,
     Check,
     Estimate,
     ModelSnapshot,
     Parameter,
-    Promise,
 )
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
@@ -68,19 +64,14 @@ from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening, innovations
-from reactorwatch.spc.training_errors import QUANTILE, TrainingErrors
+from reactorwatch.spc.training_errors import TrainingErrors
 from reactorwatch.stored_state import unpack_numbers, unpack_times
-
-RAISED = Event.RAISED.value
 
 MOST_KEPT = 3
 """Baselines that can be restored; memory stays bounded."""
 
 TIMES_FEWEST = 2
 """Times the fewest rows of a training that a part of it needs to judge the rest: with fewer it is too rough."""
-
-CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, TrainingState, str], TrainingCheck]
-"""Judges a training by itself, see `training_check`."""
 
 
 def check_promise(config: MonitorConfig, period_min: float) -> None:
@@ -114,8 +105,7 @@ class PlantPipeline:
         failures: counter of errors in the search for causes; None: a new one.
         changes: changes of the baseline to come.
         diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`.
-        check: judges the training by itself; None: that is not done.
-        power: True to state the deviations that would be seen.
+        promises: stage of the promise of false alarms; None: one that checks and states nothing more.
 
     Raises:
         InputError: the settings ask for a process model that does not fit the plant's signals.
@@ -129,8 +119,7 @@ class PlantPipeline:
         signals: signal checks.
         operation: operation of the plant, for the texts of alarms.
         training_rows: number of rows of the training, after its end.
-        promise: promise of false alarms; None before the end of the training.
-        alarm_rates: false alarms a row by the errors that the training may have made, shape (draws,), after its end.
+        promises: promise of false alarms.
     """
 
     def __init__(
@@ -143,26 +132,14 @@ class PlantPipeline:
         failures: Failures | None = None,
         changes: deque[ScheduledChange] | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
-        check: CheckTraining | None = None,
-        power: bool = False,
+        promises: PromiseStage | None = None,
     ) -> None:
         self._config = config
-        self._check, self._states_power = check, power
-        self._watch: Watch | None = None
-        self.promise: PlantPromise | None = None
-        self._promised: Promise | None = None
         self._units = [config.units.get(name, "") for name in config.outputs]
-        self.alarm_rates = np.zeros(0)
-        self._chance_names = {
-            *(name for name, _ in alarm_names(config)),
-            *config.charts,
-            SHIFT,
-            *SignalChecks.CHANCE_NAMES,
-        }
-        self._promise_key = keys.key(config.plant, keys.PROMISE, NODE)
         self._update = ModelUpdate(config, deque() if changes is None else changes)
         self._diagnose = diagnose
         self._failures = Failures() if failures is None else failures
+        self.promises = promises or PromiseStage(config, self._failures, points=points)
         self._board = board
         self._points = points
         self.model = _model(config, model)
@@ -200,6 +177,7 @@ class PlantPipeline:
         self._promise_checked = False
         self._is_training_open = False
         self._kept: list[KeptBaseline] = []
+        self._modes = OperatingModes(config) if config.modes else None
         self._incident: Training | None = None
         self.notes: list[str] = []
         self.rows_watched = 0
@@ -227,6 +205,7 @@ class PlantPipeline:
             list(self._kept),
             b"" if self._reference is not None or self.baseline is None else self.baseline.SerializeToString(),
             None if self._incident is None else self._incident.state,
+            None if self._modes is None else msgspec.structs.replace(self._modes.state),
         )
 
     def _trained_state(self, reference: Reference) -> TrainedState:
@@ -243,9 +222,9 @@ class PlantPipeline:
             self._drift.until_next,
             b"" if self.baseline is None else self.baseline.SerializeToString(),
             self._shift.state,
-            None if self.promise is None else self.promise.state,
+            self.promises.state,
             None if self._bank is None else self._bank.state,
-            b"" if self.promise is None else Promise(power=self.promise.power).SerializeToString(),
+            self.promises.power,
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -270,6 +249,10 @@ class PlantPipeline:
         if state.incident is not None:
             self._incident = self._new_incident()
             self._incident.restore(state.incident)
+        if self._modes is not None and state.modes is not None:
+            self._modes.state = msgspec.structs.replace(
+                state.modes, baselines=dict(state.modes.baselines), trainings=dict(state.modes.trainings)
+            )
         watched = state.watched
         if watched is None:
             self._training.restore(state.training)
@@ -283,8 +266,7 @@ class PlantPipeline:
         if watched.baseline:
             self._update.baseline = Baseline.FromString(watched.baseline)
         self._drift.until_next = watched.until_drift
-        if watched.promise is not None:
-            self.promise = PlantPromise(watched.promise, list(Promise.FromString(watched.power).power))
+        self.promises.restore(watched.promise, watched.power)
         self._checks = [Check(name=name, result=result) for name, result in watched.checks]
         learned = [item.learned for item in watched.whiteners]
         outputs = len(self._config.outputs)
@@ -359,9 +341,19 @@ class PlantPipeline:
         return self._reference is not None
 
     @property
+    def is_judged(self) -> bool:
+        """False in a mode in which signals are checked only."""
+        return self._modes is None or self._modes.state.is_judged
+
+    @property
     def reference(self) -> str:
         """Kind of the reference: `equations`, `black-box` or `arx`; empty before there is one."""
         return "" if self._reference is None else self._reference.kind
+
+    @property
+    def newest_reference(self) -> str:
+        """Kind of the reference that judges, or judged last; empty before there was one."""
+        return self.reference or ("" if self._modes is None else self._modes.state.reference)
 
     @property
     def noise_levels(self) -> dict[str, dict[str, float]] | None:
@@ -394,7 +386,8 @@ class PlantPipeline:
     @property
     def expected_false_alarms(self) -> float:
         """Mean number of false alarms expected so far."""
-        return self.opportunities / self._arl0 if self._arl0 else 0.0
+        before = 0.0 if self._modes is None else self._modes.state.expected
+        return before + (self.opportunities / self._arl0 if self._arl0 else 0.0)
 
     def update(self, row: Row, units: list[str], publications: list[Publication]) -> None:
         """Process a row.
@@ -407,6 +400,8 @@ class PlantPipeline:
         time_ns = row.time_ns
         if self._update.changes:
             self._change_baseline(time_ns, publications)
+        if self._modes is not None and self._modes.is_change(self.operation.values):
+            self._change_mode(self._modes)
         interval = self._sampling.update(time_ns)
         if self.is_normal and not row.restarted and self._step_row(row, units, interval, publications):
             return
@@ -420,14 +415,17 @@ class PlantPipeline:
         if self._is_process or self._config.bounds:
             usable = self.signals.mask_values(time_ns, row.values, publications)
             measured.inputs, measured.values = usable[: self._inputs], list(usable[self._inputs :])
-        if self._reference is None:
+        if self._modes is not None and not self.is_judged:
+            if self._modes.state.is_learned:
+                publications.extend(self.signals.check_values(time_ns, measured.values, units))
+        elif self._reference is None:
             self._train(measured)
         else:
             if row.restarted:
                 self.signals.reset()
             before = len(publications)
             self._evaluate(measured)
-            self._count_alarms(time_ns, publications, before)
+            self._note(self.promises.count_alarms(time_ns, self.rows_watched, publications, before))
             self.is_normal = self._find_normal(time_ns)
         self.operation.inputs = ()
 
@@ -438,7 +436,7 @@ class PlantPipeline:
         """
         if not self._points:
             return []
-        publications, reference = self._promise_messages(time_ns), self._reference
+        publications, reference = self.promises.messages(time_ns, self.rows_watched), self._reference
         outputs = zip(self._model_keys, self._config.outputs, self._predictors, strict=True)
         for index, (key, output, predictor) in enumerate(outputs):
             adaptive, fitted = predictor.adaptive_snapshot(), predictor.reference_snapshot()
@@ -543,7 +541,9 @@ class PlantPipeline:
             self._promise_checked = True
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
-        share = config.training_length.share((time_ns - self._began_ns) / MINUTE_NS, self._training.rows)
+        share = config.training_length.share((time_ns - self._began_ns) / MINUTE_NS, self._training_rows())
+        if self._modes is not None and self._modes.state.is_resumed:
+            share = 1.0
         timed_out = self.signals.silence.silent[len(config.inputs) :]
         if share >= 1.0 and not self._is_training_open and self._training.is_enough(timed_out):
             rows, self.training_rows = self._training.state, self._training.rows
@@ -559,7 +559,7 @@ class PlantPipeline:
                     self._check_training(rows)
                 self._evaluate(row)
                 publications.extend(self.snapshots(time_ns))
-                publications.extend(self._promise_messages(time_ns))
+                publications.extend(self.promises.messages(time_ns, self.rows_watched))
                 return
         self._training.add(time_ns, row.inputs, values)
         if not self._points:
@@ -571,6 +571,11 @@ class PlantPipeline:
                 residual = value - prediction
                 if isfinite(residual):
                     publications.append(Publication(key, _estimate(time_ns, prediction, residual, unit)))
+
+    def _training_rows(self) -> int:
+        """Rows of the training so far, those in other modes too, until one is learned."""
+        is_learned = self._modes is None or self._modes.state.is_learned
+        return self._training.rows + (0 if is_learned or self._modes is None else self._modes.rows)
 
     def _predict(self, row: MeasuredRow) -> list[float]:
         """Predict each output by its identified model, which is updated with the row."""
@@ -629,53 +634,18 @@ class PlantPipeline:
             self.on_finding(self._diagnose(job))
 
     def _check_training(self, rows: TrainingState) -> None:
-        """Judge the training by itself, and state the power; an error there leaves the promise without them."""
-        if self._watch is not None and self.promise is not None:
-            watch, self._watch = self._watch, None
-            try:
-                self.promise.power = state_power(watch, rows)
-            except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
-                self._failures.add("power", error, "the deviations that would be seen are not stated")
-        if self._check is None or self.promise is None or self._reference is None:
-            return
-        model = self.equations if isinstance(self._reference, ProcessReference) else None
-        try:
-            check = self._check(self._config, model, rows, self._reference.kind)
-        except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
-            self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
-            return
-        self.promise.state = replace(self.promise.state, check=check)
-        if not self.promise.is_kept:
-            self.notes.append(f"promise: {self.promise.text(self.rows_watched)}")
+        """Judge the training by itself."""
+        if self._reference is not None:
+            model = self.equations if isinstance(self._reference, ProcessReference) else None
+            self._note(self.promises.check(rows, model, self._reference.kind, self.rows_watched))
+
+    def _note(self, text: str) -> None:
+        if text:
+            self.notes.append(text)
 
     def _describe(self, time_ns: int) -> str:
         """Operation of the plant, and a promise that it does not keep, as the text of an alarm has them."""
-        warning = "" if self.promise is None else self.promise.warning
-        return "; ".join(filter(None, (self.operation.describe(time_ns), warning)))
-
-    def _promise_messages(self, time_ns: int) -> list[Publication]:
-        """The promise as it is now; without points only one that is not kept or no longer holds."""
-        promise, rows = self.promise, self.rows_watched
-        if promise is None or not (self._points or not promise.is_kept or promise.has_drifted(rows)):
-            return []
-        message = promise.message(time_ns, rows)
-        if message == self._promised:  # it was published for another reason in this row
-            return []
-        self._promised = message
-        return [Publication(self._promise_key, message)]
-
-    def _count_alarms(self, time_ns: int, publications: list[Publication], before: int) -> None:
-        """Count the alarms that chance can raise among the publications of a row, from an index on."""
-        if self.promise is None:
-            return
-        alarms = [item.message for item in publications[before:] if isinstance(item.message, Alarm)]
-        raised = [alarm for alarm in alarms if alarm.event == RAISED]
-        if count := sum(alarm.alarm.partition("/")[0] in self._chance_names for alarm in raised):
-            had_drifted = self.promise.has_drifted(self.rows_watched)
-            self.promise.count_alarms(count, self.rows_watched)
-            publications.extend(self._promise_messages(time_ns))
-            if self.promise.has_drifted(self.rows_watched) and not had_drifted:
-                self.notes.append(f"promise: {self.promise.text(self.rows_watched)}")
+        return "; ".join(filter(None, (self.operation.describe(time_ns), self.promises.warning)))
 
     def _change_baseline(self, time_ns: int, publications: list[Publication]) -> None:
         """Execute the change that holds from a row on, if there is one."""
@@ -709,7 +679,7 @@ class PlantPipeline:
             trained.reference.restart()
             self._quarantined = (False,) * len(self._config.outputs)
             publications.extend(self.snapshots(time_ns))
-            publications.extend(self._promise_messages(time_ns))
+            publications.extend(self.promises.messages(time_ns, self.rows_watched))
         return True
 
     # --- commands --------------------------------------------------------------------------------------------
@@ -739,12 +709,7 @@ class PlantPipeline:
         kept = {Baseline.FromString(item.change).id: item for item in self._kept}
         restored = kept.get(change.restored) if change.what == RESTORE else None
         if self._reference is not None:
-            kept[self._in_force.id] = KeptBaseline(
-                self._in_force.SerializeToString(),
-                self._trained_state(self._reference),
-                [predictor.state for predictor in self._predictors],
-                self.signals.state,
-            )
+            kept[self._in_force.id] = self._make_kept_baseline(self._reference)
         self._kept = list(kept.values())[-MOST_KEPT:]
         rows = self._incident.state if change.what == ACCEPT and self._incident is not None else None
         self._incident, self._update.rows = None, None
@@ -754,6 +719,14 @@ class PlantPipeline:
         else:
             self._train_again(change.time_ns, rows)
         self._update.baseline = change
+
+    def _make_kept_baseline(self, reference: Reference) -> KeptBaseline:
+        return KeptBaseline(
+            self._in_force.SerializeToString(),
+            self._trained_state(reference),
+            [predictor.state for predictor in self._predictors],
+            self.signals.state,
+        )
 
     def _restore_baseline(self, kept: KeptBaseline) -> None:
         """Judge by a baseline that was replaced; its filters and charts start with the next row."""
@@ -765,6 +738,8 @@ class PlantPipeline:
         change, self._update.baseline = self._update.baseline, None
         self._restore_training(msgspec.structs.replace(kept.trained, suspicion=None, baseline=b""))
         self._update.baseline = change
+        if self._bank is not None:
+            self._bank = ArxBank(self._predictors, self._inputs)
         assert self._reference is not None
         self._reference.restart()
         self._charts.restart()
@@ -776,11 +751,9 @@ class PlantPipeline:
 
     def _train_again(self, time_ns: int, rows: TrainingState | None) -> None:
         """Train from a row on, after the given rows."""
-        self._reference = self._step = self._kalman = self._suspicion = self._bank = self.promise = None
-        self._is_process = self._is_process_given
-        self.signals.use_ranges(self._ranges if self._is_process else self._stated)
-        self._leave_out({})
-        self._refusals = self.rows_watched = 0
+        self._stop_judging()
+        if self._modes is not None:
+            self._modes.state.is_judged, self._modes.state.is_resumed = True, False
         self._start_training(time_ns)
         if rows is None:
             return
@@ -811,6 +784,8 @@ class PlantPipeline:
             trained: result of the training.
             again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
         """
+        if self._modes is not None:
+            self._modes.state.is_learned, self._modes.state.reference = True, trained.reference.kind
         self._leave_out(trained.left_out)
         unmade = self._charts.choose(self._evaluated, trained.e, trained.values)
         self._shift.is_active = trained.responses is not None and not has_values_only(self._config)
@@ -847,20 +822,61 @@ class PlantPipeline:
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
 
+    def _change_mode(self, modes: OperatingModes) -> None:
+        """Leave a mode, and judge by what was learned in the next, or go on to learn it."""
+        self._leave_normal()
+        state, old, began_ns = modes.state, key_of(modes.state.mode), self._began_ns
+        if state.is_judged and self._reference is not None:
+            state.baselines[old] = self._make_kept_baseline(self._reference)
+        elif state.is_judged and self._training.rows:
+            state.trainings[old] = ModeTraining(self._training.state, [item.state for item in self._predictors])
+        self._incident = None
+        state.mode, state.expected = (
+            [self.operation.values[name] for name in self._config.modes],
+            self.expected_false_alarms,
+        )
+        new, change = key_of(state.mode), self._update.baseline
+        self._stop_judging()
+        state.is_judged = not modes.is_startup(state.mode)
+        if not state.is_judged:
+            return
+        if (known := state.baselines.pop(new, None)) is not None:
+            self._restore_baseline(known)
+            self._update.baseline, state.expected = change, 2.0 * state.expected - self.expected_false_alarms
+            return
+        begun = state.trainings.pop(new, None)
+        state.is_resumed = begun is not None and state.is_learned
+        self._start_training(began_ns)
+        if begun is not None:
+            self._training.restore(begun.rows)
+            for predictor, item in zip(self._predictors, begun.predictors, strict=True):
+                predictor.restore(item)
+                predictor.restart()
+        if state.is_learned and not (begun and self._training.is_enough([False] * len(self._config.outputs))):
+            state.is_judged = False
+            self.notes.append(
+                f"{modes.describe()} was not seen in the training: its rows are watched by signal checks only; "
+                "`baseline relearn` learns them"
+            )
+
+    def _stop_judging(self) -> None:
+        """Judge no rows."""
+        self._reference = self._step = self._kalman = self._suspicion = self._bank = None
+        self._is_process = self._is_process_given
+        self.signals.use_ranges(self._ranges if self._is_process else self._stated)
+        self._leave_out({})
+        self._refusals = self.rows_watched = 0
+        self.promises.promise = None
+
     def _start_promise(self, trained: TrainingResult, period_min: float) -> None:
-        """State the promise of false alarms; alarms so far go on to count."""
+        """State the promise of false alarms."""
         errors, arl0 = TrainingErrors.draw(len(trained.learned)), self._arl0
         rates = self._charts.relative_rates(trained.learned, trained.e, trained.values, arl0, errors)
         rates += self.signals.relative_rates(trained.learned, self._evaluated, arl0, errors)
         rates += self._drift.chance_alarms(self._evaluated) + self._count_step_tests
-        self.alarm_rates = rates / arl0
-        rows = false_alarm_budget.DAYS_MIN / period_min
-        mean, upper = rows * self._chance_alarms / arl0, rows * float(np.quantile(self.alarm_rates, QUANTILE))
-        before = PromiseState(0.0, 0.0, rows) if self.promise is None else self.promise.state
-        state = replace(before, per_30_days=mean, upper_per_30_days=max(mean, upper), rows_in_30_days=rows)
-        self.promise = PlantPromise(replace(state, check=TrainingCheck()))
-        if self._states_power:
-            self._watch = Watch(
+        watch = None
+        if self.promises.states_power:
+            watch = Watch(
                 self._config,
                 trained.reference,
                 self._predictors,
@@ -871,6 +887,7 @@ class PlantPipeline:
                 dict(zip(self._config.outputs, self._units, strict=True)),
                 period_min,
             )
+        self.promises.start(rates / arl0, self._chance_alarms / arl0, period_min, watch)
 
     def _promise(self, asked: float | None, period_min: float, checks: list[Check]) -> float:
         """False alarms in 30 days that are promised; tests of steps are left out if they would make it impossible."""
@@ -995,7 +1012,7 @@ class PlantPipeline:
         if self._drift.wanted:
             self._update_beside(row)
             row.publications.extend(self._drift.update(row.time_ns, self._predictors))
-        self._count_alarms(row.time_ns, row.publications, before)
+        self._note(self.promises.count_alarms(row.time_ns, self.rows_watched, row.publications, before))
         if self._board.has_unexplained:  # a lasting step
             self._leave_normal()
             self._set_learning()

@@ -158,7 +158,8 @@ def _deviations(watch: Watch, rows: TrainingState) -> list[Deviation]:
     if isinstance(reference, ProcessReference):
 
         def of_equations(values: Array) -> Array:
-            fresh = ProcessReference(reference.model, watch.config.outputs, reference.noise)
+            fresh = ProcessReference.from_state(reference.state, reference.equations, watch.config.outputs)
+            fresh.restart()
             return fresh.run(time_min, inputs, values)[1]
 
         return _biases(watch, measured, of_equations)

@@ -99,8 +99,8 @@ def check_training(
 
 def _watch(pipeline: PlantPipeline, rows: Sequence[Row], units: list[str]) -> _Trial:
     """Watch rows with a trained pipeline."""
-    promise = pipeline.promise
+    promise = pipeline.promises.promise
     assert promise is not None
     for row in rows:
         pipeline.update(row, units, [])
-    return _Trial(promise, pipeline.rows_watched, pipeline.alarm_rates, pipeline.opportunities)
+    return _Trial(promise, pipeline.rows_watched, pipeline.promises.alarm_rates, pipeline.opportunities)

@@ -90,7 +90,7 @@ def print_counts(title: str, plants: Sequence[Plant], outcomes: Iterator[Outcome
     Args:
         title: heading of the table.
         plants: sound plants, by kind and input.
-        outcomes: their outcomes, and those of later tables.
+        outcomes: outcomes of these plants, then those of later tables.
     """
     print(f"| sound plant, {title} | false alarms, by input | promised | not kept |\n|---|---|---|---|", flush=True)
     found = [(plant, next(outcomes)) for plant in plants]

@@ -6,7 +6,6 @@ so a replay does the same there.
 
 from collections.abc import Sequence
 
-from monitor_node.baseline.training_diagnosis import DIAGNOSED
 from reactorwatch.contract.commands import check_signature
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.errors import InputError
@@ -53,5 +52,5 @@ def check_command(command: BaselineCommand, kept: Sequence[int], *, has_rows: bo
 
 
 def is_command(change: Baseline) -> bool:
-    """True if a person made a change; False if the diagnosis of the training did."""
-    return change.what != DIAGNOSED
+    """True if a person made a change; False if the diagnosis of the training did, or a version that named no maker."""
+    return change.what in (ACCEPT, RELEARN, RESTORE)

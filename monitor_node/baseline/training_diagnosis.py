@@ -6,7 +6,6 @@ diagnosis takes far longer than a row, so a job and its finding are values, and 
 them.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -15,13 +14,12 @@ import msgspec
 import numpy as np
 
 from monitor_node.baseline.training import TrainingState
-from monitor_node.baseline.uncertainty import describe_uncertain, find_uncertain
+from monitor_node.baseline.uncertainty import Uncertain, describe_uncertain, find_uncertain
 from reactorwatch.contract.messages_pb2 import Baseline
 from reactorwatch.diagnosis.extended import extended_model
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
-from reactorwatch.kalman.uncertain_model import is_disturbance, widen_model
 from reactorwatch.process import effects_of
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
@@ -98,13 +96,13 @@ def diagnose_training(job: DiagnosisJob) -> Finding:
     verdict, why, extended = _diagnose(record, model, uncertain)
     if extended is not None:
         uncertain = find_uncertain(extended.build(), outputs, *rows)
-    if uncertain:
-        why = f"{why}; {describe_uncertain(uncertain)}"
-    result = replace(extended or given, uncertain=uncertain)
-    return Finding(job.first_ns, verdict, why, _json(result.to_object()) if extended or uncertain else "")
+    if uncertain.names:
+        why = f"{why}; {describe_uncertain(uncertain.names)}"
+    result = replace(extended or given, uncertain=uncertain.names)
+    return Finding(job.first_ns, verdict, why, _json(result.to_object()) if extended or uncertain.names else "")
 
 
-def _diagnose(record: Record, model: ProcessModel, uncertain: Sequence[str]) -> tuple[str, str, ExtendedModel | None]:
+def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tuple[str, str, ExtendedModel | None]:
     """Verdict of the diagnosis, the reason, and the model with the causes that last; None: there are none.
 
     Args:
@@ -114,11 +112,10 @@ def _diagnose(record: Record, model: ProcessModel, uncertain: Sequence[str]) -> 
     """
     from reactorwatch.diagnosis.diagnose import diagnose  # a quarter of a second, which no other row needs
 
-    disturbances = tuple(item for item in uncertain if is_disturbance(item))
     try:
-        found = diagnose(record, widen_model(model, disturbances))
+        found = diagnose(record, uncertain.add_disturbances(model))
     except InputError as error:
-        if not uncertain:
+        if not uncertain.names:
             raise
         return FAILED, f"not diagnosed: {error}", None
     lasting = [cause for cause in found.causes if cause.profile != FREE_NAME]

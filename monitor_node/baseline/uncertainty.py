@@ -21,7 +21,15 @@ from reactorwatch.diagnosis.whiteness import minus_log10_p
 from reactorwatch.kalman.ekf import Filter, FilterState
 from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.kalman.noise_estimation import NoiseFit
-from reactorwatch.kalman.uncertain_model import CONSTANT, NOISE, WANDER, is_disturbance, select_effects, widen_model
+from reactorwatch.kalman.uncertain_model import (
+    CONSTANT,
+    NOISE,
+    WANDER,
+    is_disturbance,
+    learned_parameters,
+    select_effects,
+    widen_model,
+)
 from reactorwatch.process.model import ProcessModel
 
 Array = NDArray[np.float64]
@@ -48,9 +56,25 @@ UNCERTAIN = 1.25
 the plant follows."""
 
 
+class Uncertain(NamedTuple):
+    """Additional states of a filter.
+
+    Attributes:
+        names: texts of the states, see `kalman.uncertain_model`.
+        learned: values of their `learned_parameters`.
+    """
+
+    names: tuple[str, ...] = ()
+    learned: tuple[float, ...] = ()
+
+    def add_disturbances(self, model: ProcessModel) -> ProcessModel:
+        """Add the disturbances and the coloured noise to a model, not the constants."""
+        return widen_model(model, tuple(filter(is_disturbance, self.names)), self.learned)
+
+
 def find_uncertain(
     model: ProcessModel, outputs: tuple[str, ...], time_min: Array, inputs: Array, measured: Array
-) -> tuple[str, ...]:
+) -> Uncertain:
     """Find additional states that a filter of the model needs; empty: none.
 
     Args:
@@ -61,7 +85,7 @@ def find_uncertain(
         measured: output values, shape (n, outputs); NaN if missing or left out.
     """
     if np.min(np.count_nonzero(np.isfinite(measured), axis=0), initial=LEAST_ROWS) < LEAST_ROWS:
-        return ()
+        return Uncertain()
     rows = _Rows(model, outputs, time_min, inputs, measured)
     plain = rows.fit(())
     if rows.drop_disturbances(plain):
@@ -78,9 +102,10 @@ def find_uncertain(
             break
         best = found
     if best.uncertain != constants or plain.noise.loss - best.noise.loss > LEAST_GAIN:
-        return best.uncertain
+        learned = (best.noise.parameters[name] for name in learned_parameters(best.uncertain))
+        return Uncertain(best.uncertain, tuple(learned))
     certain, uncertain = rows.sds_after_moves(plain), rows.sds_after_moves(best)
-    return constants if np.any(uncertain > UNCERTAIN * certain) else ()
+    return Uncertain(constants) if np.any(uncertain > UNCERTAIN * certain) else Uncertain()
 
 
 def describe_uncertain(uncertain: Sequence[str]) -> str:

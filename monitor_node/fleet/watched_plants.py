@@ -60,8 +60,8 @@ class WatchedPlants:
         self._first_model = first.model
         self.alarms = tuple(alarm.alarm for alarm in first.alarms.all_alarms())
         is_common = first.model is not None and not first.model.uncertain  # else plants differ in what was learned
-        form = Conversion.of(config, first.model) if is_common and not points else None
-        self._quiet = None if form is None or first.model is None else PackedPlants(form, config, first.model)
+        form = Conversion.of(first.config, first.model) if is_common and not points else None
+        self._quiet = None if form is None or first.model is None else PackedPlants(form, first.config, first.model)
         self._monitors: dict[str, Monitor] = {}  # of plants that are not quiet
         self._demote_at_row: dict[str, int] = {}  # row of the next attempt to pack
         self._deadlines = DeadlineQueue()

@@ -183,7 +183,7 @@ def run(
         notes=[*(trained.notes if trained is not None else ()), *monitor.notes],
         left_out=monitor.excluded_signals,
         refused_trainings=monitor.refused_trainings,
-        reference=monitor.reference or None,
+        reference=monitor.pipeline.newest_reference or None,
         noise_levels=monitor.noise_levels,
         baseline=monitor.baseline,
         training_rows=monitor.pipeline.training_rows if trained is None else trained.rows,

@@ -36,7 +36,7 @@ TRAINING = ("training_min", "training_rows")
 """Settings that are compared only where they are stated."""
 
 
-ROLES = ("setpoints", "modes", "labels", "bounds", "resolution")
+ROLES = ("setpoints", "modes", "startup_modes", "labels", "bounds", "resolution")
 """Settings of signals that a state has only where there are any; earlier versions had none."""
 
 

@@ -72,6 +72,42 @@ class KeptBaseline(StoredState, frozen=True):
     signals: SignalChecksState
 
 
+class ModeTraining(StoredState, frozen=True):
+    """Training in a mode that was left before its end.
+
+    Attributes:
+        rows: rows of the training.
+        predictors: identified models, one an output.
+    """
+
+    rows: TrainingState
+    predictors: list[PredictorState]
+
+
+class ModesState(msgspec.Struct, forbid_unknown_fields=True):
+    """State of the modes of a plant.
+
+    Attributes:
+        mode: present mode, one value a signal; NaN before its first sample.
+        is_judged: False in a mode in which signals are checked only.
+        is_learned: True once a mode was learned: one that is new then has not been seen in the training.
+        reference: kind of the reference that judged last.
+        expected: false alarms expected in the modes before, less those of the present one before.
+        is_resumed: True if the present mode was seen in the training, and is learned from these rows now.
+        baselines: baselines of the other modes.
+        trainings: trainings of the other modes.
+    """
+
+    mode: list[float]
+    is_judged: bool = True
+    is_learned: bool = False
+    reference: str = ""
+    expected: float = 0.0
+    is_resumed: bool = False
+    baselines: dict[str, KeptBaseline] = msgspec.field(default_factory=dict)
+    trainings: dict[str, ModeTraining] = msgspec.field(default_factory=dict)
+
+
 class PipelineState(StoredState, frozen=True):
     """State of a pipeline, without the alarms.
 
@@ -87,6 +123,7 @@ class PipelineState(StoredState, frozen=True):
         kept: baselines that can be restored, the oldest first.
         change: newest change of the baseline by a command, while the plant is trained because of it; empty else.
         incident: rows since an alarm without a known cause is active; None: there is none.
+        modes: state of the plant's modes; None without signals of modes.
     """
 
     sampling: SamplingState
@@ -100,3 +137,4 @@ class PipelineState(StoredState, frozen=True):
     kept: list[KeptBaseline] = msgspec.field(default_factory=list)
     change: bytes = b""
     incident: TrainingState | None = None
+    modes: ModesState | None = None

@@ -112,6 +112,8 @@ def monitor(
     training: TrainingMin = None,
     training_rows: TrainingRows = None,
     process: Process = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
     reference: Reference = None,
     diagnose: Diagnose = None,
     state: Annotated[
@@ -145,7 +147,10 @@ def monitor(
     from reactorwatch.runtime.config import LogConfig, section
 
     tables, bus = _settings(config, endpoint)
-    flags: dict[str, Any] = {"plant": name, "process": process, "reference": reference}
+    choice = choose_process(process, inputs, outputs)
+    flags: dict[str, Any] = {"plant": name, "process": choice.process, "reference": reference}
+    if choice.outputs:
+        flags |= {"inputs": list(choice.inputs), "outputs": list(choice.outputs)}
     flags |= training_flags(tables, training, training_rows)
     of_fleet = {"plants": plants, "shard": shard, "state": str(state) if state is not None else None}
     fleet = section(FleetConfig, "fleet", tables, of_fleet)

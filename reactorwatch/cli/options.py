@@ -54,6 +54,14 @@ Outputs = Annotated[
         "--output", help="A column to watch, without a process (repeatable, or with commas).", show_default=False
     ),
 ]
+Modes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--mode",
+        help="A column that says how the plant is operated, without a process (repeatable, or with commas).",
+        show_default=False,
+    ),
+]
 TrainingMin = Annotated[
     float | None,
     typer.Option("--training", help="Minutes to learn from [cstr: 100; else see --training-rows].", show_default=False),
@@ -113,15 +121,18 @@ def check_encodable(text: str | None) -> str | None:
     return text
 
 
-def choose_process(process: str | None, inputs: list[str] | None, outputs: list[str] | None) -> "ProcessChoice":
-    """Choice of a process by `--process`, or by `--input` and `--output`.
+def choose_process(
+    process: str | None, inputs: list[str] | None, outputs: list[str] | None, modes: list[str] | None = None
+) -> "ProcessChoice":
+    """Choice of a process by `--process`, or by `--input`, `--output` and `--mode`.
 
     Raises:
         InputError: as `ProcessChoice`.
     """
     from reactorwatch.description.choice import ProcessChoice
 
-    named = [tuple(name.strip() for text in texts or () for name in text.split(",")) for texts in (inputs, outputs)]
+    given = (inputs, outputs, modes)
+    named = [tuple(name.strip() for text in texts or () for name in text.split(",")) for texts in given]
     return ProcessChoice(process, *named)
 
 

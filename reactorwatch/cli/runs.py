@@ -1,14 +1,30 @@
 """Commands that run all nodes: `up` and `demo`."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reactorwatch.cli.options import Diagnose, Endpoint, Plant, Process, Settings, parse_pace
+from reactorwatch.cli.options import (
+    Diagnose,
+    Endpoint,
+    Inputs,
+    Outputs,
+    Plant,
+    Process,
+    Settings,
+    choose_process,
+    parse_pace,
+)
 from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS, FileFormat
+
+if TYPE_CHECKING:
+    from reactorwatch.description.choice import ProcessChoice
 
 Site = Annotated[
     Path | None,
@@ -44,6 +60,8 @@ def up(
     seed: Annotated[int | None, typer.Option(help="Of the input and the noise.", show_default=False)] = None,
     fault: Annotated[list[str] | None, typer.Option(help="A fault, as cause:profile:size@onset. Repeatable.")] = None,
     process: Process = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
     record: Annotated[
         Path | None,
         typer.Option(help="Play this record (a recording or a table) in place of a simulated plant."),
@@ -64,12 +82,30 @@ def up(
         "speed": parse_pace(speed, "--speed"),
         "seed": seed,
         "faults": fault or None,
-        "process": process,
     }
-    if record is None and stated != GUESS:
+    choice = choose_process(process, inputs, outputs)
+    if record is None and (stated != GUESS or choice.outputs):
         raise InputError("options about the form of a table are for the record of --record; name it, or leave them out")
     played = None if record is None else PlayedRecord(record, stated)
-    raise typer.Exit(run_until_stopped(config, endpoint, out, flags, diagnose, site, played))
+    with describe_in_file(choice) as named:
+        flags["process"] = named
+        raise typer.Exit(run_until_stopped(config, endpoint, out, flags, diagnose, site, played))
+
+
+@contextmanager
+def describe_in_file(choice: "ProcessChoice") -> Iterator[str | None]:
+    """Process as settings of nodes name it: columns alone are described in a file, for as long as the nodes run."""
+    if not choice.outputs:
+        yield choice.process
+        return
+    import tomli_w
+
+    from reactorwatch.description.toml_file import to_tables
+
+    with TemporaryDirectory(prefix="reactorwatch-") as folder:
+        path = Path(folder) / "process.toml"
+        path.write_text(tomli_w.dumps(to_tables(choice.load())), encoding="utf-8")
+        yield str(path)
 
 
 def demo(

@@ -13,6 +13,7 @@ from reactorwatch.cli.options import (
     Force,
     Inputs,
     Json,
+    Modes,
     Outputs,
     Plant,
     Process,
@@ -92,6 +93,7 @@ def backtest(
     process: Process = None,
     inputs: Inputs = None,
     outputs: Outputs = None,
+    modes: Modes = None,
     plant: Plant = None,
     train: Annotated[
         Path | None,
@@ -126,7 +128,7 @@ def backtest(
     from reactorwatch.records.output import check_output_folder
     from reactorwatch.runtime.config import read_settings, section
 
-    named, choice = expand_files(files), choose_process(process, inputs, outputs)
+    named, choice = expand_files(files), choose_process(process, inputs, outputs, modes)
     sources = (*named, config, train, choice.file)
     if out is not None:
         check_output_folder(out, SUMMARY, sources, force=force)
@@ -140,7 +142,7 @@ def backtest(
     flags: dict[str, Any] = {"plant": plant or DEFAULT_PLANT, "reference": reference}
     if choice.outputs:
         choice.load()  # reports a column of two roles
-        flags |= {"inputs": choice.inputs, "outputs": choice.outputs}
+        flags |= {"inputs": choice.inputs, "outputs": choice.outputs, "modes": choice.modes}
     flags |= training_flags(tables, training, training_rows)
     settings = section(MonitorConfig, "monitor", tables, flags)
     asked = BacktestOptions(

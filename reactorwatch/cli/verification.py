@@ -78,12 +78,20 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
 def _described_process(file: Path, monitor: MonitorConfig) -> Process | None:
     """Process that the recording describes, where the settings in it name a file; None: that of the settings.
 
-    A file of equations that a recording cannot hold is read, if it is still there.
+    A file of equations that a recording cannot hold is read.
+
+    Raises:
+        InputError: that file is no longer there.
     """
     named = ProcessChoice(monitor.process).file
     described = None if named is None else recorded_process(file, monitor.plant)
-    if described is None or (described.model is None and named is not None and named.exists()):
+    if named is None or described is None or (described.model is None and named.exists()):
         return None
+    if described.model is None and named.suffix.lower() != ".toml":
+        raise InputError(
+            f"{file}: was watched by the equations of {named}, which a recording does not hold, and there is no such "
+            "file; put it back, or name another by --config"
+        )
     return described
 
 

@@ -20,21 +20,26 @@ class ProcessChoice:
         process: a name in the catalogue or a path, see `find_process`; None: the reactor, unless columns are named.
         inputs: columns that are inputs of a process without a description.
         outputs: columns that are its outputs.
+        modes: columns that say how it is operated.
 
     Raises:
-        InputError: a process and columns are named, or inputs without an output.
+        InputError: a process and columns are named, or inputs or modes without an output.
     """
 
     process: str | None = None
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
+    modes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.process is not None and (self.inputs or self.outputs):
+        if self.process is not None and (self.inputs or self.outputs or self.modes):
             raise InputError(
-                f"--input and --output describe a process without a file, got them beside --process {self.process}; "
+                "--input, --output and --mode describe a process without a file, got them beside --process "
+                f"{self.process}; "
                 "leave one of the two out"
             )
+        if self.modes and not self.outputs:
+            raise InputError(f"--mode needs an --output, got only the mode {', '.join(self.modes)}")
         if self.inputs and not self.outputs:
             raise InputError(f"--input needs an --output, got only the input {', '.join(self.inputs)}")
 
@@ -64,7 +69,7 @@ class ProcessChoice:
             InputError: as `find_process`.
         """
         if self.outputs:
-            roles = {"input": self.inputs, "output": self.outputs}
+            roles = {"input": self.inputs, "output": self.outputs, "mode": self.modes}
             signals = (Signal(name, role=role) for role, names in roles.items() for name in names)
             return Process(UNDESCRIBED, tuple(signals))
         return find_process(self.process or DEFAULT_PROCESS, zero_ns, on_bus=on_bus)

@@ -254,7 +254,13 @@ def extended_model_of(
 def are_named(extended: ExtendedModel) -> bool:
     """True if the catalogue has the effects of an extended model, so that their names are enough."""
     own = EFFECTS_OF.get(extended.name, ())
-    return all(item.effect in own or is_generic(item.effect) for item in extended.effects)
+    return all(
+        is_generic(item.effect) or any(_are_equal(item.effect, effect) for effect in own) for item in extended.effects
+    )
+
+
+def _are_equal(one: Effect, other: Effect) -> bool:
+    return one is other or (type(one) is type(other) and vars(one) == vars(other))
 
 
 def is_complete(extended: ExtendedModel, model: ProcessModel) -> bool:

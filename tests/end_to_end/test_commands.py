@@ -239,5 +239,5 @@ def test_simulate_and_backtest_speak_json_to_machines(called: Command, record_cs
     assert said == {
         "samples": 3, "zero": None, "span_min": 0.2, "runs": 1, "trained_until_min": None, "expected_false_alarms": 0.0,
         "signals": {"inputs": ["qc"], "outputs": ["C", "T"], "left_out": []},
-        "reference": None, "noise_levels": None, "baseline": None, "alarms": [],
+        "reference": None, "noise_levels": None, "baseline": None, "alarms": [], "promise": None, "power": [],
     }  # fmt: skip

@@ -109,7 +109,7 @@ def test_the_drawing_has_every_tab_the_diagnosis_among_them(demo: tuple[Path, st
         table = chunk.to_record_batch()
         if "ContainerBlueprint:display_name" in table.schema.names:
             tabs += [name[0] for name in table.column("ContainerBlueprint:display_name").to_pylist() if name]
-    panels = {"Overview", "Residuals and charts", "Alarms", "Model", "Phase plane", "Health", "Diagnosis"}
+    panels = {"Overview", "Residuals and charts", "Alarms", "Model", "Phase plane", "Promise", "Health", "Diagnosis"}
     assert sorted(tabs) == sorted(panels)
 
 

@@ -67,7 +67,7 @@ def test_an_hour_with_faults_is_said_again_value_for_value(hour: Path, capsys: p
     assert (code, told["exact"], told["rows"], told["differing"], told["after_the_end"]) == (0, True, ROWS, 0, 0)
     assert told["kinds"] == [
         {"kind": kind, "recorded": recorded(hour, kind), "equal": recorded(hour, kind)}
-        for kind in (keys.ALARM, keys.ALARM_KPIS, keys.CHART, keys.ESTIMATE, keys.MODEL)
+        for kind in (keys.ALARM, keys.ALARM_KPIS, keys.CHART, keys.ESTIMATE, keys.MODEL, keys.PROMISE)
     ]
 
 
@@ -181,7 +181,7 @@ def test_what_the_monitor_said_and_the_recorder_lost_is_as_many_differences(
         hour, tmp_path / "x.mcap", lambda e: f"/{keys.ESTIMATE}/" in e.key and e.publish_time_ns == at_ns
     )
     code, told = verified(lost, capsys)
-    assert (code, told["differing"]) == (1, 2)
+    assert (code, told["differing"]) == (1, 4)  # of each output by the reference and by the identified model
     assert {item["what"] for item in told["differences"]} == {"not recorded"}
     assert told["notes"][-1].startswith("2 messages of reactor/cstr/estimate never reached this recording")
 

@@ -27,7 +27,7 @@ from recorder.tools.mcap_file import RecordingWriter
 
 ROOT = Path(__file__).parents[2]
 HOSTILE = "\x1b[2J\x1b]0;title\x07 a\r\nb\tc\x7f\x9b31m\u202eevil\u2066\u200b\u2028\u2029\ufeff\U000e0041"
-BORDER = {"printing.py", "crash.py", "display.py"}
+BORDER = {"printing.py", "crash.py", "display.py", "replay_keys.py"}
 
 
 def acted_on(text: str) -> list[str]:

@@ -23,7 +23,7 @@ class PlantArray:
 
     Args:
         form: conversion to and from monitors.
-        signals: names of each plant's signals, the input first.
+        signals: names of each plant's signals, the inputs first.
 
     Attributes:
         of: slot by plant.
@@ -36,7 +36,7 @@ class PlantArray:
         times: rings of spacings, shape (slots, rows kept). They take no memory where all are zero: unchanged values are
             not written.
         ring: rings of values, shape (slots, rows kept, bytes).
-        others: rings of inputs at no level, shape (slots, rows kept); they take no memory where there are none.
+        others: rings of inputs at no level, shape (slots, rows kept, inputs); they take no memory where there are none.
         health_due_ns: time of the next health message, by slot; never for a free slot.
     """
 
@@ -98,7 +98,7 @@ class PlantArray:
         p["reference"][: kept.reference.size] = kept.reference
         self.ring[slot, :count] = kept.rows
         _write(self.times[slot, :count], spacings)
-        _write(self.others[slot, : kept.others.size], kept.others)
+        _write(self.others[slot, : len(kept.others)], kept.others)
 
     def copy(self, of: int, slot: int) -> None:
         """Fill the arrays of a slot with those of another."""
@@ -124,8 +124,8 @@ class PlantArray:
         """Make slots for a number of plants."""
         form, before = self._form, len(self.names)
         records, times = _zeros((plants,), form.record), _zeros((plants, form.keeps), np.dtype(np.int32))
-        ring = _zeros((plants, form.keeps, row_bytes(form.columns)), np.dtype(np.uint8))
-        others = _zeros((plants, form.keeps if form.columns else 0), np.dtype(np.int64))
+        ring = _zeros((plants, form.keeps, row_bytes(form.columns, form.inputs)), np.dtype(np.uint8))
+        others = _zeros((plants, form.keeps if form.columns else 0, form.inputs), np.dtype(np.int64))
         numbers, f8 = _zeros((plants,), form.step.numbers_type), np.dtype(np.float64)
         belief, variances = (_zeros((plants, size), f8) for size in form.step.filter_sizes)
         if before:
@@ -133,7 +133,7 @@ class PlantArray:
             numbers[:before], belief[:before] = self.numbers, self.kalman.belief
             variances[:before] = self.kalman.variances
             for now, then in ((times, self.times), (others, self.others)):
-                written = np.flatnonzero(then.any(axis=1))
+                written = np.flatnonzero(then.reshape(before, -1).any(axis=1))
                 now[written] = then[written]
         self.plants, self.times, self.ring, self.others = records, times, ring, others
         self.numbers, self.kalman = numbers, FilterNumbers(belief, variances)
@@ -144,8 +144,8 @@ class PlantArray:
 
 def _write(into: NDArray[Any], values: NDArray[Any]) -> None:
     """Write values that differ: pages that were never written take no memory."""
-    place = np.flatnonzero(into != values)
-    into[place] = values[place]
+    changed = np.nonzero(into != values)
+    into[changed] = values[changed]
 
 
 def _zeros(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:

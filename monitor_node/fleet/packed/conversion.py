@@ -30,7 +30,7 @@ from monitor_node.fleet.packed.pending import (
     write_alignment,
     write_runs,
 )
-from monitor_node.fleet.packed.record import Array, Records, record_type
+from monitor_node.fleet.packed.record import MOST_SIGNALS, Array, Records, record_type
 from monitor_node.fleet.packed.ring import NewestRows, times_ns_of
 from monitor_node.ingest.alignment import REMEMBERED, AlignmentState
 from monitor_node.ingest.sampling import SamplingState
@@ -99,6 +99,7 @@ class Conversion:
         keeps: number of the newest rows that are kept.
         remembered: number of these by which repeated samples are recognised.
         columns: number of values that are kept of each row.
+        inputs: number of inputs.
         figures: KPIs of alarms that were never raised, but for the time.
         least_s: see `DataTimeout`.
     """
@@ -107,11 +108,12 @@ class Conversion:
         self.config, self._model, self.step = config, model, step
         self._alarms = [keys.chart_name(*pair) for pair in alarm_names(config)]
         self._signals = config.signals
-        self.record = record_type(len(config.outputs), len(model.states))
+        self.record = record_type(len(config.inputs), len(config.outputs), len(model.states))
         self._looks = has_causes(config, model)
         self.remembered = REMEMBERED * config.reorder_rows
         self.keeps = config.isolation_rows if self._looks else self.remembered
         self.columns = len(self._signals) if self._looks else 0
+        self.inputs = len(config.inputs)
         fresh = Monitor(config, 0, points=False, model=model)
         state = fresh.state
         self._predictors, self._training = state.watch.predictors, state.watch.training
@@ -130,7 +132,7 @@ class Conversion:
         step = RowStep.of(config, model)
         if model is None or step is None:
             return None
-        if len(config.inputs) != 1 or config.carried_signals:  # the ring keeps the levels of one input, and no others
+        if config.carried_signals or len(config.signals) > MOST_SIGNALS:  # the ring keeps inputs and outputs alone
             return None
         form = Conversion(config, model, step)
         return form if form.keeps >= form.remembered else None
@@ -147,7 +149,7 @@ class Conversion:
         pipeline = monitor.pipeline
         if monitor.is_replaying_history or monitor.phase != "watching" or not pipeline.is_normal:
             return None
-        if None in monitor.receipts_ns:
+        if None in monitor.receipts_ns or monitor.converts_samples:
             return None
         state = monitor.state
         watched, alignment = state.watch.watched, state.alignment
@@ -262,7 +264,7 @@ class Conversion:
             NoiseLevels(tuple(noise[: len(outputs)]), tuple(noise[len(outputs) :])),
             FilterState(float(numbers["time_min"]), tuple(inputs), x, P),
             inputs,
-            [False],
+            [False] * len(inputs),
             p["typical_sd"].tolist(),
             0,
             p["reach"].tolist(),

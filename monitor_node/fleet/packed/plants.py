@@ -101,7 +101,7 @@ class PackedPlants:
         rest, rows = found
         usual_ns = round(float(monitor.pipeline.numbers[0]["period_ns"][0]))
         spacings = kept_spacings(rows.times_ns, usual_ns)
-        values = kept_values(rows.values)
+        values = kept_values(rows.values, self._form.inputs)
         if spacings is None or values is None:
             return False
         slot = self._slots.take(plant)
@@ -333,7 +333,7 @@ class _Rows(NamedTuple):
     Attributes:
         slots: slots of the plants, shape (rows,).
         times_ns: times of the rows, shape (rows,).
-        values: values of the rows, the input first, shape (rows, signals).
+        values: values of the rows, the inputs first, shape (rows, signals).
     """
 
     slots: NDArray[np.int32]

@@ -16,18 +16,22 @@ Places: TypeAlias = NDArray[np.int32]
 Bytes: TypeAlias = NDArray[np.uint8]
 
 LEVELS = 64
-"""Values of the input that the kept rows tell apart by a byte; the byte is this number for any other. An input that is
+"""Values of an input that the kept rows tell apart by a byte; the byte is this number for any other. An input that is
 held for ten rows on average has 60 in 600."""
 
+MOST_SIGNALS = 31
+"""Signals of a plant whose arrival fits the bits of `have`."""
 
-def record_type(outputs: int, states: int) -> np.dtype[Any]:
+
+def record_type(inputs: int, outputs: int, states: int) -> np.dtype[Any]:
     """Type of a plant's record.
 
     Args:
+        inputs: number of inputs.
         outputs: number of monitored outputs.
         states: number of states of the model.
     """
-    signals, noise = outputs + 1, outputs + states
+    signals, noise = inputs + outputs, outputs + states
     f, i, u = np.float64, np.int64, np.uint64
     columns: list[tuple[str, DTypeLike, tuple[int, ...]]] = [
         # samples on their way into a row
@@ -64,7 +68,7 @@ def record_type(outputs: int, states: int) -> np.dtype[Any]:
         ("arl0", f, ()),
         ("width", f, (outputs,)),
         ("promise", f, (NUMBERS,)),  # see `PromiseState`; 0: there is none
-        ("reach", f, (1,)),  # see `references.input_reach`
+        ("reach", f, (inputs,)),  # see `references.input_reach`
         ("noise", f, (noise,)),  # standard deviations, of sensors and process
         ("typical_sd", f, (outputs,)),
         # the newest rows, in a ring
@@ -73,7 +77,7 @@ def record_type(outputs: int, states: int) -> np.dtype[Any]:
         ("unit_ns", i, ()),  # unit of the kept spacings
         ("usual_ns", i, ()),  # spacing that is kept as 0
         ("reference", i, (outputs,)),  # see `ring.Kept`
-        ("levels", i, (LEVELS,)),
-        ("level_rows", np.int16, (LEVELS,)),
+        ("levels", i, (inputs, LEVELS)),
+        ("level_rows", np.int16, (inputs, LEVELS)),
     ]
     return np.dtype([(name, kind, shape) for name, kind, shape in columns], align=True)

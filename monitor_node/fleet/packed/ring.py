@@ -11,7 +11,7 @@ What was measured is kept in seven bytes: the 64 bits of its number, less those 
 That fits as long as values are of one sign and within a factor of 200 of that one, and it fits for zero, which has a
 code of its own.
 
-The input is mostly one of a few values, at which it is held for some rows each: one byte tells which of those that the
+An input is mostly one of a few values, at which it is held for some rows each: one byte tells which of those that the
 kept rows have, as far as there are no more than `LEVELS`. One that is none of them, as under a controller, is kept as
 it is, in an array that takes memory only where that happened.
 """
@@ -36,7 +36,7 @@ class NewestRows(NamedTuple):
 
     Attributes:
         times_ns: time of each row.
-        values: values of each row, the input first, shape (rows, signals); without columns if they are not kept.
+        values: values of each row, the inputs first, shape (rows, signals); without columns if they are not kept.
     """
 
     times_ns: list[int]
@@ -57,14 +57,14 @@ def kept_spacings(times_ns: list[int], usual_ns: int) -> tuple[int, Places] | No
 
 
 class Kept(NamedTuple):
-    """Values as they are kept; n rows of s signals.
+    """Values as they are kept; n rows of u inputs and s - u outputs.
 
     Attributes:
-        rows: which level the input is at, then what was measured, shape (n, bytes).
-        reference: bits of the values that measured ones are kept as what they are more than, shape (s - 1,).
-        levels: bits of the values of the input, shape (LEVELS,).
-        level_rows: how many rows are at each, shape (LEVELS,).
-        others: bits of the input where it is at none of them, shape (n,).
+        rows: the level of each input, then the outputs, shape (n, bytes).
+        reference: bits of the values from which outputs are kept as differences, shape (s - u,).
+        levels: bits of the values of each input, shape (u, LEVELS).
+        level_rows: number of rows at each of them, shape (u, LEVELS).
+        others: bits of each input where it is at none of them, shape (n, u).
     """
 
     rows: Bytes
@@ -74,54 +74,59 @@ class Kept(NamedTuple):
     others: Ints
 
 
-def row_bytes(columns: int) -> int:
+def row_bytes(columns: int, inputs: int) -> int:
     """Size of a row in bytes.
 
     Args:
         columns: number of its values; 0 if they are not kept.
+        inputs: number of inputs among them.
     """
-    return 1 + VALUE_BYTES * (columns - 1) if columns else 0
+    return inputs + VALUE_BYTES * (columns - inputs) if columns else 0
 
 
-def kept_values(values: Array) -> Kept | None:
+def kept_values(values: Array, inputs: int) -> Kept | None:
     """Values as they are kept; None if they do not fit.
 
     Args:
-        values: input first, shape (rows, signals).
+        values: inputs first, shape (rows, signals).
+        inputs: number of inputs.
     """
     bits = np.ascontiguousarray(values).view(np.int64)
+    levels, level_rows = np.zeros((inputs, LEVELS), np.int64), np.zeros((inputs, LEVELS), np.int32)
     if not values.shape[1]:
-        none = np.zeros(LEVELS, np.int64)
-        return Kept(np.empty((len(values), 0), np.uint8), bits[0, :0], none, none.astype(np.int32), none[:0])
-    measured = bits[:, 1:]
+        none = np.empty((len(values), 0), np.uint8)
+        return Kept(none, bits[0, :0], levels, level_rows, np.empty((0, inputs), np.int64))
+    measured = bits[:, inputs:]
     last = [column[np.flatnonzero(column)[-1:]] for column in measured.T]
     reference = np.array([each[0] if each.size else 0 for each in last], dtype=np.int64)
     codes = np.where(measured == 0, ZERO, measured - reference)
     if np.any((measured != 0) & ((codes <= ZERO) | (codes >= -ZERO))):
         return None
     whole = np.ascontiguousarray(codes.astype("<i8")).view(np.uint8).reshape(*codes.shape, 8)
-    found, which, counts = np.unique(bits[:, 0], return_inverse=True, return_counts=True)
-    most = np.argsort(-counts, kind="stable")[:LEVELS]
-    levels, level_rows = np.zeros(LEVELS, np.int64), np.zeros(LEVELS, np.int32)
-    levels[: most.size], level_rows[: most.size] = found[most], counts[most]
-    place = np.full(found.size, LEVELS, np.uint8)
-    place[most] = np.arange(most.size)
-    at = place[which]
+    at = np.empty((len(values), inputs), np.uint8)
+    for i in range(inputs):
+        found, which, counts = np.unique(bits[:, i], return_inverse=True, return_counts=True)
+        most = np.argsort(-counts, kind="stable")[:LEVELS]
+        levels[i, : most.size], level_rows[i, : most.size] = found[most], counts[most]
+        index = np.full(found.size, LEVELS, np.uint8)
+        index[most] = np.arange(most.size)
+        at[:, i] = index[which]
     rows = np.column_stack([at, whole[:, :, :VALUE_BYTES].reshape(len(values), -1)])
-    return Kept(rows, reference, levels, level_rows, np.where(at == LEVELS, bits[:, 0], 0))
+    return Kept(rows, reference, levels, level_rows, np.where(at == LEVELS, bits[:, :inputs], 0))
 
 
 def values_of(kept: Kept) -> Array:
     """The values that are kept, shape (rows, signals)."""
-    rows = kept.rows
+    rows, count = kept.rows, len(kept.levels)
     if not rows.shape[1]:
         return np.empty((len(rows), 0))
-    whole = np.zeros((len(rows), rows.shape[1] // VALUE_BYTES, 8), np.uint8)
-    whole[:, :, 8 - VALUE_BYTES :] = rows[:, 1:].reshape(len(rows), -1, VALUE_BYTES)
+    whole = np.zeros((len(rows), (rows.shape[1] - count) // VALUE_BYTES, 8), np.uint8)
+    whole[:, :, 8 - VALUE_BYTES :] = rows[:, count:].reshape(len(rows), -1, VALUE_BYTES)
     codes = whole.view("<i8")[:, :, 0] >> 8 * (8 - VALUE_BYTES)  # with its sign
     measured = np.where(codes == ZERO, 0, codes + kept.reference)
-    at = rows[:, 0]
-    inputs = np.where(at < LEVELS, kept.levels[np.minimum(at, LEVELS - 1)], kept.others)
+    at = rows[:, :count]
+    held = kept.levels[np.arange(count), np.minimum(at, LEVELS - 1)]
+    inputs = np.where(at < LEVELS, held, kept.others)
     return np.ascontiguousarray(np.column_stack([inputs, measured])).view(np.float64)
 
 
@@ -133,7 +138,7 @@ def newest_rows(p: np.void, last_ns: int, times: Places, ring: Bytes, others: In
         last_ns: time of the newest row.
         times: spacings, shape (rows kept,).
         ring: values, shape (rows kept, bytes).
-        others: inputs at no level, shape (rows kept,).
+        others: inputs at no level, shape (rows kept, inputs).
     """
     count, keeps = int(p["kept"]), len(times)
     order = (int(p["head"]) - count + np.arange(count)) % keeps

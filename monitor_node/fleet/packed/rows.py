@@ -18,34 +18,36 @@ _MINUTE_NS = int(MINUTE_NS)
 
 
 @jit
-def _level(p: Any, bits: int) -> int:
-    """Index of the level that the input is at, perhaps one that was unused; `LEVELS` if there is none."""
+def _level(p: Any, i: int, bits: int) -> int:
+    """Index of the level that an input is at, perhaps one that was unused; `LEVELS` if there is none."""
     free = LEVELS
     for level in range(LEVELS):
-        if p.level_rows[level] == 0:
+        if p.level_rows[i, level] == 0:
             free = min(free, level)
-        elif p.levels[level] == bits:
+        elif p.levels[i, level] == bits:
             return level
     if free < LEVELS:
-        p.levels[free] = bits
+        p.levels[i, free] = bits
     return free
 
 
 @jit
 def _keep(p: Any, row: Bytes, others: Ints, bits: Ints) -> None:
     """Put a row into the ring, see `ring.Kept`."""
-    if p.kept == others.size and row[0] < LEVELS:
-        p.level_rows[row[0]] -= 1  # of the row that goes
-    level = _level(p, bits[0])
-    row[0] = level
-    if level < LEVELS:
-        p.level_rows[level] += 1
-    else:
-        others[p.head] = bits[0]
-    for place in range(bits.size - 1):
-        code = bits[1 + place] - p.reference[place] if bits[1 + place] else ZERO
+    inputs = others.shape[1]
+    for i in range(inputs):
+        if p.kept == others.shape[0] and row[i] < LEVELS:
+            p.level_rows[i, row[i]] -= 1  # of the row that goes
+        level = _level(p, i, bits[i])
+        row[i] = level
+        if level < LEVELS:
+            p.level_rows[i, level] += 1
+        else:
+            others[p.head, i] = bits[i]
+    for k in range(bits.size - inputs):
+        code = bits[inputs + k] - p.reference[k] if bits[inputs + k] else ZERO
         for byte in range(VALUE_BYTES):
-            row[1 + VALUE_BYTES * place + byte] = code >> 8 * byte & 0xFF
+            row[inputs + VALUE_BYTES * k + byte] = code >> 8 * byte & 0xFF
 
 
 @jit
@@ -53,9 +55,10 @@ def _fits(p: Any, spacing_ns: int, bits: NDArray[np.int64], is_kept: bool) -> bo
     """True if the ring can keep a row."""
     over_ns = spacing_ns - p.usual_ns
     fits = over_ns % p.unit_ns == 0 and abs(over_ns // p.unit_ns) < 2**31
+    inputs = bits.size - p.reference.size
     for i in range(p.reference.size if is_kept else 0):
-        off = bits[1 + i] - p.reference[i]
-        fits = fits and (bits[1 + i] == 0 or ZERO < off < -ZERO)
+        off = bits[inputs + i] - p.reference[i]
+        fits = fits and (bits[inputs + i] == 0 or ZERO < off < -ZERO)
     return bool(fits)
 
 
@@ -95,10 +98,10 @@ def step_rows(
         times: spacing before each of the newest rows, shape (plants, rows kept).
         ring: values of these rows, see `ring.Kept`, shape (plants, rows kept, bytes); without columns if there is no
             isolation.
-        others: inputs at no level, shape (plants, rows kept).
+        others: inputs at no level, shape (plants, rows kept, inputs).
         row_slots: slot of each row.
         row_time_ns: time of each row.
-        row_values: values of each row, the input first, shape (rows, signals).
+        row_values: values of each row, the inputs first, shape (rows, signals).
         row_time_min: time of each row in minutes.
         row_bits: values of each row as bits.
         kinds: filled with the kind of each row; after a row that is odd, all of its plant are.

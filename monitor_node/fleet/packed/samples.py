@@ -70,7 +70,7 @@ def take_samples(
         most_left: number of emitted rows that are remembered.
         rows: filled with the slot of each row.
         row_time_ns: filled with its time.
-        row_values: filled with its values, the input first.
+        row_values: filled with its values, the inputs first.
         others: filled with the indices of samples that are not processed.
 
     Returns:

@@ -1,13 +1,19 @@
 """`diagnose` and `simulate` take any process that has equations: by name, TOML or extended model."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from monitor_node.config import MonitorConfig
 from reactorwatch.cli.main import app
+from reactorwatch.cli.verification import _described_process
+from reactorwatch.errors import InputError
+from reactorwatch.process.fingerprint import fingerprint
+from reactorwatch.process.library.three_tanks.model import three_tanks
 from tests.unit.process.test_three_tanks import measure
 
 DESCRIPTION = """
@@ -117,3 +123,28 @@ def test_the_extended_model_of_code_is_read_without_the_code(rig: Path) -> None:
     assert run.exit_code == 0, run.output
     described.unlink()
     watch_and_simulate(rig, out / "extended.json")
+
+
+ONE_ROW = "sample,P101 flow,P102 flow,L1,L2,L3\n0,1,1,1,1,1\n1,1,1,1,1,2\n"
+
+
+@pytest.mark.parametrize(("text", "is_held"), [(CODE, False), (CODE.replace("(Clog(),)", "()"), True)])
+def test_a_recording_judged_by_code_that_is_gone_is_not_verified_without_it(
+    tmp_path: Path, text: str, is_held: bool
+) -> None:
+    """Equations without effects of the user's own are in the recording; with such effects its code is needed."""
+    (tmp_path / "rig.csv").write_text(ONE_ROW, encoding="utf-8")
+    code, recording = tmp_path / "rig.py", tmp_path / "rig.mcap"
+    code.write_text(text, encoding="utf-8")
+    arguments = ["import", str(tmp_path / "rig.csv"), "--process", str(code), "-o", str(recording), "--plant", "rig"]
+    run = CliRunner().invoke(app, arguments)
+    assert run.exit_code == 0, run.output
+    code.unlink()
+    config = MonitorConfig(plant="rig", process=str(code))
+    if is_held:
+        held = _described_process(recording, config)
+        assert held is not None
+        assert fingerprint(held.require_model()) == fingerprint(replace(three_tanks(), name="code"))
+    else:
+        with pytest.raises(InputError, match=r"which a recording does not hold.*put it back"):
+            _described_process(recording, config)

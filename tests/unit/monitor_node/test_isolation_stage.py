@@ -43,7 +43,7 @@ class Board:
 class Reference:
     """Reference with the model and the noise of the plant."""
 
-    model, noise = cstr(), SENSORS
+    equations, plant_noise = cstr(), SENSORS
 
 
 def suspicion() -> tuple[Suspicion, Board]:

@@ -13,7 +13,7 @@ from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.messages_pb2 import Power
 from recorder.tools.player import samples_of
 
-FACTOR, RUNS, HORIZON_MIN, ONSET_MIN = 1.3, 10, 10.0, 5.0
+FACTOR, RUNS, HORIZON_MIN, ONSET_MIN = 1.3, 8, 10.0, 5.0
 OF_OUTPUTS = {"T.bias": "temperature_bias", "C.bias": "concentration_bias"}
 CASES = [
     ("equations", "coolant_flow"),

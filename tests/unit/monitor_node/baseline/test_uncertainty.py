@@ -1,17 +1,24 @@
 """A training shows what a filter has to estimate beside the states of the equations."""
 
+from collections.abc import Callable
+from dataclasses import replace as replace_model
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
-from monitor_node.baseline.uncertainty import describe_uncertain, find_uncertain
+from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
+from monitor_node.baseline.uncertainty import Uncertain, describe_uncertain, find_uncertain
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.replay import backtest
+from reactorwatch.contract.codec import Encoded
+from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.kalman.uncertain_model import is_disturbance
+from reactorwatch.process.extended_model import ExtendedModel
 from reactorwatch.process.library.cstr.model import cstr
 
 from ..samples import samples
@@ -20,7 +27,7 @@ from ..warm_plant import changes, publish
 WIDE, RARE, LITTLE = INPUTS.values()
 KIND = {item.name: item for item in KINDS}
 EXACT = Kind("as the model")
-TRAINING_MIN = 100.0
+TRAINING_MIN = 60.0
 
 
 @cache
@@ -28,7 +35,7 @@ def uncertain(kind: Kind, moves: int, seed: int = 11) -> tuple[str, ...]:
     record = simulate(kind, (WIDE, RARE, LITTLE)[moves], seed)
     rows = record.time_min < TRAINING_MIN
     measured = np.column_stack([record.columns[name][rows] for name in ("C", "T")])
-    return find_uncertain(cstr(), ("C", "T"), record.time_min[rows], record.columns["qc"][rows, None], measured)
+    return find_uncertain(cstr(), ("C", "T"), record.time_min[rows], record.columns["qc"][rows, None], measured).names
 
 
 def disturbances(kind: Kind, moves: int) -> set[str]:
@@ -57,7 +64,7 @@ def test_noise_with_memory_is_coloured_noise(memory: tuple[float, float]) -> Non
 
 def test_a_training_of_few_rows_is_left_as_it_is() -> None:
     nothing = np.zeros((20, 1))
-    assert find_uncertain(cstr(), ("C", "T"), np.arange(20.0), nothing, np.zeros((20, 2))) == ()
+    assert find_uncertain(cstr(), ("C", "T"), np.arange(20.0), nothing, np.zeros((20, 2))) == Uncertain()
 
 
 def test_what_is_uncertain_is_said_in_words() -> None:
@@ -67,31 +74,42 @@ def test_what_is_uncertain_is_said_in_words() -> None:
     )
 
 
+UNCERTAIN = ("constant temperature_bias", "constant volume", "constant valve_lag")
+QUICK = MonitorConfig(training_min=20.0, isolation=False)
+
+
+def messages_of(kind: Kind, moves: int, seed: int, span_min: float) -> list[Encoded]:
+    """Messages of the first minutes of a plant."""
+    record = simulate(kind, (WIDE, RARE, LITTLE)[moves], seed)
+    rows = record.time_min < span_min
+    return list(samples(record.time_min[rows], {name: item[rows] for name, item in record.columns.items()}))
+
+
+def find(uncertain: tuple[str, ...]) -> Callable[[DiagnosisJob], Finding]:
+    """Diagnosis that finds these additional states."""
+    model = msgspec.json.encode(ExtendedModel("cstr", uncertain=uncertain).to_object()).decode()
+    return lambda job: Finding(job.first_ns, NOMINAL, "limits allow for it", model)
+
+
 def test_a_valve_lag_that_the_training_could_not_show_raises_no_alarm() -> None:
-    record = simulate(KIND["valve lag of 0.12 min"], RARE, 111)
-    rows = record.time_min < 240.0
-    messages = list(samples(record.time_min[rows], {name: item[rows] for name, item in record.columns.items()}))
-    config = MonitorConfig(isolation=False)
-    found = backtest.run(messages, config)
-    assert found.baseline is not None
-    assert '"uncertain":["constant' in found.baseline.model
-    assert found.raised_alarms == []
-    given = backtest.run(messages, MonitorConfig(isolation=False, diagnose_training=False))
-    assert len(given.raised_alarms) >= 2
+    """The first move is at 75 min."""
+    messages, raised = messages_of(KIND["valve lag of 0.12 min"], 1, 111, 160.0), []
+    for model in (replace_model(cstr(), uncertain=UNCERTAIN), cstr()):
+        found = backtest.run(messages, replace(QUICK, diagnose_training=False), model=model)
+        raised.append(len(found.raised_alarms))
+    assert raised[0] == 0
+    assert raised[1] >= 1
 
 
-def test_a_monitor_with_uncertain_constants_resumes_bit_for_bit() -> None:
-    record = simulate(KIND["feed that wanders"], LITTLE, 12)
-    rows = record.time_min < 130.0
-    messages = list(samples(record.time_min[rows], {name: item[rows] for name, item in record.columns.items()}))
-    config, half = MonitorConfig(isolation=False), 3 * 1150
-    monitor = Monitor(config, 0)
-    publish(monitor, messages[: 3 * 1002])
+@pytest.mark.parametrize("uncertain", [UNCERTAIN, ("wander T", "noise C")])
+def test_a_monitor_with_additional_states_resumes_bit_for_bit(uncertain: tuple[str, ...]) -> None:
+    messages, monitor = messages_of(EXACT, 2, 12, 40.0), Monitor(QUICK, 0)
+    first = publish(monitor, messages[: 3 * 202])
     assert monitor.diagnosis_job is not None
-    monitor.on_finding(find_deviations(monitor.diagnosis_job))
-    first = publish(monitor, messages[3 * 1002 : half])
+    monitor.on_finding(find(uncertain)(monitor.diagnosis_job))
+    first += publish(monitor, messages[3 * 202 : 3 * 300])
     (change,) = changes(first)
-    assert "wander T" in change.model
-    resumed = Monitor(config, 0)
+    assert all(item in change.model for item in uncertain)
+    resumed = Monitor(QUICK, 0)
     resumed.from_bytes(monitor.to_bytes())
-    assert publish(resumed, messages[half:]) == publish(monitor, messages[half:])
+    assert publish(resumed, messages[3 * 300 :]) == publish(monitor, messages[3 * 300 :])

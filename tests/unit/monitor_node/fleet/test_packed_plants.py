@@ -10,11 +10,15 @@ import pytest
 from monitor_node.alarms.annunciator import AnnunciatorState
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from monitor_node.fleet.monitor import FleetMonitor
+from monitor_node.fleet.sharding import WHOLE, ShardGroup
 from monitor_node.state.monitor_state import MonitorState
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Health, Quality, Sample
+from reactorwatch.process.library.three_tanks.model import three_tanks
 
-from ..fleets import alone, fleet, of, row_by_row, run_of, stage_by_stage
+from ..fleets import PLANTS, QUICK, alone, fleet, of, row_by_row, run_of, stage_by_stage
+from ..test_many_inputs import tanks
 
 ALL = MonitorConfig(training_min=20.0, isolation=False, charts=("shewhart", "ewma", "cusum", "mewma"))
 LOOKING = MonitorConfig(training_min=20.0)
@@ -291,6 +295,36 @@ def test_an_input_is_remembered_to_the_bit_however_many_values_it_has(rows: int)
             own.on_message(message, now_ns)
     assert monitor.quiet == ["x"]
     assert comparable(monitor.monitor("x").state).to_bytes() == comparable(own.state).to_bytes()
+
+
+@pytest.mark.parametrize("rows", [150, 230, 231])
+def test_a_plant_with_two_inputs_that_move_in_each_row_is_packed_without_loss(rows: int) -> None:
+    plant, model = tanks(rows=rows, model=three_tanks()), three_tanks()
+    config = plant.config(diagnose_training=False, isolation=True, isolation_rows=60)
+    monitor = FleetMonitor(config, 0, ShardGroup(PLANTS, WHOLE, "a"), model=model)
+    own, packed_rows = Monitor(config, 0, points=False, model=model), 0
+    run = plant.messages()
+    for first in range(0, len(run), 5):
+        monitor.on_messages(run[first : first + 5], 10**9 * first)
+        for message in run[first : first + 5]:
+            own.on_message(message, 10**9 * first)
+        packed_rows += bool(monitor.quiet)
+    assert packed_rows > 20
+    stored = Monitor(own.config, 0, points=False, model=model)
+    stored.from_bytes(monitor.state_of("cstr"))
+    assert comparable(stored.state).to_bytes() == comparable(own.state).to_bytes()
+    assert comparable(monitor.monitor("cstr").state).to_bytes() == comparable(own.state).to_bytes()
+
+
+def test_a_plant_whose_samples_are_converted_keeps_a_monitor_of_its_own() -> None:
+    run = run_of("x", 12, span_min=40.0)
+    for index in signal(run, 2):
+        run[index] = changed(run[index], value=Sample.FromString(run[index].payload).value - 273.15, unit="degC")
+    monitor = fleet(QUICK)
+    for begin in range(0, len(run), 30):
+        monitor.on_messages(run[begin : begin + 30], 10**9 * begin)
+    assert monitor.quiet == []
+    assert monitor.monitor("x").watching_since_ns is not None
 
 
 def comparable(state: MonitorState) -> MonitorState:

@@ -25,10 +25,8 @@ from ..fleets import PLANTS, SECOND_NS, alarms, of
 ROWS = 400
 CONFIG = MonitorConfig(training_rows=200, isolation=False, diagnose_training=False)
 FLEET = FleetConfig(plants=PLANTS, processes={"north_*": "three_tanks", "north_2": "cstr"})
-PROCESSES = {"north_1": "three_tanks", "north_2": "cstr", "south": None}
+PROCESSES = {"north_1": "three_tanks", "north_2": "cstr", "north_3": "three_tanks", "south": None}
 FAULTS = {"north_1": "pump1:step:-4@30min", "south": "coolant_flow:step:-0.2@30min"}
-TWO_INPUTS = "north_1"
-"""Plants with several inputs are not packed."""
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +80,6 @@ def test_each_plant_is_watched_as_by_a_monitor_of_its_own_process(
         assert of(plant, found) == expected[plant], plant
         assert bool(alarms(expected[plant])) == (plant in FAULTS)
     assert set(monitor.quiet) == set(runs) - FAULTS.keys()
-    assert monitor.active_monitor(TWO_INPUTS) is not None
 
 
 def test_a_restored_plant_resumes_with_the_process_of_its_name(runs: dict[str, list[Encoded]]) -> None:

@@ -1,0 +1,79 @@
+"""`reactorwatch baseline` and `--mode`: what is sent, what is printed, and what is refused."""
+
+from typing import Any
+
+import msgspec
+import pytest
+from typer.testing import CliRunner
+
+from reactorwatch.cli import baseline
+from reactorwatch.cli.main import app
+from reactorwatch.cli.options import choose_process
+from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply
+from reactorwatch.errors import InputError
+
+BASELINES = [
+    Baseline(id=0, what="trained", by="monitor"),
+    Baseline(id=1, what="relearn", by="Anna", why="new pump", time_ns=5),
+    Baseline(id=2, what="restore", by="Ben", why="old pump", time_ns=7, restored=0),
+]
+
+
+@pytest.fixture
+def sent(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """Commands that were sent, each with its name; the answer is the list of baselines, or a text."""
+    commands: list[tuple[Any, ...]] = []
+
+    def send(
+        node: str, config: Any, endpoint: Any, plant: Any, timeout: float, name: str, command: Any
+    ) -> CommandReply:
+        commands.append((node, plant, name, command))
+        listed = BASELINES if command.what == "list" else []
+        return CommandReply(
+            accepted=True, text=f"{command.what} by {command.by}, from the next row on", baselines=listed
+        )
+
+    monkeypatch.setattr(baseline, "send_command", send)
+    return commands
+
+
+@pytest.mark.parametrize("what", ["accept", "relearn", "restore"])
+def test_a_command_carries_who_and_why(sent: list[tuple[Any, ...]], what: str) -> None:
+    words = ["baseline", what, "--plant", "north", "--by", "Anna", "--why", "new pump"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert result.output == f"{what} by Anna, from the next row on\n"
+    assert sent == [("monitor", "north", "baseline", BaselineCommand(what=what, by="Anna", why="new pump"))]
+
+
+def test_restore_names_a_baseline_by_its_number_also_the_first(sent: list[tuple[Any, ...]]) -> None:
+    CliRunner().invoke(app, ["baseline", "restore", "--by", "Ben", "--why", "old pump", "--id", "0"])
+    ((_, _, _, command),) = sent
+    assert command.HasField("id")
+    assert command.id == 0
+
+
+def test_the_list_is_one_line_or_one_object_a_baseline(sent: list[tuple[Any, ...]]) -> None:
+    lines = CliRunner().invoke(app, ["baseline", "list"]).output.splitlines()
+    assert [line.split(" from ")[0] for line in lines] == [
+        "0: trained by monitor",
+        "1: relearn by Anna",
+        "2: restore 0 by Ben",
+    ]
+    assert lines[1].endswith(": new pump")
+    printed = CliRunner().invoke(app, ["baseline", "list", "--json"]).output.splitlines()
+    objects = [msgspec.json.decode(line) for line in printed]
+    assert [(item["id"], item["what"], item["by"], item["why"]) for item in objects] == [
+        (item.id, item.what, item.by, item.why) for item in BASELINES
+    ]
+    assert objects[2]["restored"] == 0
+    assert len(sent) == 2
+
+
+def test_a_mode_is_a_column_of_a_process_without_a_file() -> None:
+    process = choose_process(None, ["q"], ["th"], ["phase,auto"]).load()
+    assert process.names("mode") == ("phase", "auto")
+    with pytest.raises(InputError, match="--mode needs an --output, got only the mode phase"):
+        choose_process(None, None, None, ["phase"])
+    with pytest.raises(InputError, match="--input, --output and --mode describe a process without a file"):
+        choose_process("cstr", None, None, ["phase"])
