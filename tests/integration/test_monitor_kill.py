@@ -11,7 +11,7 @@ from .live_run import PLANT, LiveRun
 KILLS_MIN = (8.0, 20.0)
 """In training, and watching; the third kill comes while the alarms of the leak stand."""
 LOOKS = 3
-"""Looks for causes heard before that kill; the next one comes two seconds later. A monitor stores its state once it
+"""Looks for causes heard before that kill; the next one comes five seconds later. A monitor stores its state once it
 has published, and what is on its way from a process that is killed is lost."""
 
 
@@ -26,7 +26,7 @@ def test_three_kills_change_no_alarm(tmp_path: Path) -> None:
     The recording replays, value for value, as that of a monitor that was never stopped.
     """
     state: dict[str, Any] = {"state_file": str(tmp_path / "monitor.state"), "state_every_s": 0.5}
-    with LiveRun(tmp_path, duration_min=90.0, speed=480.0, **state) as run:
+    with LiveRun(tmp_path, duration_min=90.0, speed=240.0, **state) as run:
         monitor, plant = run.start_all()
         for kill in range(1 + len(KILLS_MIN)):
             if kill < len(KILLS_MIN):
