@@ -1,4 +1,4 @@
-"""A lasting step is told from outliers in the innovations of any linear predictor, and chance is kept to its share."""
+"""A lasting step is distinguished from outliers in the innovations of any linear predictor; chance has its share."""
 
 import numpy as np
 import pytest
