@@ -127,6 +127,6 @@ def _object(item: "Baseline") -> dict[str, object]:
 def _line(item: "Baseline") -> str:
     from reactorwatch.contract.alarm_text import format_moment
 
-    since = f" from {format_moment(item.time_ns)}" if item.time_ns else " at first"
+    since = f" from {format_moment(item.time_ns)}" if item.time_ns else " from the start"
     restored = f" {item.restored}" if item.what == "restore" else ""
     return f"{item.id}: {item.what}{restored} by {item.by or 'monitor'}{since}" + (f": {item.why}" if item.why else "")
