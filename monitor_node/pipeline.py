@@ -515,14 +515,18 @@ class PlantPipeline:
     def start_run(self) -> None:
         """Expect the first row of another run of the plant, whose times are unrelated to those of the training."""
         self._sampling.state = SamplingState(period_ns=self._sampling.state.period_ns)
+        self._forget_rows()
+        self._quarantined = (False,) * len(self._config.outputs)
+        self.signals.reset()
+
+    def _forget_rows(self) -> None:
+        """Judge the next row without those before it, as after a gap; charts and alarms keep their memory."""
         if self._reference is not None:
             self._reference.restart()
-        self._quarantined = (False,) * len(self._config.outputs)
         for whitener in self._whiteners:
             whitener.restart()
         self._shift.restart()
         self.signals.restart()
-        self.signals.reset()
 
     def _start_training(self, time_ns: int | None) -> None:
         config = self._config
@@ -740,14 +744,9 @@ class PlantPipeline:
         self._update.baseline = change
         if self._bank is not None:
             self._bank = ArxBank(self._predictors, self._inputs)
-        assert self._reference is not None
-        self._reference.restart()
+        self._forget_rows()
         self._charts.restart()
-        self._shift.restart()
-        for whitener in self._whiteners:
-            whitener.restart()
         self._quarantined = (False,) * len(self._config.outputs)
-        self.signals.restart()
 
     def _train_again(self, time_ns: int, rows: TrainingState | None) -> None:
         """Train from a row on, after the given rows."""
@@ -1051,11 +1050,7 @@ class PlantPipeline:
             reference.predictions = self._predict(row) if self._bank is None else self._predict_by_bank(row)
             reference.extrapolation_sds = [predictor.extrapolation_sd for predictor in self._predictors]
         if row.interval.is_gap:  # the input in it is unknown
-            reference.restart()
-            self.signals.restart()
-            self._shift.restart()
-            for whitener in self._whiteners:
-                whitener.restart()
+            self._forget_rows()
         predictions, sds, extrapolation = reference.update(
             time_ns, row.inputs, values, self._quarantined, row.interval.missing
         )

@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from reactorwatch.cli.alarm import MONITOR, Timeout
 from reactorwatch.cli.command_client import TIMEOUT_S, send_command
-from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Settings, check_encodable
+from reactorwatch.cli.options import Endpoint, Json, Plant, Settings, check_encodable
 from reactorwatch.cli.printing import print_lines
 
 if TYPE_CHECKING:
@@ -14,9 +15,8 @@ if TYPE_CHECKING:
 
 By = Annotated[str, typer.Option("--by", help="Your name.", callback=check_encodable, show_default=False)]
 Why = Annotated[str, typer.Option("--why", help="Reason, for the record.", callback=check_encodable)]
-Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the monitor.", min=0.1, max=MAX_WAIT_S)]
 
-COMMAND, MONITOR = "baseline", "monitor"
+COMMAND = "baseline"
 
 baselines = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -26,32 +26,25 @@ def register_commands(app: typer.Typer) -> None:
     app.add_typer(baselines, name=COMMAND, help="Accept, relearn or restore what a plant is judged by.")
 
 
-@baselines.command("accept")
-def accept(
-    by: By,
-    why: Why,
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
-    timeout: Timeout = TIMEOUT_S,
-    json: Json = False,
-) -> None:
-    """Take the plant as it is now as sound: learn from the rows since the active alarm on."""
-    _send("accept", by, why, None, (config, endpoint, name, timeout), json=json)
+def _register(what: str, description: str) -> None:
+    """Register a subcommand without a number."""
+
+    def act(
+        by: By,
+        why: Why,
+        config: Settings = None,
+        endpoint: Endpoint = None,
+        name: Plant = None,
+        timeout: Timeout = TIMEOUT_S,
+        json: Json = False,
+    ) -> None:
+        _send(what, by, why, None, (config, endpoint, name, timeout), json=json)
+
+    baselines.command(what, help=description)(act)
 
 
-@baselines.command("relearn")
-def relearn(
-    by: By,
-    why: Why,
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
-    timeout: Timeout = TIMEOUT_S,
-    json: Json = False,
-) -> None:
-    """Learn the plant again, from the next row on."""
-    _send("relearn", by, why, None, (config, endpoint, name, timeout), json=json)
+_register("accept", "Take the plant as it is now as sound: learn from the rows since the active alarm on.")
+_register("relearn", "Learn the plant again, from the next row on.")
 
 
 @baselines.command("restore")

@@ -25,7 +25,7 @@ def baseline_of(*learned: Prewhitening) -> Baseline:
 @pytest.mark.parametrize("coefficient", [0.0, 0.5])
 @pytest.mark.parametrize("rows", [100, 1000, 5000])
 def test_at_most_a_tenth_of_the_plants_is_worse_than_its_bound(rows: int, coefficient: float) -> None:
-    """Of 60 plants: three standard errors are 0.12; `make promise` has 1,000."""
+    """60 plants, for which three standard errors are 0.12; `make promise` has 1,000."""
     assert share_worse(rows, coefficient, 60) < 0.22
 
 
@@ -48,7 +48,7 @@ def test_the_chart_of_all_outputs_has_the_intended_rate_on_average_too() -> None
 
 @pytest.mark.parametrize("limit", [20.0, 40.0, 80.0])
 def test_the_tail_of_a_weighted_sum_is_that_of_the_sum_it_is(limit: float) -> None:
-    """Of equal weights chi-square; of weights 2, 2, 1, 1 the convolution of two exponentials."""
+    """Equal weights give chi-square; weights 2, 2, 1, 1 the convolution of two exponentials."""
     equal = weighted_chi2_tail(np.full((1, 6), 2.0), np.zeros((1, 6)), limit)[0]
     assert equal == pytest.approx(chi2.sf(limit / 2.0, 6), rel=0.05)
     mixed = weighted_chi2_tail(np.array([[2.0, 2.0, 1.0, 1.0]]), np.zeros((1, 4)), limit)[0]

@@ -29,7 +29,7 @@ def test_a_sensor_without_outliers_has_an_alarm_at_the_first() -> None:
 
 @pytest.mark.parametrize("rate", [0.001, 0.005, 0.02])
 def test_a_steady_rate_raises_no_more_alarms_than_promised(rate: float) -> None:
-    """Of 300 sensors with a training each, over 6,000 rows: 6 are expected at most."""
+    """300 sensors with a training each, over 6,000 rows: at most 6 alarms are expected."""
     rng, alarms, trained = np.random.default_rng(3), 0, 0
     while trained < 300:
         outliers = int(rng.binomial(ROWS, rate))
