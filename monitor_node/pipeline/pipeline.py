@@ -205,6 +205,7 @@ class PlantPipeline:
             b"" if self._reference is not None or self.baseline is None else self.baseline.SerializeToString(),
             None if self._incident is None else self._incident.state,
             None if self._modes is None else msgspec.structs.replace(self._modes.state),
+            [command.SerializeToString() for command in self._update.commands],
         )
 
     def _trained_state(self, reference: Reference) -> TrainedState:
@@ -243,6 +244,7 @@ class PlantPipeline:
             predictor.restore(of_predictor)
         self._refusals, self._began_ns = state.refusals, state.began_ns
         self._kept = list(state.kept)
+        self._update.changes.extend(ScheduledChange(None, Baseline.FromString(item)) for item in state.commands)
         if state.change:
             self._update.baseline = Baseline.FromString(state.change)
         if state.incident is not None:
@@ -691,6 +693,11 @@ class PlantPipeline:
     def baselines(self) -> list[Baseline]:
         """Baselines that can be restored, the oldest first, then the one in force."""
         return [*(Baseline.FromString(item.change) for item in self._kept), self._in_force]
+
+    @property
+    def pending_commands(self) -> int:
+        """Number of accepted commands on the baseline that hold from the next row on."""
+        return len(self._update.commands)
 
     @property
     def _in_force(self) -> Baseline:
