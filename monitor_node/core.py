@@ -373,8 +373,9 @@ class Monitor:
 
     @property
     def changes(self) -> int:
-        """Count of changes that a restart must preserve: of alarms and of the baseline."""
-        return self.alarms.changes + (0 if self.baseline is None else self.baseline.id)
+        """Count of changes that a restart must preserve: of alarms, and of the baseline when accepted and executed."""
+        executed = 0 if self.baseline is None else self.baseline.id
+        return self.alarms.changes + 2 * executed + self.pipeline.pending_commands
 
     # --- diagnosis of the training ---------------------------------------------------------------------------
 

@@ -82,6 +82,11 @@ class ModelUpdate:
             return f"not diagnosed: {finding.why}; the plant is judged by the equations as given"
         return "" if finding.verdict == NOMINAL else f"{finding.why}; the plant is judged by the equations as given"
 
+    @property
+    def commands(self) -> list[Baseline]:
+        """Changes by accepted commands that hold from the next row on, in order."""
+        return [item.baseline for item in self.changes if item.at_ns is None and is_command(item.baseline)]
+
     def pop_due(self, time_ns: int) -> Baseline | None:
         """The change that holds from a row on, with its time and number; None: there is none.
 

@@ -127,6 +127,7 @@ class PlantPipeline:
             self.baseline.SerializeToString() if is_changed and self.baseline is not None else b"",
             None if evaluation.incident is None else evaluation.incident.state,
             None if self._modes is None else self._modes.copy_state(),
+            [command.SerializeToString() for command in self._update.commands],
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -145,6 +146,7 @@ class PlantPipeline:
         self.models.restore(state.predictors)
         self._training.refusals, self._training.began_ns = state.refusals, state.began_ns
         self._baselines.kept = list(state.kept)
+        self._update.changes.extend(ScheduledChange(None, Baseline.FromString(item)) for item in state.commands)
         watched = state.watched
         change = state.change if watched is None or not watched.baseline else watched.baseline
         if change:
@@ -404,6 +406,11 @@ class PlantPipeline:
     def equations(self) -> ProcessModel | None:
         """Process model in force; None: there is none."""
         return self._baselines.equations
+
+    @property
+    def pending_commands(self) -> int:
+        """Number of accepted commands on the baseline that hold from the next row on."""
+        return len(self._update.commands)
 
     def schedule_command(self, command: BaselineCommand) -> Baseline:
         """Schedule a command on the baseline for the next row; returns the change.

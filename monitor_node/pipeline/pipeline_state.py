@@ -124,6 +124,7 @@ class PipelineState(StoredState, frozen=True):
         change: newest change of the baseline by a command, while the plant is trained because of it; empty else.
         incident: rows since an alarm without a known cause is active; None: there is none.
         modes: state of the plant's modes; None without signals of modes.
+        commands: changes by accepted commands that hold from the next row on, each a serialized `Baseline`, in order.
     """
 
     sampling: SamplingState
@@ -138,3 +139,4 @@ class PipelineState(StoredState, frozen=True):
     change: bytes = b""
     incident: TrainingState | None = None
     modes: ModesState | None = None
+    commands: list[bytes] = msgspec.field(default_factory=list)

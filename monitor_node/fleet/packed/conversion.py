@@ -149,6 +149,8 @@ class Conversion:
         pipeline = monitor.pipeline
         if monitor.is_replaying_history or monitor.phase != "watching" or not pipeline.is_normal:
             return None
+        if pipeline.pending_commands:
+            return None
         if None in monitor.receipts_ns or monitor.converts_samples:
             return None
         state = monitor.state

@@ -133,6 +133,29 @@ def test_a_replay_and_a_resumed_monitor_do_the_same_bit_for_bit(
     assert replayed.published == run.published
 
 
+@pytest.mark.parametrize("what", ["accept", "relearn", "restore"])
+def test_a_command_is_executed_by_a_monitor_that_resumes_before_the_next_row(
+    plant: tuple[Array, Array], what: str
+) -> None:
+    runs = [Run(plant, "arx").take_until(CHANGE + 12) for _ in range(2)]
+    for run, is_resumed in zip(runs, (False, True), strict=True):
+        if what == "restore":
+            assert run.ask("relearn").accepted
+            run.take_until(CHANGE + 13)
+        before = run.monitor.changes
+        assert run.ask(what).accepted
+        assert run.monitor.changes == before + 1, "so the state is stored at once"
+        if is_resumed:
+            run.resume()
+        before = run.monitor.changes
+        run.take_until(CHANGE + 13 if what != "restore" else CHANGE + 14)
+        assert run.monitor.changes > before, "so is the change in force"
+        run.take_until(CHANGE + 20)
+    assert runs[0].changes[-1].what == what
+    assert runs[0].published == runs[1].published
+    assert runs[0].monitor.to_bytes() == runs[1].monitor.to_bytes()
+
+
 @pytest.mark.parametrize(
     ("row", "fields", "text"),
     [
