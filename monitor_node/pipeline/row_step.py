@@ -5,6 +5,9 @@ stages then update are numbers: one record a plant, whose type is composed of th
 one plant steps over an array of one record, a fleet over one with a record for each plant; the steps themselves are in
 the stages' modules.
 
+The step is compiled once for all plants: it is given the addresses of the stages' arrays (`Frame`) rather than records,
+whose types, and so the machine code, would differ with the numbers of inputs, outputs and alarms.
+
 Any other row is an event, and changes nothing here: the stages process it one by one (`pipeline`), with the same
 numbers. Events are: a row after a gap or a missing row; one by which the filter restarts; a value out of the signal's
 range; a timeout; more equal readings than a sound sensor has; a residual that may be a spike; and a row that raises an
@@ -31,7 +34,7 @@ from monitor_node.signal_checks.timeout import TIMEOUT, update_timeout
 from monitor_node.stages.charts import alarm_names
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
-from reactorwatch.codegen.numba_kernel import Entry, call_at, jit
+from reactorwatch.codegen.numba_kernel import Entry, call_at, carray, jit, pointer_at
 from reactorwatch.identification.black_box.filter import JUDGED, filter_row
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, row_function
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
@@ -63,7 +66,30 @@ MOST_PERIODS = 1.99 - WHOLE
 POINT = 5
 """Numbers of a chart's point: those of a `Judgement`."""
 
+_SHEWHART, _EWMA, _CUSUM = Shewhart.numbers, Ewma.numbers, Cusum.numbers
+_COLUMNS = SETTINGS + max(_SHEWHART, _EWMA, _CUSUM)
+
 Records: TypeAlias = NDArray[np.void]
+Words: TypeAlias = NDArray[np.int64]
+
+LAST_NS = 0
+"""Word of a plant's numbers that is the time of its newest row."""
+
+HEAD = np.dtype([("last_ns", "i8"), ("period_ns", "f8"), ("time_min", "f8")])
+"""Time of the newest row; sampling period; time of the filter's newest row."""
+
+CONSTANTS = np.dtype(
+    [
+        ("filter_address", "i8"),  # address of the filter's machine code; 0: a black box
+        ("spacing_min", "f8", (2,)),  # shortest and longest time between two rows
+        ("silence_limit", "f8"),  # see `DataTimeout`
+        ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
+        ("reach", "f8"),  # see `is_normal`
+        ("weight", "f8"),  # weight of the MEWMA chart
+    ],
+    align=True,
+)
+"""Constants of a step whose number is the same for all plants."""
 
 
 def row_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
@@ -76,9 +102,7 @@ def row_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
     """
     return np.dtype(
         [
-            ("last_ns", "i8"),  # time of the newest row
-            ("period_ns", "f8"),  # sampling period
-            ("time_min", "f8"),  # time of the filter's newest row
+            *((name, HEAD[name]) for name in HEAD.names or ()),
             ("inputs", "f8", (inputs,)),  # inputs of that row
             ("timeouts", TIMEOUT, (1 + inputs + outputs,)),  # of the plant, each input and each output
             ("whiteners", WHITENER, (outputs,)),
@@ -102,14 +126,13 @@ def work_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
         outputs: number of monitored outputs.
         alarms: number of alarms that the charts can raise.
     """
-    rows = SETTINGS + max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
     return np.dtype(
         [
             ("new", "f8", (3 + 2 * inputs + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
             ("outputs", "f8", (5 * outputs + 1,)),  # its results
             ("expected", "f8", (outputs,)),  # expected values of the prewhitening filters
             ("e", "f8", (outputs,)),  # prewhitened residuals
-            ("columns", "f8", (rows, outputs)),  # columns of a bank of charts, see `compiled_chart`
+            ("columns", "f8", (_COLUMNS, outputs)),  # columns of a bank of charts, see `compiled_chart`
             ("points", "f8", (max(alarms, 1), POINT)),  # points of the charts, one row an alarm
         ],
         align=True,
@@ -126,15 +149,10 @@ def settings_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
     """
     return np.dtype(
         [
-            ("filter_address", "i8"),  # address of the filter's machine code; 0: a black box
-            ("spacing_min", "f8", (2,)),  # shortest and longest time between two rows
+            ("constants", CONSTANTS),
             ("resolutions", "f8", (outputs,)),  # stated resolution of each output; 0 where it is learned
             ("ranges", "f8", (inputs + outputs, 2)),  # smallest and largest value of each signal
-            ("silence_limit", "f8"),  # see `DataTimeout`
-            ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
             ("rules", "i8", (max(alarms, 1), 2)),  # violating points that raise each alarm, mask of its window
-            ("reach", "f8"),  # see `is_normal`
-            ("weight", "f8"),  # weight of the MEWMA chart
         ],
         align=True,
     )
@@ -153,6 +171,114 @@ class FilterNumbers(NamedTuple):
     variances: Array
 
 
+class Plant(NamedTuple):
+    """Numbers of a plant's stages, see `row_type`; within the compiled step."""
+
+    head: Any
+    inputs: Array
+    timeouts: Any
+    whiteners: Any
+    stuck: Any
+    spike_limits: Array
+    shewhart: Array
+    ewma: Array
+    cusum: Array
+    mewma: Array
+    delays: Any
+
+
+class Work(NamedTuple):
+    """Results of a step, see `work_type`; within the compiled step."""
+
+    new: Array
+    outputs: Array
+    expected: Array
+    e: Array
+    columns: Array
+    points: Array
+
+
+class Settings(NamedTuple):
+    """Constants of a step, see `settings_type`; within the compiled step."""
+
+    constants: Any
+    resolutions: Array
+    ranges: Array
+    rules: Words
+
+
+_FIRST = 3
+_P = _FIRST + len(HEAD.names or ()) - 1  # `head` takes the place of its three fields
+_WORK = _P + len(Plant._fields)
+_SETTINGS = _WORK + len(Work._fields)
+
+
+def frame_of(sizes: tuple[int, int, int], scratch: Records, work: Records, settings: Records) -> Words:
+    """Where the compiled step finds its arrays, which the caller keeps alive.
+
+    Args:
+        sizes: numbers of inputs, outputs and alarms.
+        scratch: numbers of one plant, shape (1,), see `row_type`.
+        work: shape (1,), see `work_type`.
+        settings: shape (1,), see `settings_type`.
+
+    Returns:
+        the sizes, then the addresses of the fields.
+    """
+    addresses = [
+        records[name].ctypes.data for records in (scratch, work, settings) for name in records.dtype.names or ()
+    ]
+    return np.array([*sizes, *addresses], dtype=np.int64)
+
+
+def words_of(numbers: Records) -> Words:
+    """Numbers of plants as words, shape (plants, words): a view."""
+    words: Words = numbers.view(np.int64).reshape(len(numbers), -1)
+    return words
+
+
+@jit
+def _plant_at(frame: Words) -> Plant:
+    inputs, outputs, alarms = frame[0], frame[1], max(frame[2], 1)
+    return Plant(
+        carray(pointer_at(frame[_FIRST]), (1,), HEAD),
+        carray(pointer_at(frame[_P + 1]), (inputs,), np.float64),
+        carray(pointer_at(frame[_P + 2]), (1 + inputs + outputs,), TIMEOUT),
+        carray(pointer_at(frame[_P + 3]), (outputs,), WHITENER),
+        carray(pointer_at(frame[_P + 4]), (outputs,), STUCK),
+        carray(pointer_at(frame[_P + 5]), (outputs,), np.float64),
+        carray(pointer_at(frame[_P + 6]), (_SHEWHART, outputs), np.float64),
+        carray(pointer_at(frame[_P + 7]), (_EWMA, outputs), np.float64),
+        carray(pointer_at(frame[_P + 8]), (_CUSUM, outputs), np.float64),
+        carray(pointer_at(frame[_P + 9]), (1 + 2 * outputs + 2 * outputs * outputs,), np.float64),
+        carray(pointer_at(frame[_P + 10]), (alarms,), DELAY),
+    )
+
+
+@jit
+def _work_at(frame: Words) -> Work:
+    inputs, outputs, alarms = frame[0], frame[1], max(frame[2], 1)
+    return Work(
+        carray(pointer_at(frame[_WORK]), (3 + 2 * inputs + 2 * outputs,), np.float64),
+        carray(pointer_at(frame[_WORK + 1]), (5 * outputs + 1,), np.float64),
+        carray(pointer_at(frame[_WORK + 2]), (outputs,), np.float64),
+        carray(pointer_at(frame[_WORK + 3]), (outputs,), np.float64),
+        carray(pointer_at(frame[_WORK + 4]), (_COLUMNS, outputs), np.float64),
+        carray(pointer_at(frame[_WORK + 5]), (alarms, POINT), np.float64),
+    )
+
+
+@jit
+def _settings_at(frame: Words) -> Settings:
+    inputs, outputs, alarms = frame[0], frame[1], max(frame[2], 1)
+    return Settings(
+        carray(pointer_at(frame[_SETTINGS]), (1,), CONSTANTS),
+        carray(pointer_at(frame[_SETTINGS + 1]), (outputs,), np.float64),
+        carray(pointer_at(frame[_SETTINGS + 2]), (inputs + outputs, 2), np.float64),
+        carray(pointer_at(frame[_SETTINGS + 3]), (alarms, 2), np.int64),
+    )
+
+
 @jit
 def _predict(
     p: Any,
@@ -166,10 +292,10 @@ def _predict(
     values: Array,
 ) -> bool:
     """Filter a row that is not too far from the one before; returns True if all went well."""
-    inputs, new = p.inputs.size, work.new
+    inputs, new, constants = p.inputs.size, work.new, settings.constants[0]
     count = values.size - inputs
-    spacing_min = time_min - p.time_min
-    if not settings.spacing_min[0] < spacing_min <= settings.spacing_min[1]:
+    spacing_min = time_min - p.head[0].time_min
+    if not constants.spacing_min[0] < spacing_min <= constants.spacing_min[1]:
         return False
     step = 0.5 * spacing_min
     for i in range(inputs):
@@ -181,10 +307,10 @@ def _predict(
     first = parameters.size - variances.size
     for i in range(variances.size):
         parameters[first + i] = variances[i]
-    if settings.filter_address == 0:
+    if constants.filter_address == 0:
         return filter_row(belief, new, parameters, after, work.outputs) == JUDGED
-    before, given, constants = belief.ctypes.data, new.ctypes.data, parameters.ctypes.data
-    call_at(settings.filter_address, (1, before, given, constants, after.ctypes.data, work.outputs.ctypes.data))
+    before, given, fixed = belief.ctypes.data, new.ctypes.data, parameters.ctypes.data
+    call_at(constants.filter_address, (1, before, given, fixed, after.ctypes.data, work.outputs.ctypes.data))
     return bool(work.outputs[work.outputs.size - 1] != 0.0)
 
 
@@ -194,7 +320,7 @@ def _add_point(p: Any, point: Array, settings: Any, alarm: int) -> int:
     is_out = point[4] > 0.0
     if not (is_out or p.recent):
         return ORDINARY
-    normal = not is_out and is_normal(point[0], point[1], point[2], point[3], p.above != 0, settings.reach)
+    normal = not is_out and is_normal(point[0], point[1], point[2], point[3], p.above != 0, settings.constants[0].reach)
     p.recent, p.in_a_row = add_point(p.recent, p.in_a_row, settings.rules[alarm, 1], is_out, normal)
     return EVENT if raises(p.recent, settings.rules[alarm, 0], is_out) else VIOLATING
 
@@ -224,7 +350,8 @@ def _take_points(p: Any, work: Any, numbers: Array, settings: Any, first: int) -
 @jit
 def _update_charts(p: Any, work: Any, settings: Any) -> int:
     """Update the charts with the prewhitened residuals; returns the verdict."""
-    charts, columns, e, verdict = settings.charts, work.columns, work.e, ORDINARY
+    constants, columns, e, verdict = settings.constants[0], work.columns, work.e, ORDINARY
+    charts = constants.charts
     if charts[0] >= 0:
         _lay_out(columns, p.shewhart, e)
         judge_shewhart(columns)
@@ -238,7 +365,7 @@ def _update_charts(p: Any, work: Any, settings: Any) -> int:
         judge_cusum(columns)
         verdict = max(verdict, _take_points(p, work, p.cusum, settings, charts[2]))
     if charts[3] >= 0:
-        statistic, limit, point = move_mewma(p.mewma, e, settings.weight), p.mewma[0], work.points[charts[3]]
+        statistic, limit, point = move_mewma(p.mewma, e, constants.weight), p.mewma[0], work.points[charts[3]]
         if statistic < 0.0:
             return EVENT
         point[0], point[1], point[2], point[3] = statistic, float(e.size), 0.0, limit
@@ -249,10 +376,8 @@ def _update_charts(p: Any, work: Any, settings: Any) -> int:
 
 @jit
 def step(
-    numbers: Records,
-    scratch: Records,
-    works: Records,
-    constants: Records,
+    numbers: Words,
+    frame: Words,
     beliefs: Array,
     variances: Array,
     parameters: Array,
@@ -265,10 +390,8 @@ def step(
     """Take a row through all stages; returns the verdict.
 
     Args:
-        numbers: numbers of the plants, shape (plants,), see `row_type`.
-        scratch: numbers of one plant, to work in, shape (1,).
-        works: filled, shape (1,), see `work_type`.
-        constants: constants of the step, shape (1,), see `settings_type`.
+        numbers: numbers of the plants, see `words_of`.
+        frame: see `frame_of`.
         beliefs: beliefs of the filters, see `FilterNumbers`.
         variances: variances of the filters, see `FilterNumbers`.
         parameters: parameters of the model, and room for the variances, shape (parameters + outputs + states,).
@@ -278,10 +401,13 @@ def step(
         time_min: the same in minutes.
         values: values of the row, the inputs first.
     """
-    scratch[0] = numbers[plant]
-    p, work, settings = scratch[0], works[0], constants[0]
-    spacing_ns = time_ns - p.last_ns
-    if spacing_ns <= 0 or float(spacing_ns) > MOST_PERIODS * p.period_ns:
+    scratch = carray(pointer_at(frame[_FIRST]), (numbers.shape[1],), np.int64)
+    for i in range(scratch.size):
+        scratch[i] = numbers[plant, i]
+    p, work, settings = _plant_at(frame), _work_at(frame), _settings_at(frame)
+    head = p.head[0]
+    spacing_ns = time_ns - head.last_ns
+    if spacing_ns <= 0 or float(spacing_ns) > MOST_PERIODS * head.period_ns:
         return EVENT
     for i in range(values.size):
         if not settings.ranges[i, 0] <= values[i] <= settings.ranges[i, 1]:
@@ -290,7 +416,7 @@ def step(
     if not _predict(p, belief, variances[plant], parameters, after, work, settings, time_min, values):
         return EVENT
     for i in range(p.timeouts.size):
-        if update_timeout(p.timeouts[i], time_ns, True, settings.silence_limit, -1)[0]:
+        if update_timeout(p.timeouts[i], time_ns, True, settings.constants[0].silence_limit, -1)[0]:
             return EVENT
     inputs = p.inputs.size
     outputs = values.size - inputs
@@ -306,19 +432,17 @@ def step(
     verdict = _update_charts(p, work, settings)
     if verdict == EVENT:
         return EVENT
-    p.last_ns, p.time_min = time_ns, time_min
+    head.last_ns, head.time_min = time_ns, time_min
     for i in range(inputs):
         p.inputs[i] = values[i]
     for i in range(belief.size):
         belief[i] = after[i]
-    numbers[plant] = scratch[0]
+    for i in range(scratch.size):
+        numbers[plant, i] = scratch[i]
     return verdict
 
 
-@lru_cache
-def step_entry(inputs: int, outputs: int, alarms: int) -> Entry:
-    """Machine code of the step for the types of these numbers of inputs, outputs and alarms."""
-    return Entry(step)
+_STEP = Entry(step)
 
 
 class RowFilter(NamedTuple):
@@ -352,31 +476,33 @@ class RowStep:
     Attributes:
         numbers_type: type of the numbers of a plant's stages.
         filter_sizes: sizes of belief and variances of a filter.
-        settings: constants of the step, shape (1,).
         parameters: parameters of the model, and room for the variances of a filter.
         work: results of the newest step, shape (1,).
-        scratch: numbers of one plant, to work in, shape (1,).
+        frame: see `frame_of`.
         after: belief of a filter, to work in.
     """
 
     def __init__(self, config: MonitorConfig, row_filter: RowFilter, ranges: Sequence[SignalRange]) -> None:
         kinds = [chart for chart, _ in alarm_names(config)]
         sizes = len(config.inputs), len(config.outputs), len(kinds)
-        self._code, self._step = row_filter.code, step_entry(*sizes)
+        self._code = row_filter.code
         self.numbers_type = numbers_type(config)
         self.filter_sizes = row_filter.belief, row_filter.constants
-        self.settings = np.zeros(1, settings_type(*sizes))
-        p = self.settings[0]
-        p["filter_address"], p["spacing_min"] = row_filter.address, row_filter.spacing_min
-        p["silence_limit"] = config.silence_periods
+        self._settings = np.zeros(1, settings_type(*sizes))
+        p = self._settings[0]
+        constants = p["constants"]
+        constants["filter_address"], constants["spacing_min"] = row_filter.address, row_filter.spacing_min
+        constants["silence_limit"] = config.silence_periods
         p["resolutions"] = [config.resolution.get(name, 0.0) for name in config.outputs]
         p["ranges"] = [[item.lower, item.upper] for item in ranges]
-        p["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
+        constants["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
         for i, kind in enumerate(kinds):
             p["rules"][i] = (1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1)
-        p["reach"], p["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
+        constants["reach"], constants["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
         self.work = np.zeros(1, work_type(*sizes))
-        self.scratch = np.zeros(1, self.numbers_type)
+        self._scratch = np.zeros(1, self.numbers_type)
+        self.frame = frame_of(sizes, self._scratch, self.work, self._settings)
+        self._numbers, self._words = self._scratch, words_of(self._scratch)
         self.after: Array = np.empty(row_filter.belief)
         self.parameters: Array = np.concatenate([row_filter.parameters, np.empty(row_filter.constants)])
 
@@ -420,8 +546,11 @@ class RowStep:
 
     def update(self, numbers: Records, kalman: FilterNumbers, time_ns: int, time_min: float, values: Array) -> int:
         """Take a row of one plant through all stages; returns the verdict."""
-        own = (self.scratch, self.work, self.settings, *kalman, self.parameters, self.after)
-        verdict: int = self._step.call(numbers, *own, 0, time_ns, time_min, values)
+        if numbers is not self._numbers:
+            self._numbers, self._words = numbers, words_of(numbers)
+        verdict: int = _STEP.call(
+            self._words, self.frame, *kalman, self.parameters, self.after, 0, time_ns, time_min, values
+        )
         return verdict
 
 
