@@ -1,7 +1,7 @@
 """Rows of a training or an incident, from which a baseline is learned."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import isfinite
 
 from reactorwatch.stored_state import StoredState, pack_numbers, pack_times, unpack_numbers, unpack_times
@@ -30,12 +30,17 @@ class TrainingRows:
     Args:
         inputs: number of inputs.
         outputs: number of monitored outputs.
+        rows: first rows, each with its time, inputs and outputs.
     """
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, rows: Iterable[tuple[int, Sequence[float], list[float]]] = ()
+    ) -> None:
         self._inputs, self._outputs = inputs, outputs
         self._rows: deque[tuple[int, Sequence[float], list[float]]] = deque(maxlen=MOST_ROWS)
         self._counts = [0] * outputs
+        for row in rows:
+            self.add(*row)
 
     @property
     def state(self) -> TrainingState:

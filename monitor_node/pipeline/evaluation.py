@@ -22,7 +22,7 @@ from monitor_node.baseline.training_rows import TrainingRows
 from monitor_node.config import MonitorConfig
 from monitor_node.health.failures import Failures
 from monitor_node.ingest.alignment import MeasuredRow, Row
-from monitor_node.ingest.sampling import Interval, SamplingState
+from monitor_node.ingest.sampling import SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.pipeline.budget import AlarmBudget
 from monitor_node.pipeline.estimates import estimates
@@ -62,6 +62,7 @@ class Evaluation:
         reference: the reference; None if rows are not evaluated.
         is_process: True if the plant is the model's.
         is_normal: True if the compiled step may take the next row, see `row_step`.
+        needs_rows: True if there is anything to publish or to update after a row that the compiled step has taken.
         left_out: signals that are not monitored, with the reason.
         checks: checks of the training.
         rows_watched: number of evaluated rows.
@@ -101,6 +102,7 @@ class Evaluation:
         self._evaluated = [True] * len(config.outputs)
         self._noted: set[str] = set()
         self.is_normal = False
+        self.needs_rows = True
         self.left_out: dict[str, str] = {}
         self.checks: list[Check] = []
         self.rows_watched = 0
@@ -325,7 +327,7 @@ class Evaluation:
             self._charts.store(self.ordinary.numbers[0])
             self.is_normal = False
 
-    def step(self, row: Row, units: list[str], interval: Interval, publications: list[Publication]) -> bool:
+    def step(self, row: Row) -> bool:
         """Evaluate a row by the compiled step; returns False if it is an event, for which nothing has changed."""
         reference, values, time_min = self.reference, row.values, row.time_ns / MINUTE_NS
         assert isinstance(reference, ProcessReference | BlackBoxReference)
@@ -337,13 +339,11 @@ class Evaluation:
         inputs = values[: self._inputs]
         reference.accept_row(time_min, inputs)
         self.rows_watched += 1
-        if self._points or self._drift.wanted or self._shift.is_active:
-            self._publish_stages(MeasuredRow.of(row, self._inputs, units, interval, publications))
         if self._suspicion is not None:
             self._suspicion.add(time_min, inputs, values[self._inputs :])
         return True
 
-    def _publish_stages(self, row: MeasuredRow) -> None:
+    def publish_step(self, row: MeasuredRow) -> None:
         """Publish a row that the compiled step has taken, and pass it to the stages that the step does not have."""
         before = len(row.publications)
         predictions, sds, z, expected = self.ordinary.predictions
@@ -380,6 +380,7 @@ class Evaluation:
         self.evaluate(row)
         self._count_alarms(row, before)
         self.is_normal = self.find_normal(row.time_ns, sampling)
+        self.needs_rows = self._points or self._drift.wanted or self._shift.is_active
 
     def evaluate(self, row: MeasuredRow) -> None:
         """Evaluate a row, stage by stage."""
@@ -453,13 +454,11 @@ class Evaluation:
         if not self._board.has_unexplained:
             self.incident = None
             return
+        sample = row.time_ns, row.inputs, list(row.values)
         if self.incident is None:
-            self.incident = self.new_incident()
-        self.incident.add(row.time_ns, row.inputs, list(row.values))
-
-    def new_incident(self) -> TrainingRows:
-        """Rows of an incident, of which there are none yet."""
-        return TrainingRows(self._inputs, len(self._config.outputs))
+            self.incident = TrainingRows(self._inputs, len(self._config.outputs), [sample])
+        else:
+            self.incident.add(*sample)
 
     def _new_suspicion(self, reference: Reference) -> Suspicion | None:
         if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.equations)):

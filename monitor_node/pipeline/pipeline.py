@@ -16,12 +16,12 @@ from monitor_node.baseline.references import ProcessReference
 from monitor_node.baseline.signal_range import input_bounds
 from monitor_node.baseline.training import TrainingResult
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, equations_text
-from monitor_node.baseline.training_rows import TrainingState
+from monitor_node.baseline.training_rows import TrainingRows, TrainingState
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.health.failures import Failures
 from monitor_node.health.message import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
-from monitor_node.ingest.sampling import SamplingPeriod, SamplingState
+from monitor_node.ingest.sampling import Interval, SamplingPeriod, SamplingState
 from monitor_node.pipeline.budget import check_promise
 from monitor_node.pipeline.estimates import model_snapshots
 from monitor_node.pipeline.evaluation import Evaluation
@@ -152,7 +152,7 @@ class PlantPipeline:
         if change:
             self._update.baseline = Baseline.FromString(change)
         if state.incident is not None:
-            self.evaluation.incident = self.evaluation.new_incident()
+            self.evaluation.incident = TrainingRows(self._inputs, len(self._config.outputs))
             self.evaluation.incident.restore(state.incident)
         if self._modes is not None and state.modes is not None:
             self._modes.restore(state.modes)
@@ -249,13 +249,16 @@ class PlantPipeline:
         if self._modes is not None and self._modes.is_change(self.operation.values):
             self._note(self._modes.change(self.operation.values))
         interval = self._sampling.update(time_ns)
-        if evaluation.is_normal and not row.restarted and evaluation.step(row, units, interval, publications):
-            return
-        evaluation.leave_normal()
+        if evaluation.is_normal:
+            if not row.restarted and evaluation.step(row):
+                if evaluation.needs_rows:
+                    evaluation.publish_step(self._split(row, units, interval, publications))
+                return
+            evaluation.leave_normal()
         self._units = units
         if row.restarted:
             self.operation.on_restart()
-        measured = MeasuredRow.of(row, self._inputs, units, interval, publications)
+        measured = self._split(row, units, interval, publications)
         self.operation.inputs = measured.inputs
         publications.extend(evaluation.signals.check_row(time_ns, row.values))
         if evaluation.is_process or self._config.bounds:
@@ -271,6 +274,12 @@ class PlantPipeline:
                 evaluation.signals.reset()
             evaluation.update(measured, self._sampling.state)
         self.operation.inputs = ()
+
+    def _split(self, row: Row, units: list[str], interval: Interval, publications: list[Publication]) -> MeasuredRow:
+        """A row for the stages, with inputs and outputs apart."""
+        inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
+        follows = interval.follows and not row.restarted
+        return MeasuredRow(row.time_ns, inputs, values, units, interval, follows, publications)
 
     def _train(self, row: MeasuredRow) -> None:
         config, training, time_ns, publications = self._config, self._training, row.time_ns, row.publications

@@ -123,7 +123,7 @@ class _Banked:
     """
 
     def __init__(self, bank: Bank[CompiledChart], kind: type[CompiledChart]) -> None:
-        self._bank, self._has_memory = bank, kind.has_memory
+        self._bank, self._kind, self._has_memory = bank, kind, kind.has_memory
 
     def to_bytes(self) -> bytes:
         return self._bank.state.to_bytes()
@@ -137,7 +137,7 @@ class _Banked:
         self._bank.restart(index)
 
     def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
-        return self._bank.chart(index).explain(judgement, signals[index])
+        return self._kind.explain(judgement, signals[index])
 
     @property
     def numbers(self) -> Array:

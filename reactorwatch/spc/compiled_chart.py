@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.codegen.numba_kernel import Entry
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, SignalChart, finite
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Shown, SignalChart, finite
 
 # The first rows of a chart's column: what comes in and what goes out. After them come its settings, where its memory
 # starts, and its memory.
@@ -73,6 +73,11 @@ class CompiledChart(SignalChart):
         Args:
             columns: shape (SETTINGS + numbers, plants).
         """
+
+    @classmethod
+    @abstractmethod
+    def explain(cls, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
+        """See `SignalChart`; from the judgement alone, as the memory is in a bank."""
 
     @classmethod
     def from_state(cls, state: SignalState) -> Self:

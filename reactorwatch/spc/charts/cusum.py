@@ -108,7 +108,8 @@ class Cusum(CompiledChart):
         rate = _cusum_rate(errors.mean[:, 0] / sqrt(learned.rows), k / scale, h / scale)
         return rate / _cusum_rate(np.zeros(1), np.full(1, k), np.full(1, known))
 
-    def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
+    @classmethod
+    def explain(cls, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`."""
         return f"{signal.name} has been {judgement.side} what the model expects for long", {signal.name: 1.0}
 

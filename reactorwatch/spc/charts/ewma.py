@@ -109,7 +109,8 @@ class Ewma(CompiledChart):
         (learned,), (sd,), weight = baseline.learned, baseline.memory_sd, baseline.settings["ewma_weight"]
         return weight, sd * designed_limit(baseline.arl0, weight, learned), np.eye(1)
 
-    def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
+    @classmethod
+    def explain(cls, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`: as the lasting shift of the signal that would look like this."""
         size = abs(judgement.statistic) * signal.scale / signal.passed
         return signal.describe(judgement, size, lead="on average "), {signal.name: 1.0}

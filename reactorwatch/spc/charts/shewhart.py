@@ -129,7 +129,8 @@ class Shewhart(CompiledChart):
         """See `Chart`."""
         return 1.0, designed_width(baseline.point_probability, baseline.learned[0]), np.eye(1)
 
-    def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
+    @classmethod
+    def explain(cls, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`."""
         size, allowed = abs(judgement.statistic) * signal.scale, judgement.upper_limit * signal.scale
         return signal.describe(judgement, size, allowed), {signal.name: 1.0}
