@@ -146,6 +146,14 @@ class Evaluation:
         Raises:
             ValueError: the state is damaged.
         """
+        self.restore_baseline(state, equations)
+        if (state.suspicion is None) != (self._suspicion is None):
+            raise ValueError("the state must tell of the search for causes as it is set")
+        if self._suspicion is not None and state.suspicion is not None:
+            self._suspicion.restore(state.suspicion)
+
+    def restore_baseline(self, state: TrainedState, equations: ProcessModel | None) -> None:
+        """Take over what was learned, as `restore`; the search for causes starts with the next row."""
         self._drift.until_next = state.until_drift
         self.promises.restore(state.promise, state.power)
         self.checks = [Check(name=name, result=result) for name, result in state.checks]
@@ -162,10 +170,6 @@ class Evaluation:
         self._charts.restore(state.charts, self._evaluated)
         self._models.restore_bank(state.bank)
         self._shift.restore(state.shift)
-        if (state.suspicion is None) != (self._suspicion is None):
-            raise ValueError("the state must tell of the search for causes as it is set")
-        if self._suspicion is not None and state.suspicion is not None:
-            self._suspicion.restore(state.suspicion)
         self._quarantined, self.rows_watched = tuple(state.withheld), state.rows_watched
 
     def restore_reference(

@@ -1,7 +1,5 @@
 """Baselines of one plant: the one in force, and those that operators can restore."""
 
-import msgspec
-
 from monitor_node.baseline.commands import ACCEPT, RESTORE, TRAINED, check_command
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.references import Reference
@@ -108,8 +106,9 @@ class KeptBaselines:
         self._models.restart()
         self._models.resume(kept.predictors)
         self._evaluation.signals.restore_limits(kept.signals)
-        trained = msgspec.structs.replace(kept.trained, suspicion=None, baseline=b"")
-        self._evaluation.restore(trained, self._model)
+        change = Baseline.FromString(kept.change)
+        equations = read_equations(change.model) if change.model else self._model
+        self._evaluation.restore_baseline(kept.trained, equations)
         if self._evaluation.reference is not None:
             self._models.use_bank(self._evaluation.reference)
         self._evaluation.restart_charts()
