@@ -21,8 +21,9 @@ from typing import NamedTuple
 from monitor_node.baseline.signal_range import signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation, Suspect
+from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
 from monitor_node.isolation.stage import FEW_ROWS, LOOKS, ROWS_BEFORE, preparation
+from monitor_node.isolation.suspect import Suspect
 from monitor_node.isolation.window import Row
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record

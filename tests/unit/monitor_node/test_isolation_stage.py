@@ -98,6 +98,7 @@ def test_late_looks_name_what_early_ones_cannot_and_a_resumed_search_says_the_sa
     feed(first, leak[:ALARM])
     board.has_unexplained = True
     feed(first, leak[ALARM : ALARM + 150])
+    early = len(board.causes)
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(first.state), type=stage.SuspicionState)
     assert state.way is not None
     second, other = suspicion()
@@ -108,7 +109,7 @@ def test_late_looks_name_what_early_ones_cannot_and_a_resumed_search_says_the_sa
     feed(first, rest)
     feed(second, rest)
     assert not any(board.stopped)
-    assert other.causes == board.causes[3:]
+    assert other.causes == board.causes[early:]
     assert second.state == first.state
     assert [causes[0].cause for causes in board.causes[-1:]] == ["coolant_flow"]
     assert board.causes[-1][0].probability > 0.9
