@@ -7,7 +7,8 @@ then the rows since the alarm are kept, and `ROWS_BEFORE` before it: a slow ramp
 onset. A plant without an unexplained alarm keeps `isolation_rows` rows.
 
 Between looks and after the last one the probabilities follow the rows (`live_posterior`). They are published when one
-has moved by `WORTH_PUBLISHING`, or another cause becomes likelier than all others together.
+has moved by `WORTH_PUBLISHING`, or another cause becomes likelier than all others together. If the rows come to
+contradict what the last look named, as when a ramp ends, the next look is taken at once.
 
 The result depends on the samples alone. While the most likely cause is a sensor, its true reading is reconstructed.
 """
@@ -49,6 +50,9 @@ ROWS_BEFORE = 400
 
 LEAST = 0.01
 """Probability below which a suspect is not published."""
+
+LEAST_GROWTH = 1.3
+"""Factor by which the rows since the alarm have to grow until a look that is not in `LOOKS`."""
 
 WORTH_PUBLISHING = 0.1
 """Change of a probability since the last publication that is worth another one."""
@@ -96,6 +100,7 @@ class SuspicionState(StoredState, frozen=True):
         reconstruction: state of the reconstruction; None without one.
         live: state of the probabilities that follow the rows; None without an active alarm of unknown cause.
         published: probabilities of the suspects that were published last, by cause.
+        named_rows: number of rows since the first alarm at the last look, if it named a cause; else 0.
     """
 
     rows: bytes
@@ -107,6 +112,7 @@ class SuspicionState(StoredState, frozen=True):
     reconstruction: ReconstructionState | None
     live: LivePosteriorState | None = None
     published: dict[str, float] = {}  # noqa: RUF012 # msgspec copies it
+    named_rows: int = 0
 
 
 class Suspicion:
@@ -126,6 +132,7 @@ class Suspicion:
         self._isolation: Isolation | None = None
         self._live: LivePosterior | None = None
         self._published: dict[str, float] = {}
+        self._named_rows = 0
         # Flat, as most of the memory of a plant: time in minutes, inputs, outputs of the model.
         self._rows: deque[tuple[float, ...]] = deque(maxlen=config.isolation_rows)
         self._incident = 0
@@ -147,6 +154,7 @@ class Suspicion:
             None if self._reconstruction is None else self._reconstruction.state,
             None if self._live is None else self._live.state,
             dict(self._published),
+            self._named_rows,
         )
 
     def restore(self, state: SuspicionState) -> None:
@@ -165,7 +173,7 @@ class Suspicion:
         if state.live is not None:
             live = self._made_isolation().new_live_posterior()
             self._live = live if live.restore(state.live) else None
-        self._published = dict(state.published)
+        self._published, self._named_rows = dict(state.published), state.named_rows
         if state.reconstruction is not None:
             self._reconstruct(state.output, state.cause, 0.0, ())
             assert self._reconstruction is not None
@@ -217,7 +225,7 @@ class Suspicion:
         """Set the number of rows since the first alarm; more rows are kept as long as looks follow."""
         self._since = since
         if since is None:
-            self._live, self._published = None, {}
+            self._live, self._published, self._named_rows = None, {}, 0
         usual = self._config.isolation_rows
         if since is not None and since <= LOOKS[-1]:
             usual = max(usual, min(usual, ROWS_BEFORE) + LOOKS[-1])
@@ -227,8 +235,16 @@ class Suspicion:
             self._rows = deque(self._rows, maxlen=usual)
 
     def _is_look_due(self, since: int) -> bool:
-        """Return true for a row with a look; late looks need rows that are not far apart."""
-        return since in LOOKS and (since <= FEW_ROWS or len(newest_rows(self._rows_of_look(since))) > since)
+        """Return true for a row with a look."""
+        return since in LOOKS and self._has_rows(since)
+
+    def _may_look_early(self, since: int) -> bool:
+        """Return true if a look may be taken because the rows contradict what the last one named."""
+        return 0 < LEAST_GROWTH * self._named_rows <= since < LOOKS[-1] and self._has_rows(since)
+
+    def _has_rows(self, since: int) -> bool:
+        """Return true if the rows for a look are known; late looks need rows that are not far apart."""
+        return since <= FEW_ROWS or len(newest_rows(self._rows_of_look(since))) > since
 
     def _rows_of_look(self, since: int) -> list[Row]:
         """Rows for a look: the usual number, and later `ROWS_BEFORE` rows before the first alarm and all since."""
@@ -244,6 +260,7 @@ class Suspicion:
         suspects = isolation.suspects(self._rows_of_look(since), min(since, FEW_ROWS))
         publications = self._publish(time_ns, suspects, stopped=isolation.stopped)
         self._live = isolation.follow()
+        self._named_rows = since if suspects[0].cause != UNKNOWN else 0
         return publications
 
     def _follow_causes(
@@ -253,7 +270,9 @@ class Suspicion:
         if not live.update(time_ns / MINUTE_NS, inputs, measured):
             self._live = None
             return []
-        suspects, before = live.suspects(), self._published
+        suspects, before, since = live.suspects(), self._published, self._since or 0
+        if suspects[0].cause == UNKNOWN and suspects[0].probability > CONVINCED and self._may_look_early(since):
+            return self._look(time_ns, since)
         probabilities = {item.cause: item.probability for item in suspects}
         changes = (abs(probabilities.get(cause, 0.0) - before.get(cause, 0.0)) for cause in {*probabilities, *before})
         is_other = suspects[0].cause != max(before, key=before.__getitem__, default="")
