@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.ingest.sampling import missing_rows
+from monitor_node.isolation.bank_kernel import NO_FAULT, add_evidence, growth, set_causes
 from monitor_node.isolation.bank_model import MOST_SHARE, BankModel, bank_model_of
-from monitor_node.isolation.residual import add_row, log_evidence_of_sums, sums_dtype, sums_of
+from monitor_node.isolation.residual import SUMMED_ROWS, log_evidence_of_sums, sums_dtype, sums_of
 from monitor_node.isolation.suspect import Evidence, Suspect, rank_suspects
 from monitor_node.isolation.window import GAP_PERIODS, GATE
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting.fault_filter import HUBER
 from reactorwatch.diagnosis.fitting.profiles import Ramp, Step
 from reactorwatch.kalman.ekf import LONGEST_GAP_MIN, NoiseLevels
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
@@ -34,12 +34,6 @@ from reactorwatch.stored_state import StoredState
 
 MOST_MEMBERS = 24
 """Largest number of causes, each with a profile, that a bank follows."""
-
-DIVERGED = 1e6
-"""Standard deviations beyond which all innovations count alike."""
-
-NO_FAULT = -1
-"""Index in place of the cause's in the filter of a plant without a fault."""
 
 
 class Member(NamedTuple):
@@ -101,11 +95,14 @@ class LivePosterior:
         self._constants = self._bank.constants(noise)
         n, n_y = self._bank.n_states, len(model.outputs)
         self._n_y, sums = n_y, sums_dtype(n_y)
-        self._filters = np.zeros(0, np.dtype([
-            ("cause", "<i8"), ("is_step", "?"), ("size", "<f8"), ("onset_min", "<f8"), ("onset_sd_min", "<f8"),
-            ("reference_min", "<f8"), ("end_min", "<f8"), ("log_evidence", "<f8"), ("belief", "<f8", (n + n * n,)),
+        numbers = ("size", "onset_min", "onset_sd_min", "reference_min", "end_min", "largest_share", "log_evidence")
+        fields = [
+            *((name, "<i8") for name in ("cause", "is_step")),
+            *((name, "<f8") for name in numbers),
+            ("belief", "<f8", (n + n * n,)),
             *((name, sums[name]) for name in sums.names or ()),
-        ]))  # fmt: skip
+        ]
+        self._filters = np.zeros(0, np.dtype(fields))
         self._time_min = self._period_min = nan
         self._inputs: list[float] = []
         self._far = np.zeros(n_y, dtype=np.bool_)
@@ -113,6 +110,10 @@ class LivePosterior:
     def prepare(self) -> None:
         """Compile now what the first row would compile."""
         self._bank.step.prepare()
+        nothing = np.zeros(0, self._filters.dtype)
+        log_evidence_of_sums(np.zeros(1, sums_dtype(self._n_y))[0])
+        set_causes(np.zeros((0, 0)), 0, 0, nothing, 0.0, 0.0)
+        add_evidence(nothing, np.zeros((0, 0)), np.zeros(self._n_y, dtype=np.bool_), 0, SUMMED_ROWS)
 
     def start(
         self, members: Sequence[Member], without_fault: tuple[Array, Array], time_min: Array, inputs: Sequence[float]
@@ -133,6 +134,7 @@ class LivePosterior:
             row["cause"], row["is_step"], row["log_evidence"] = cause, known.profile == Step.name, known.log_evidence
             row["size"], row["onset_min"], row["onset_sd_min"] = known.size, known.onset_min, known.onset_sd_min
             row["end_min"], row["reference_min"] = item.end_min, min(item.end_min, last_min)
+            row["largest_share"] = _largest_share(known.effect, known.size)
             row["belief"] = _augment(item.x, item.covariance, item.slope, item.variance)
             for name in sums.dtype.names or ():
                 row[name] = sums[name]
@@ -189,36 +191,28 @@ class LivePosterior:
             after, outputs = self._step(belief, row, values)
         self._far, self._time_min = far, time_min
         self._filters["belief"] = after
-        self._limit_sizes()
-        self._add_evidence(outputs[:, 3 * n : 4 * n], outputs[:, 4 * n : 5 * n], np.isfinite(values))
-        return bool(np.isfinite(self._filters["log_evidence"][:-1]).any())
+        if add_evidence(self._filters, outputs, np.isfinite(values), self._bank.n_states - 1, SUMMED_ROWS):
+            finite = np.isfinite(self._filters["log_evidence"])  # a filter that has diverged names no cause any more
+            self._filters = self._filters[finite | (self._filters["cause"] == NO_FAULT)]
+        return self._filters.size > 1
 
     def suspects(self) -> list[Suspect]:
         """Posterior probabilities of the causes, most likely first."""
-        filters, n = self._filters[:-1], self._bank.n_states
-        shares, variances = filters["belief"][:, n - 1], filters["belief"][:, -1]
-        sizes = filters["size"] * self._growth(filters, self._time_min)
-        items = [
-            Evidence(
-                self._effects[int(row["cause"])],
-                float(row["log_evidence"]),
-                Step.name if row["is_step"] else Ramp.name,
-                float(size * share),
-                float(abs(size)) * max(float(variance), 0.0) ** 0.5,
-                float(row["onset_min"]),
-                float(row["onset_sd_min"]),
-            )
-            for row, size, share, variance in zip(filters, sizes, shares, variances, strict=True)
-        ]
-        best = filters[int(np.argmax(filters["log_evidence"]))]
-        none = float(best["log_evidence"]) + log_evidence_of_sums(best)
-        return rank_suspects(items, none, float(self._filters[-1]["log_evidence"]))
-
-    def _growth(self, filters: NDArray[np.void], time_min: float) -> Array:
-        """Size at a time relative to that in the last row of the look, shape (filters,)."""
-        age = np.minimum(time_min, filters["end_min"]) - filters["onset_min"]
-        span = filters["reference_min"] - filters["onset_min"]
-        return np.where(filters["is_step"], 1.0, age / np.where(filters["is_step"], 1.0, span))
+        filters, n, now = self._filters[:-1], self._bank.n_states, self._time_min
+        names = ("cause", "log_evidence", "size", "is_step", "onset_min", "onset_sd_min", "reference_min", "end_min")
+        columns = [filters[name].tolist() for name in names]
+        shares, variances = filters["belief"][:, n - 1].tolist(), filters["belief"][:, -1].tolist()
+        items = []
+        for share, variance, cause, log_evidence, size, is_step, onset_min, onset_sd_min, reference_min, end_min in zip(
+            shares, variances, *columns, strict=True
+        ):
+            size_now = size * growth(now, is_step, onset_min, reference_min, end_min)
+            size_sd, profile = abs(size_now) * max(variance, 0.0) ** 0.5, (Step if is_step else Ramp).name
+            effect = self._effects[cause]
+            items.append(Evidence(effect, log_evidence, profile, size_now * share, size_sd, onset_min, onset_sd_min))
+        best = int(np.argmax(filters["log_evidence"]))
+        none = items[best].log_evidence + log_evidence_of_sums(filters[best])
+        return rank_suspects(items, none, float(self._filters["log_evidence"][-1]))
 
     def _predict(self, before: Sequence[float], time_min: float, lost: int) -> tuple[Array, Array]:
         """Beliefs at the start of the last piece of an interval, and the arguments of the compiled step for it.
@@ -254,19 +248,10 @@ class LivePosterior:
         row = np.empty((filters.size, 2 * n_u + 3 + 2 * self._n_y))
         row[:, :n_u] = row[:, n_u : 2 * n_u] = self._bank.inputs
         row[:, :n_p], row[:, n_u : n_u + n_p] = before, inputs
-        of_cause = np.flatnonzero(filters["cause"] >= 0)
-        first = n_p + 2 * filters["cause"][of_cause]
-        begin, end = (self._size_at(of_cause, time_min) for time_min in (begin_min, end_min))
-        for block, mean, value in ((0, 0.5 * (begin + end), begin), (n_u, end, end)):
-            row[of_cause, block + first], row[of_cause, block + first + 1] = mean, value
+        set_causes(row, n_p, n_u + n_p, filters, begin_min, end_min)
         row[:, 2 * n_u], row[:, 2 * n_u + 1 : 2 * n_u + 3] = end_min, 0.5 * (end_min - begin_min)
         row[:, 2 * n_u + 3 :] = inf
         return row
-
-    def _size_at(self, of_cause: NDArray[np.intp], time_min: float) -> Array:
-        """Size of each filter's cause at a time and a relative size of 1."""
-        filters = self._filters[of_cause]
-        return np.asarray(filters["size"] * self._growth(filters, time_min))
 
     def _step(self, belief: Array, row: Array, measured: Array) -> tuple[Array, Array]:
         """Filter a row with these measured values; returns the beliefs and the outputs of the compiled step."""
@@ -276,29 +261,11 @@ class LivePosterior:
         after, outputs = (item.reshape(len(row), -1) for item in results)
         return after, outputs
 
-    def _limit_sizes(self) -> None:
-        """Keep each size within the bounds of its effect."""
-        n = self._bank.n_states
-        for row in self._filters[:-1]:
-            effect, size = self._effects[int(row["cause"])], float(row["size"])
-            largest = (effect.upper if size > 0.0 else effect.lower) / size if size else inf
-            row["belief"][n - 1] = min(max(float(row["belief"][n - 1]), 0.0), largest, MOST_SHARE)
 
-    def _add_evidence(self, w: Array, scale: Array, measured: NDArray[np.bool_]) -> None:
-        """Add a row's innovations, shape (filters, n_y), to the evidence of each filter."""
-        if not measured.any():
-            return
-        w, scale = np.where(measured, w, 0.0), np.where(measured, scale, 1.0)
-        fine = np.isfinite(w).all(axis=1) & (scale > 0.0).all(axis=1)
-        fine &= np.isfinite(self._filters["belief"]).all(axis=1)
-        self._filters["log_evidence"][~fine] = -inf
-        kept = fine | (self._filters["cause"] == NO_FAULT)  # a filter that has diverged names no cause any more
-        filters = self._filters = self._filters[kept]
-        w, scale = np.where(fine[:, None], w, 0.0)[kept], np.where(fine[:, None], scale, 1.0)[kept]
-        size = np.minimum(np.abs(w), DIVERGED)
-        loss = 0.5 * np.minimum(size, HUBER) ** 2 + HUBER * np.maximum(size - HUBER, 0.0)
-        filters["log_evidence"] -= np.sum(loss + np.log(scale), axis=1)
-        add_row(filters, w, measured)
+def _largest_share(effect: Effect, size: float) -> float:
+    """Largest relative size of a cause that is possible."""
+    bound = effect.upper if size > 0.0 else effect.lower
+    return min(bound / size, MOST_SHARE) if size else 1.0
 
 
 def _augment(x: Array, covariance: Array, slope: Array, variance: float) -> Array:

@@ -1,12 +1,13 @@
 """Evidence that more than noise is left in the innovations of a fitted hypothesis."""
 
-from math import log
+from math import inf, log
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
+from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.diagnosis.fitting.fault_filter import HUBER
 
 SUMMED_ROWS = (1, 5, 20)
@@ -57,32 +58,21 @@ def sums_of(w: Array, measured: NDArray[np.bool_]) -> np.void:
     return cast(np.void, sums)
 
 
-def add_row(sums: NDArray[np.void], w: Array, measured: NDArray[np.bool_]) -> None:
-    """Add a row to the sums of some hypotheses, shape (n,).
-
-    Args:
-        sums: records of `sums_dtype`, or with its fields.
-        w: normalised innovations, shape (n, n_y); 0 where not measured.
-        measured: mask of measured values, shape (n_y,).
-    """
-    sums["rows"] += 1
-    sums["sum"] += np.clip(w, -HUBER, HUBER)[:, None, :]
-    sums["summed"] += measured
-    full = sums["rows"][:, None, None] % np.array(SUMMED_ROWS)[:, None] == 0
-    counted = full & (sums["summed"] > 0)
-    sums["square"] += np.where(counted, sums["sum"] ** 2 / np.maximum(sums["summed"], 1.0), 0.0)
-    sums["count"] += counted
-    sums["sum"] *= ~full
-    sums["summed"] *= ~full
-
-
 def log_evidence_of_sums(sums: np.void) -> float:
     """Evidence as `log_evidence_of_residual`, from the sums of one hypothesis."""
-    square, count, evidence = sums["square"], sums["count"], []
-    variance = (TRAINING_VALUES + square[0]) / (TRAINING_VALUES + count[0])  # the first blocks are single rows
-    variance = np.clip(variance, 1.0 / LARGEST_VARIANCE, LARGEST_VARIANCE)
-    for total, n in zip(np.sum(square / variance, axis=1).tolist(), np.sum(count, axis=1).tolist(), strict=True):
-        if n:
+    return _log_evidence(sums["square"], sums["count"])
+
+
+@jit
+def _log_evidence(square: Array, count: Array) -> float:
+    best, n_y = -inf, square.shape[1]
+    for b in range(len(square)):
+        total = n = 0.0
+        for j in range(n_y):  # the first blocks are single rows
+            variance = (TRAINING_VALUES + square[0, j]) / (TRAINING_VALUES + count[0, j])
+            total += square[b, j] / min(max(variance, 1.0 / LARGEST_VARIANCE), LARGEST_VARIANCE)
+            n += count[b, j]
+        if n > 0.0:
             larger = 0.5 * (total - n - n * log(total / n)) if total > n else 0.0
-            evidence.append(larger - 0.5 * log(n))
-    return max(evidence, default=0.0) - log(len(SUMMED_ROWS))
+            best = max(best, larger - 0.5 * log(n))
+    return (best if best > -inf else 0.0) - log(len(square))
