@@ -20,8 +20,8 @@ from monitor_node.baseline.model_update import ScheduledChange
 from monitor_node.baseline.training import NO_VALUE
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
-from monitor_node.failures import Failures
-from monitor_node.health import NODE, Processed, health_message
+from monitor_node.health.failures import Failures
+from monitor_node.health.message import NODE, Processed, health_message
 from monitor_node.ingest.alignment import Aligner, Row
 from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, ReceiveStats
 from monitor_node.ingest.rejects import RejectCounter
@@ -29,12 +29,12 @@ from monitor_node.ingest.replay_filter import ReplayFilter
 from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, reject_reason
 from monitor_node.ingest.sample_units import make_sample_units
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
-from monitor_node.pipeline import PlantPipeline
-from monitor_node.process_settings import order_inputs
-from monitor_node.promise_stage import PromiseStage
+from monitor_node.pipeline.pipeline import PlantPipeline
+from monitor_node.pipeline.promise_stage import PromiseStage
+from monitor_node.pipeline.training_check import check_training
 from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
-from monitor_node.training_check import check_training
+from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.commands import decode_command
@@ -373,8 +373,9 @@ class Monitor:
 
     @property
     def changes(self) -> int:
-        """Count of changes that a restart must preserve: of alarms and of the baseline."""
-        return self.alarms.changes + (0 if self.baseline is None else self.baseline.id)
+        """Count of changes that a restart must preserve: of alarms, and of the baseline when accepted and executed."""
+        executed = 0 if self.baseline is None else self.baseline.id
+        return self.alarms.changes + 2 * executed + self.pipeline.pending_commands
 
     # --- diagnosis of the training ---------------------------------------------------------------------------
 
@@ -468,14 +469,14 @@ class Monitor:
     @property
     def promise(self) -> Promise | None:
         """Promise of false alarms, as it is now; None before the end of the training."""
-        promise = self.pipeline.promises.promise
-        return None if promise is None else promise.message(self.last_ns or 0, self.pipeline.rows_watched)
+        promise = self.pipeline.evaluation.promises.promise
+        return None if promise is None else promise.message(self.last_ns or 0, self.pipeline.evaluation.rows_watched)
 
     @property
     def excluded_signals(self) -> dict[str, str]:
         """Signals that are not monitored, with the reason: no value came, or the training could not use them."""
         never_came = (signal for signal in self._signals if signal not in self._heard_from_ns)
-        return dict.fromkeys(never_came, NO_VALUE) | self.pipeline.left_out
+        return dict.fromkeys(never_came, NO_VALUE) | self.pipeline.evaluation.left_out
 
     @property
     def refused_trainings(self) -> int:
@@ -485,7 +486,7 @@ class Monitor:
     @property
     def notes(self) -> list[str]:
         """Notes to log; the caller empties the list."""
-        notes, failures = self.pipeline.notes, self.failures.notes
+        notes, failures = self.pipeline.evaluation.notes, self.failures.notes
         notes += failures
         failures.clear()
         return notes
@@ -494,7 +495,7 @@ class Monitor:
 
     @property
     def _silence(self) -> SilenceCheck:
-        return self.pipeline.signals.silence
+        return self.pipeline.evaluation.signals.silence
 
     @property
     def receipts_ns(self) -> tuple[int | None, int | None]:
@@ -581,7 +582,7 @@ class Monitor:
             changes=self._changes,
             diagnose=self._diagnose,
             promises=PromiseStage(
-                self.config, self.failures, check=check_training, states_power=self._power, points=self._points
+                self.config, board, self.failures, check=check_training, states_power=self._power, points=self._points
             ),
         )
 
@@ -593,9 +594,9 @@ class Monitor:
         self.failures.add(stage, error, "the plant is learned again, its alarms stay")
         alarms = self.alarms.all_alarms()
         self._changes = deque(item for item in self._changes if item.at_ns is not None)  # findings on its training
-        notes, receipts_ns = self.pipeline.notes, self.receipts_ns
+        notes, receipts_ns = self.pipeline.evaluation.notes, self.receipts_ns
         self.pipeline = self._new_pipeline(self.alarms)
-        self.pipeline.notes, self.receipts_ns = notes, receipts_ns
+        self.pipeline.evaluation.notes, self.receipts_ns = notes, receipts_ns
         self._watching_since_ns = None
         self.resume_from_alarms(alarms)
 

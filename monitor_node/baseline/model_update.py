@@ -11,8 +11,9 @@ from typing import NamedTuple
 from monitor_node.baseline.commands import is_command
 from monitor_node.baseline.predictor import ArxPredictor, arx_structure
 from monitor_node.baseline.references import ProcessReference
-from monitor_node.baseline.training import Training, TrainingResult, TrainingState
+from monitor_node.baseline.training import Training, TrainingResult
 from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, Finding, read_equations
+from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract.messages_pb2 import Baseline
 from reactorwatch.diagnosis.result import NOMINAL
@@ -80,6 +81,11 @@ class ModelUpdate:
         if finding.verdict == FAILED:
             return f"not diagnosed: {finding.why}; the plant is judged by the equations as given"
         return "" if finding.verdict == NOMINAL else f"{finding.why}; the plant is judged by the equations as given"
+
+    @property
+    def commands(self) -> list[Baseline]:
+        """Changes by accepted commands that hold from the next row on, in order."""
+        return [item.baseline for item in self.changes if item.at_ns is None and is_command(item.baseline)]
 
     def pop_due(self, time_ns: int) -> Baseline | None:
         """The change that holds from a row on, with its time and number; None: there is none.

@@ -18,10 +18,10 @@ from monitor_node.fleet.monitor import Callbacks, FleetMonitor
 from monitor_node.fleet.partition import LeaseMonitor
 from monitor_node.fleet.sharding import ShardGroup
 from monitor_node.fleet.watched_kinds import ANY, PlantKind, WatchedKinds
-from monitor_node.health import NODE
+from monitor_node.health.message import NODE
+from monitor_node.health.other_monitors import OtherMonitors, log_report
 from monitor_node.ingest.pending import PlantHistory
 from monitor_node.ingest.rejects import RejectCounter
-from monitor_node.other_monitors import OtherMonitors, log_report
 from monitor_node.state.monitor_state import OtherSettingsError
 from monitor_node.state.seal import ForeignFileError
 from monitor_node.storage.fleet_states import FleetStates
@@ -96,7 +96,7 @@ class FleetNode(FleetMonitor):
         self._worker = DiagnosisWorker()
         self._lease = LeaseMonitor(lambda: bus.has_router)
         self._pending_subscriptions = len(self.subscriptions)
-        self._changed: set[str] = set()  # plants with a changed alarm since their state was stored
+        self._changed: set[str] = set()  # plants with a changed alarm or a command since their state was stored
         self._round: list[str] = []  # plants to check for new messages
         self._round_ns = self._poll_ns = start_ns
         self._stored_at: dict[str, int] = {}  # number of messages by plant when its state was stored
@@ -207,6 +207,9 @@ class FleetNode(FleetMonitor):
                 own.rejects.add("too_many_commands", refusal)
             return CommandReply(accepted=False, text=refusal), []
         reply, publications = super().on_command(question, now_ns)
+        if reply is not None and reply.accepted:
+            self._changed.add(topic.plant)
+            self._poll_ns = 0
         return reply, self._log_alarms(publications)
 
     def on_tick(self, now_ns: int) -> list[Publication]:

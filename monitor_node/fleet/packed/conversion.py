@@ -18,8 +18,7 @@ from monitor_node.alarms.incidents import Incident
 from monitor_node.alarms.kpis import KpiState
 from monitor_node.baseline.promise import NUMBERS, PromiseState
 from monitor_node.baseline.references import ProcessReferenceState
-from monitor_node.baseline.training import TrainingState
-from monitor_node.chart_stage import ChartsState, alarm_names
+from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.packed.pending import (
@@ -35,13 +34,14 @@ from monitor_node.fleet.packed.ring import NewestRows, times_ns_of
 from monitor_node.ingest.alignment import REMEMBERED, AlignmentState
 from monitor_node.ingest.sampling import SamplingState
 from monitor_node.isolation.stage import SuspicionState, has_causes
-from monitor_node.row_step import RowStep
+from monitor_node.pipeline.pipeline_state import PipelineState, TrainedState
+from monitor_node.pipeline.row_step import RowStep
 from monitor_node.signal_checks.spike import SpikeState
 from monitor_node.signal_checks.stage import SignalChecksState
 from monitor_node.signal_checks.stuck import Stuck
 from monitor_node.signal_checks.timeout import DataTimeout
+from monitor_node.stages.charts import ChartsState, alarm_names
 from monitor_node.state.monitor_state import MonitorState
-from monitor_node.state.pipeline_state import PipelineState, TrainedState
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import AlarmKpis
 from reactorwatch.contract.sample_bytes import unit_digest
@@ -149,6 +149,8 @@ class Conversion:
         pipeline = monitor.pipeline
         if monitor.is_replaying_history or monitor.phase != "watching" or not pipeline.is_normal:
             return None
+        if pipeline.pending_commands:
+            return None
         if None in monitor.receipts_ns or monitor.converts_samples:
             return None
         state = monitor.state
@@ -172,7 +174,7 @@ class Conversion:
         p = record[0]
         for name, number in asdict(monitor.stats).items():
             p[name] = number
-        p["receipts"] = pipeline.signals.silence.of_plant.receipts[0]
+        p["receipts"] = pipeline.evaluation.signals.silence.of_plant.receipts[0]
         write_runs(p, state.runs)
         p["received"], p["published"] = state.received, state.published
         p["first_ns"], p["watching_since_ns"] = state.first_ns, state.watching_since_ns
@@ -190,7 +192,7 @@ class Conversion:
             None if self._never_came_up(board) else monitor.alarms,
             state.refused or None,
             state.failures or None,
-            msgspec.msgpack.encode(pipeline.signals.trainings),
+            msgspec.msgpack.encode(pipeline.evaluation.signals.trainings),
             tuple(state.units[signal] for signal in self._signals),
             tuple(watched.checks),
             state.watch.refusals,

@@ -15,10 +15,11 @@ from monitor_node.fleet.packed.conversion import Conversion
 from monitor_node.fleet.packed.ring import kept_spacings, kept_values
 from monitor_node.fleet.packed.rows import NEW_MINUTE, step_rows
 from monitor_node.fleet.packed.samples import find_deadlines, take_samples
-from monitor_node.health import NODE, Processed, health_message
+from monitor_node.health.message import NODE, Processed, health_message
 from monitor_node.ingest.alignment import Counts, Row
 from monitor_node.ingest.receive_stats import STALL_NS, ReceiveStats
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE, USABLE
+from monitor_node.pipeline.row_step import words_of
 from monitor_node.state.monitor_state import learning_settings, seal_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
@@ -234,10 +235,8 @@ class PackedPlants:
         slots, step = self._slots, self._form.step
         step_rows(
             slots.plants,
-            slots.numbers,
-            step.scratch,
-            step.work,
-            step.settings,
+            words_of(slots.numbers),
+            step.frame,
             *slots.kalman,
             step.parameters,
             step.after,

@@ -13,8 +13,9 @@ from monitor_node.core import Monitor
 from monitor_node.fleet.monitor import FleetMonitor
 from monitor_node.fleet.sharding import WHOLE, ShardGroup
 from monitor_node.state.monitor_state import MonitorState
-from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm, Health, Quality, Sample
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication, encode_message
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, BaselineCommand, Health, Quality, Sample
 from reactorwatch.process.library.three_tanks.model import three_tanks
 
 from ..fleets import PLANTS, QUICK, alone, fleet, of, row_by_row, run_of, stage_by_stage
@@ -395,3 +396,24 @@ def test_the_health_of_a_quiet_plant_counts_what_its_own_monitor_counts() -> Non
     (said,) = (item.message for item in monitor.on_tick(now_ns) if isinstance(item.message, Health))
     (expected,) = (item.message for item in own.on_tick(now_ns) if isinstance(item.message, Health))
     assert said == expected
+
+
+def test_a_plant_is_not_packed_while_a_command_on_its_baseline_waits_for_the_next_row() -> None:
+    run = run_of("x", 16, span_min=31.0)
+    command = Encoded(
+        keys.key("x", keys.COMMAND, "baseline"),
+        *encode_message(BaselineCommand(what="relearn", by="Anna", why="new pump")),
+    )
+    monitor, own = fleet(ALL), stage_by_stage(ALL)
+    said = [item for begin in range(0, 900, 30) for item in monitor.on_messages(run[begin : begin + 30], 10**9 * begin)]
+    expected = [item for message in run[:900] for item in own.on_message(message, 0)]
+    assert monitor.quiet == ["x"]
+    for each in (monitor, own):
+        reply, _ = each.on_command(command, 900 * 10**9)
+        assert reply is not None
+        assert reply.accepted
+    for message in run[900:]:
+        said += monitor.on_messages([message], 900 * 10**9)
+        expected += own.on_message(message, 900 * 10**9)
+    assert [item.message.what for item in said if isinstance(item.message, Baseline)] == ["relearn"]
+    assert of("x", said) == of("x", expected)

@@ -9,8 +9,9 @@ import pytest
 
 from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
-from reactorwatch.contract.codec import Encoded
-from reactorwatch.contract.messages_pb2 import Health
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, encode_message
+from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, Health
 from reactorwatch.errors import InputError
 
 from ..samples import leaking_run, samples
@@ -135,3 +136,18 @@ def test_a_full_disk_is_told_once_counted_and_stops_no_watch(
     node.on_tick(320 * SECOND)
     assert stored_rows(config) == 100
     assert health(node, 330 * SECOND).not_stored == count + 1
+
+
+def test_an_accepted_command_on_the_baseline_is_stored_before_the_reply(
+    config: MonitorConfig, leak: list[Encoded]
+) -> None:
+    node = MonitorNode(config, 0)
+    for message in leak[:30]:
+        node.on_message(message, 0)
+    key = keys.key(config.plant, keys.COMMAND, "baseline")
+    command = BaselineCommand(what="relearn", by="Anna", why="new pump")
+    reply, _ = node.on_command(Encoded(key, *encode_message(command)), 0)
+    assert reply.accepted
+    resumed = MonitorNode(config, 0)
+    published = [item.message for message in leak[30:33] for item in resumed.on_message(message, 0)]
+    assert [item.what for item in published if isinstance(item, Baseline)] == ["relearn"]

@@ -1,0 +1,572 @@
+"""A row through all stages of a monitor in one compiled step, for one plant as for ten thousand.
+
+Most rows of most plants are alike: every signal has a value, the filter predicts it, no alarm changes. All that the
+stages then update are numbers: one record a plant, whose type is composed of the stages' own (`row_type`). A monitor of
+one plant steps over an array of one record, a fleet over one with a record for each plant; the steps themselves are in
+the stages' modules.
+
+The step is compiled once for all plants: it is given the addresses of the stages' arrays (`Frame`) rather than records,
+whose types, and so the machine code, would differ with the numbers of inputs, outputs and alarms.
+
+Any other row is an event, and changes nothing here: the stages process it one by one (`pipeline`), with the same
+numbers. Events are: a row after a gap or a missing row; one by which the filter restarts; a value out of the signal's
+range; a timeout; more equal readings than a sound sensor has; a residual that may be a spike; and a row that raises an
+alarm. A point beyond a limit that raises no alarm is no event.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monitor_node.alarms.on_off_delay import DELAY, add_point, is_normal, raises
+from monitor_node.baseline.black_box_reference import BlackBoxReference
+from monitor_node.baseline.references import GATE
+from monitor_node.baseline.resolution import quantise
+from monitor_node.baseline.signal_range import SignalRange, possible_ranges
+from monitor_node.config import MonitorConfig
+from monitor_node.ingest.sampling import TOLERANCE, WHOLE
+from monitor_node.signal_checks.catalogue import CHECKS
+from monitor_node.signal_checks.stuck import STUCK, is_stuck, take_reading
+from monitor_node.signal_checks.timeout import TIMEOUT, update_timeout
+from monitor_node.stages.charts import alarm_names
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import CompiledFunction
+from reactorwatch.codegen.numba_kernel import Entry, call_at, carray, jit, pointer_at
+from reactorwatch.identification.black_box.filter import JUDGED, filter_row
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, row_function
+from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.spc.charts.base import LARGEST_VALUE
+from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.cusum import _judge as judge_cusum
+from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.ewma import _judge as judge_ewma
+from reactorwatch.spc.charts.mewma import Mewma, count_numbers
+from reactorwatch.spc.charts.mewma import move as move_mewma
+from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.charts.shewhart import _judge as judge_shewhart
+from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, STATISTIC, X
+from reactorwatch.spc.prewhitening import WHITENER, expected_value, innovation
+
+ORDINARY, VIOLATING, EVENT = 0, 1, 2
+"""Verdict on a row: nothing happened; points beyond limits are remembered; nothing was changed."""
+
+CHARTS = (Shewhart.name, Ewma.name, Cusum.name, Mewma.name)
+"""Charts that the step has, in its order."""
+
+CHECKED = {"silence", "stuck", "spike", "range"}
+"""Signal checks that the step has."""
+
+MOST_PERIODS = 1.99 - WHOLE
+"""Between rows that are further apart one may be missing."""
+
+POINT = 5
+"""Numbers of a chart's point: those of a `Judgement`."""
+
+_SHEWHART, _EWMA, _CUSUM = Shewhart.numbers, Ewma.numbers, Cusum.numbers
+_COLUMNS = SETTINGS + max(_SHEWHART, _EWMA, _CUSUM)
+
+Records: TypeAlias = NDArray[np.void]
+Words: TypeAlias = NDArray[np.int64]
+
+LAST_NS = 0
+"""Word of a plant's numbers that is the time of its newest row."""
+
+HEAD = np.dtype([("last_ns", "i8"), ("period_ns", "f8"), ("time_min", "f8")])
+"""Time of the newest row; sampling period; time of the filter's newest row."""
+
+CONSTANTS = np.dtype(
+    [
+        ("filter_address", "i8"),  # address of the filter's machine code; 0: a black box
+        ("spacing_min", "f8", (2,)),  # shortest and longest time between two rows
+        ("silence_limit", "f8"),  # see `DataTimeout`
+        ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
+        ("reach", "f8"),  # see `is_normal`
+        ("weight", "f8"),  # weight of the MEWMA chart
+    ],
+    align=True,
+)
+"""Constants of a step whose number is the same for all plants."""
+
+
+def row_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
+    """Type of the numbers of a plant's stages, composed of the stages' own; the filter has its belief elsewhere.
+
+    Args:
+        inputs: number of inputs.
+        outputs: number of monitored outputs.
+        alarms: number of alarms that the charts can raise.
+    """
+    return np.dtype(
+        [
+            *((name, HEAD[name]) for name in HEAD.names or ()),
+            ("inputs", "f8", (inputs,)),  # inputs of that row
+            ("timeouts", TIMEOUT, (1 + inputs + outputs,)),  # of the plant, each input and each output
+            ("whiteners", WHITENER, (outputs,)),
+            ("stuck", STUCK, (outputs,)),
+            ("spike_limits", "f8", (outputs,)),
+            ("shewhart", "f8", (Shewhart.numbers, outputs)),
+            ("ewma", "f8", (Ewma.numbers, outputs)),
+            ("cusum", "f8", (Cusum.numbers, outputs)),
+            ("mewma", "f8", (count_numbers(outputs),)),
+            ("delays", DELAY, (max(alarms, 1),)),
+        ],
+        align=True,
+    )
+
+
+def work_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
+    """Type of the results of a step.
+
+    Args:
+        inputs: number of inputs.
+        outputs: number of monitored outputs.
+        alarms: number of alarms that the charts can raise.
+    """
+    return np.dtype(
+        [
+            ("new", "f8", (3 + 2 * inputs + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
+            ("outputs", "f8", (5 * outputs + 1,)),  # its results
+            ("expected", "f8", (outputs,)),  # expected values of the prewhitening filters
+            ("e", "f8", (outputs,)),  # prewhitened residuals
+            ("columns", "f8", (_COLUMNS, outputs)),  # columns of a bank of charts, see `compiled_chart`
+            ("points", "f8", (max(alarms, 1), POINT)),  # points of the charts, one row an alarm
+        ],
+        align=True,
+    )
+
+
+def settings_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
+    """Type of the constants of a step.
+
+    Args:
+        inputs: number of inputs.
+        outputs: number of monitored outputs.
+        alarms: number of alarms that the charts can raise.
+    """
+    return np.dtype(
+        [
+            ("constants", CONSTANTS),
+            ("resolutions", "f8", (outputs,)),  # stated resolution of each output; 0 where it is learned
+            ("ranges", "f8", (inputs + outputs, 2)),  # smallest and largest value of each signal
+            ("rules", "i8", (max(alarms, 1), 2)),  # violating points that raise each alarm, mask of its window
+        ],
+        align=True,
+    )
+
+
+class FilterNumbers(NamedTuple):
+    """Numbers of the filters of some plants.
+
+    Attributes:
+        belief: state and covariance, shape (plants, states + states^2); of a black box see `BlackBoxFilter`.
+        variances: variances of the sensors and of the process, shape (plants, outputs + states); of a black box all
+            its constants.
+    """
+
+    belief: Array
+    variances: Array
+
+
+class Plant(NamedTuple):
+    """Numbers of a plant's stages, see `row_type`; within the compiled step."""
+
+    head: Any
+    inputs: Array
+    timeouts: Any
+    whiteners: Any
+    stuck: Any
+    spike_limits: Array
+    shewhart: Array
+    ewma: Array
+    cusum: Array
+    mewma: Array
+    delays: Any
+
+
+class Work(NamedTuple):
+    """Results of a step, see `work_type`; within the compiled step."""
+
+    new: Array
+    outputs: Array
+    expected: Array
+    e: Array
+    columns: Array
+    points: Array
+
+
+class Settings(NamedTuple):
+    """Constants of a step, see `settings_type`; within the compiled step."""
+
+    constants: Any
+    resolutions: Array
+    ranges: Array
+    rules: Words
+
+
+_FIRST = 3
+_P = _FIRST + len(HEAD.names or ()) - 1  # `head` takes the place of its three fields
+_WORK = _P + len(Plant._fields)
+_SETTINGS = _WORK + len(Work._fields)
+
+
+def frame_of(sizes: tuple[int, int, int], scratch: Records, work: Records, settings: Records) -> Words:
+    """Where the compiled step finds its arrays, which the caller keeps alive.
+
+    Args:
+        sizes: numbers of inputs, outputs and alarms.
+        scratch: numbers of one plant, shape (1,), see `row_type`.
+        work: shape (1,), see `work_type`.
+        settings: shape (1,), see `settings_type`.
+
+    Returns:
+        the sizes, then the addresses of the fields.
+    """
+    addresses = [
+        records[name].ctypes.data for records in (scratch, work, settings) for name in records.dtype.names or ()
+    ]
+    return np.array([*sizes, *addresses], dtype=np.int64)
+
+
+def words_of(numbers: Records) -> Words:
+    """Numbers of plants as words, shape (plants, words): a view."""
+    words: Words = numbers.view(np.int64).reshape(len(numbers), -1)
+    return words
+
+
+@jit
+def _plant_at(frame: Words) -> Plant:
+    inputs, outputs, alarms = frame[0], frame[1], max(frame[2], 1)
+    return Plant(
+        carray(pointer_at(frame[_FIRST]), (1,), HEAD),
+        carray(pointer_at(frame[_P + 1]), (inputs,), np.float64),
+        carray(pointer_at(frame[_P + 2]), (1 + inputs + outputs,), TIMEOUT),
+        carray(pointer_at(frame[_P + 3]), (outputs,), WHITENER),
+        carray(pointer_at(frame[_P + 4]), (outputs,), STUCK),
+        carray(pointer_at(frame[_P + 5]), (outputs,), np.float64),
+        carray(pointer_at(frame[_P + 6]), (_SHEWHART, outputs), np.float64),
+        carray(pointer_at(frame[_P + 7]), (_EWMA, outputs), np.float64),
+        carray(pointer_at(frame[_P + 8]), (_CUSUM, outputs), np.float64),
+        carray(pointer_at(frame[_P + 9]), (1 + 2 * outputs + 2 * outputs * outputs,), np.float64),
+        carray(pointer_at(frame[_P + 10]), (alarms,), DELAY),
+    )
+
+
+@jit
+def _work_at(frame: Words) -> Work:
+    inputs, outputs, alarms = frame[0], frame[1], max(frame[2], 1)
+    return Work(
+        carray(pointer_at(frame[_WORK]), (3 + 2 * inputs + 2 * outputs,), np.float64),
+        carray(pointer_at(frame[_WORK + 1]), (5 * outputs + 1,), np.float64),
+        carray(pointer_at(frame[_WORK + 2]), (outputs,), np.float64),
+        carray(pointer_at(frame[_WORK + 3]), (outputs,), np.float64),
+        carray(pointer_at(frame[_WORK + 4]), (_COLUMNS, outputs), np.float64),
+        carray(pointer_at(frame[_WORK + 5]), (alarms, POINT), np.float64),
+    )
+
+
+@jit
+def _settings_at(frame: Words) -> Settings:
+    inputs, outputs, alarms = frame[0], frame[1], max(frame[2], 1)
+    return Settings(
+        carray(pointer_at(frame[_SETTINGS]), (1,), CONSTANTS),
+        carray(pointer_at(frame[_SETTINGS + 1]), (outputs,), np.float64),
+        carray(pointer_at(frame[_SETTINGS + 2]), (inputs + outputs, 2), np.float64),
+        carray(pointer_at(frame[_SETTINGS + 3]), (alarms, 2), np.int64),
+    )
+
+
+@jit
+def _predict(
+    p: Any,
+    belief: Array,
+    variances: Array,
+    parameters: Array,
+    after: Array,
+    work: Any,
+    settings: Any,
+    time_min: float,
+    values: Array,
+) -> bool:
+    """Filter a row that is not too far from the one before; returns True if all went well."""
+    inputs, new, constants = p.inputs.size, work.new, settings.constants[0]
+    count = values.size - inputs
+    spacing_min = time_min - p.head[0].time_min
+    if not constants.spacing_min[0] < spacing_min <= constants.spacing_min[1]:
+        return False
+    step = 0.5 * spacing_min
+    for i in range(inputs):
+        new[i], new[inputs + i] = p.inputs[i], values[i]
+    row = 2 * inputs
+    new[row], new[row + 1], new[row + 2] = time_min, step, step
+    for i in range(count):
+        new[row + 3 + i], new[row + 3 + count + i] = values[inputs + i], GATE
+    first = parameters.size - variances.size
+    for i in range(variances.size):
+        parameters[first + i] = variances[i]
+    if constants.filter_address == 0:
+        return filter_row(belief, new, parameters, after, work.outputs) == JUDGED
+    before, given, fixed = belief.ctypes.data, new.ctypes.data, parameters.ctypes.data
+    call_at(constants.filter_address, (1, before, given, fixed, after.ctypes.data, work.outputs.ctypes.data))
+    return bool(work.outputs[work.outputs.size - 1] != 0.0)
+
+
+@jit
+def _add_point(p: Any, point: Array, settings: Any, alarm: int) -> int:
+    """Update the delay of an alarm that is not active with the point of its chart; returns the verdict."""
+    is_out = point[4] > 0.0
+    if not (is_out or p.recent):
+        return ORDINARY
+    normal = not is_out and is_normal(point[0], point[1], point[2], point[3], p.above != 0, settings.constants[0].reach)
+    p.recent, p.in_a_row = add_point(p.recent, p.in_a_row, settings.rules[alarm, 1], is_out, normal)
+    return EVENT if raises(p.recent, settings.rules[alarm, 0], is_out) else VIOLATING
+
+
+@jit
+def _lay_out(columns: Array, numbers: Array, e: Array) -> None:
+    """Fill the columns of a bank: a new value for each chart."""
+    for i in range(e.size):
+        columns[X, i], columns[PRESENT, i] = e[i], 1.0
+        for row in range(numbers.shape[0]):
+            columns[SETTINGS + row, i] = numbers[row, i]
+
+
+@jit
+def _take_points(p: Any, work: Any, numbers: Array, settings: Any, first: int) -> int:
+    """Take over what a bank of charts has computed; returns the verdict."""
+    columns, points, verdict = work.columns, work.points, ORDINARY
+    for i in range(numbers.shape[1]):
+        for row in range(numbers.shape[0]):
+            numbers[row, i] = columns[SETTINGS + row, i]
+        for k in range(POINT):
+            points[first + i, k] = columns[STATISTIC + k, i]
+        verdict = max(verdict, _add_point(p.delays[first + i], points[first + i], settings, first + i))
+    return verdict
+
+
+@jit
+def _update_charts(p: Any, work: Any, settings: Any) -> int:
+    """Update the charts with the prewhitened residuals; returns the verdict."""
+    constants, columns, e, verdict = settings.constants[0], work.columns, work.e, ORDINARY
+    charts = constants.charts
+    if charts[0] >= 0:
+        _lay_out(columns, p.shewhart, e)
+        judge_shewhart(columns)
+        verdict = max(verdict, _take_points(p, work, p.shewhart, settings, charts[0]))
+    if charts[1] >= 0:
+        _lay_out(columns, p.ewma, e)
+        judge_ewma(columns)
+        verdict = max(verdict, _take_points(p, work, p.ewma, settings, charts[1]))
+    if charts[2] >= 0:
+        _lay_out(columns, p.cusum, e)
+        judge_cusum(columns)
+        verdict = max(verdict, _take_points(p, work, p.cusum, settings, charts[2]))
+    if charts[3] >= 0:
+        statistic, limit, point = move_mewma(p.mewma, e, constants.weight), p.mewma[0], work.points[charts[3]]
+        if statistic < 0.0:
+            return EVENT
+        point[0], point[1], point[2], point[3] = statistic, float(e.size), 0.0, limit
+        point[4] = 1.0 if statistic > limit else 0.0
+        verdict = max(verdict, _add_point(p.delays[charts[3]], point, settings, charts[3]))
+    return verdict
+
+
+@jit
+def step(
+    numbers: Words,
+    frame: Words,
+    beliefs: Array,
+    variances: Array,
+    parameters: Array,
+    after: Array,
+    plant: int,
+    time_ns: int,
+    time_min: float,
+    values: Array,
+) -> int:
+    """Take a row through all stages; returns the verdict.
+
+    Args:
+        numbers: numbers of the plants, see `words_of`.
+        frame: see `frame_of`.
+        beliefs: beliefs of the filters, see `FilterNumbers`.
+        variances: variances of the filters, see `FilterNumbers`.
+        parameters: parameters of the model, and room for the variances, shape (parameters + outputs + states,).
+        after: belief of a filter, to work in.
+        plant: index of the plant.
+        time_ns: time of the row.
+        time_min: the same in minutes.
+        values: values of the row, the inputs first.
+    """
+    scratch = carray(pointer_at(frame[_FIRST]), (numbers.shape[1],), np.int64)
+    for i in range(scratch.size):
+        scratch[i] = numbers[plant, i]
+    p, work, settings = _plant_at(frame), _work_at(frame), _settings_at(frame)
+    head = p.head[0]
+    spacing_ns = time_ns - head.last_ns
+    if spacing_ns <= 0 or float(spacing_ns) > MOST_PERIODS * head.period_ns:
+        return EVENT
+    for i in range(values.size):
+        if not settings.ranges[i, 0] <= values[i] <= settings.ranges[i, 1]:
+            return EVENT
+    belief = beliefs[plant]
+    if not _predict(p, belief, variances[plant], parameters, after, work, settings, time_min, values):
+        return EVENT
+    for i in range(p.timeouts.size):
+        if update_timeout(p.timeouts[i], time_ns, True, settings.constants[0].silence_limit, -1)[0]:
+            return EVENT
+    inputs = p.inputs.size
+    outputs = values.size - inputs
+    for i in range(outputs):
+        value, whitener = values[inputs + i], p.whiteners[i]
+        take_reading(p.stuck[i], quantise(value, settings.resolutions[i]))
+        if is_stuck(p.stuck[i]):
+            return EVENT
+        work.expected[i] = expected_value(whitener)
+        work.e[i] = innovation(whitener, (value - work.outputs[i]) / work.outputs[2 * outputs + i])
+        if not (abs(work.e[i]) <= p.spike_limits[i] and abs(work.e[i]) < LARGEST_VALUE):
+            return EVENT
+    verdict = _update_charts(p, work, settings)
+    if verdict == EVENT:
+        return EVENT
+    head.last_ns, head.time_min = time_ns, time_min
+    for i in range(inputs):
+        p.inputs[i] = values[i]
+    for i in range(belief.size):
+        belief[i] = after[i]
+    for i in range(scratch.size):
+        numbers[plant, i] = scratch[i]
+    return verdict
+
+
+_STEP = Entry(step)
+
+
+class RowFilter(NamedTuple):
+    """Filter of a step.
+
+    Attributes:
+        address: address of its machine code; 0: a black box.
+        belief: size of its belief.
+        parameters: parameters of the equations; none for a black box, whose constants are those of a plant.
+        constants: number of the other constants, see `FilterNumbers.variances`.
+        spacing_min: shortest and longest time between two rows, in minutes.
+        code: owner of the machine code.
+    """
+
+    address: int
+    belief: int
+    parameters: Array
+    constants: int
+    spacing_min: tuple[float, float]
+    code: CompiledFunction | None = None
+
+
+class RowStep:
+    """The step for plants with certain settings.
+
+    Args:
+        config: settings of the plants' monitors.
+        row_filter: filter of the plants.
+        ranges: ranges of each input and of each output.
+
+    Attributes:
+        numbers_type: type of the numbers of a plant's stages.
+        filter_sizes: sizes of belief and variances of a filter.
+        parameters: parameters of the model, and room for the variances of a filter.
+        work: results of the newest step, shape (1,).
+        frame: see `frame_of`.
+        after: belief of a filter, to work in.
+    """
+
+    def __init__(self, config: MonitorConfig, row_filter: RowFilter, ranges: Sequence[SignalRange]) -> None:
+        kinds = [chart for chart, _ in alarm_names(config)]
+        sizes = len(config.inputs), len(config.outputs), len(kinds)
+        self._code = row_filter.code
+        self.numbers_type = numbers_type(config)
+        self.filter_sizes = row_filter.belief, row_filter.constants
+        self._settings = np.zeros(1, settings_type(*sizes))
+        p = self._settings[0]
+        constants = p["constants"]
+        constants["filter_address"], constants["spacing_min"] = row_filter.address, row_filter.spacing_min
+        constants["silence_limit"] = config.silence_periods
+        p["resolutions"] = [config.resolution.get(name, 0.0) for name in config.outputs]
+        p["ranges"] = [[item.lower, item.upper] for item in ranges]
+        constants["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
+        for i, kind in enumerate(kinds):
+            p["rules"][i] = (1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1)
+        constants["reach"], constants["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
+        self.work = np.zeros(1, work_type(*sizes))
+        self._scratch = np.zeros(1, self.numbers_type)
+        self.frame = frame_of(sizes, self._scratch, self.work, self._settings)
+        self._numbers, self._words = self._scratch, words_of(self._scratch)
+        self.after: Array = np.empty(row_filter.belief)
+        self.parameters: Array = np.concatenate([row_filter.parameters, np.empty(row_filter.constants)])
+
+    @staticmethod
+    def of(
+        config: MonitorConfig, model: ProcessModel | None, ranges: Sequence[SignalRange] | None = None
+    ) -> "RowStep | None":
+        """The step for plants with these settings; None if their rows are not such that it could take them.
+
+        Args:
+            config: settings of the plants' monitors.
+            model: model by which the plants are judged; None: there is none.
+            ranges: ranges of each input and of each output; None: those of the model.
+        """
+        if model is None or model.breakpoints or not has_step(config):
+            return None
+        if (model.input_names, model.output_names) != (config.inputs, config.outputs):
+            return None
+        outputs, states = len(config.outputs), len(model.states)
+        belief, spacing_min = states + states**2, (0.0, LONGEST_ROW_MIN)
+        code = compiled_filter(model)
+        row_filter = RowFilter(code.address, belief, model.values(), outputs + states, spacing_min, code)
+        return RowStep(config, row_filter, ranges or possible_ranges(config, model))
+
+    @staticmethod
+    def of_black_box(
+        config: MonitorConfig, reference: BlackBoxReference, ranges: Sequence[SignalRange]
+    ) -> "RowStep | None":
+        """The step for a plant with a black box; None if its rows are not such that it could take them.
+
+        Args:
+            config: settings of the plant's monitor.
+            reference: reference of the plant.
+            ranges: ranges of each input and of each output.
+        """
+        if not has_step(config):
+            return None
+        belief, constants = reference.numbers
+        shortest, longest = ((1.0 + sign * TOLERANCE) * reference.period_min for sign in (-1.0, 1.0))
+        return RowStep(config, RowFilter(0, belief.size, np.empty(0), constants.size, (shortest, longest)), ranges)
+
+    def update(self, numbers: Records, kalman: FilterNumbers, time_ns: int, time_min: float, values: Array) -> int:
+        """Take a row of one plant through all stages; returns the verdict."""
+        if numbers is not self._numbers:
+            self._numbers, self._words = numbers, words_of(numbers)
+        verdict: int = _STEP.call(
+            self._words, self.frame, *kalman, self.parameters, self.after, 0, time_ns, time_min, values
+        )
+        return verdict
+
+
+def has_step(config: MonitorConfig) -> bool:
+    """True if the step has the charts and checks of these settings."""
+    if not config.inputs or {check.name for check in CHECKS} != CHECKED or not set(config.charts) <= set(CHARTS):
+        return False
+    return len(config.outputs) > 1 or Mewma.name not in config.charts
+
+
+def numbers_type(config: MonitorConfig) -> np.dtype[Any]:
+    """Type of the numbers of the stages of a plant with these settings."""
+    return row_type(len(config.inputs), len(config.outputs), len(alarm_names(config)))
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def compiled_filter(model: ProcessModel) -> CompiledFunction:
+    """Machine code of the filter of a model, row by row."""
+    return CompiledFunction(row_function(model))
