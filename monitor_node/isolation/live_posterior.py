@@ -70,6 +70,7 @@ class LivePosteriorState(StoredState, frozen=True):
         period_min: sampling period.
         inputs: last known inputs.
         far: flags of the outputs whose last value was far from every prediction.
+        published: probability of each filter, and last that of none, when suspects were published last.
     """
 
     causes: list[str]
@@ -78,6 +79,7 @@ class LivePosteriorState(StoredState, frozen=True):
     period_min: float
     inputs: list[float]
     far: list[bool]
+    published: list[float]
 
 
 class LivePosterior:
@@ -105,6 +107,7 @@ class LivePosterior:
         self._filters = np.zeros(0, np.dtype(fields))
         self._time_min = self._period_min = nan
         self._inputs: list[float] = []
+        self._published = np.empty(0)
         self._far = np.zeros(n_y, dtype=np.bool_)
 
     def prepare(self) -> None:
@@ -143,15 +146,14 @@ class LivePosterior:
         nothing["belief"] = _augment(*without_fault, np.zeros(len(without_fault[0])), 0.0)
         self._time_min, self._period_min = last_min, float(np.median(np.diff(time_min)))
         self._inputs, self._far = list(inputs), np.zeros(self._n_y, dtype=np.bool_)
+        self.note_published()
 
     @property
     def state(self) -> LivePosteriorState:
         """A copy of the state."""
-        names = [effect.name for effect in self._effects]
-        numbers = self._filters.tobytes()
-        return LivePosteriorState(
-            names, numbers, self._time_min, self._period_min, list(self._inputs), self._far.tolist()
-        )
+        names, numbers = [effect.name for effect in self._effects], self._filters.tobytes()
+        far, published = self._far.tolist(), self._published.tolist()
+        return LivePosteriorState(names, numbers, self._time_min, self._period_min, list(self._inputs), far, published)
 
     def restore(self, state: LivePosteriorState) -> bool:
         """Resume from a state; returns false if it is of other causes or another model.
@@ -164,6 +166,7 @@ class LivePosterior:
         self._filters = np.frombuffer(state.filters, self._filters.dtype).copy()
         self._time_min, self._period_min = state.time_min, state.period_min
         self._inputs, self._far = list(state.inputs), np.array(state.far, dtype=np.bool_)
+        self._published = np.array(state.published)
         return True
 
     def update(self, time_min: float, inputs: Sequence[float], measured: Sequence[float]) -> bool:
@@ -213,6 +216,23 @@ class LivePosterior:
         best = int(np.argmax(filters["log_evidence"]))
         none = items[best].log_evidence + log_evidence_of_sums(filters[best])
         return rank_suspects(items, none, float(self._filters["log_evidence"][-1]))
+
+    def has_moved(self, least: float) -> bool:
+        """Return true if a probability may have changed by `least` since `note_published`; a quick check."""
+        before = self._published
+        return before.size != self._filters.size + 1 or bool(np.sum(np.abs(self._shares() - before)) >= least)
+
+    def note_published(self) -> None:
+        """Note that the suspects are published as they are now."""
+        self._published = self._shares()
+
+    def _shares(self) -> Array:
+        """Probability of each filter, and last that of none of the causes."""
+        evidence = self._filters["log_evidence"]
+        best = int(np.argmax(evidence[:-1]))
+        weights = np.append(evidence, evidence[best] + log_evidence_of_sums(self._filters[best]))
+        weights = np.exp(weights - np.max(weights))
+        return np.asarray(weights / np.sum(weights))
 
     def _predict(self, before: Sequence[float], time_min: float, lost: int) -> tuple[Array, Array]:
         """Beliefs at the start of the last piece of an interval, and the arguments of the compiled step for it.

@@ -7,8 +7,8 @@ then the rows since the alarm are kept, and `ROWS_BEFORE` before it: a slow ramp
 onset. A plant without an unexplained alarm keeps `isolation_rows` rows.
 
 Between looks and after the last one the probabilities follow the rows (`live_posterior`). They are published when one
-has moved by `WORTH_PUBLISHING`, or another cause becomes likelier than all others together. If the rows come to
-contradict what the last look named, as when a ramp ends, the next look is taken at once.
+has moved by `WORTH_PUBLISHING`. If the rows come to contradict what the last look named, as when a ramp ends, the next
+look is taken at once.
 
 The result depends on the samples alone. While the most likely cause is a sensor, its true reading is reconstructed.
 """
@@ -270,14 +270,18 @@ class Suspicion:
         if not live.update(time_ns / MINUTE_NS, inputs, measured):
             self._live = None
             return []
-        suspects, before, since = live.suspects(), self._published, self._since or 0
+        before, since = self._published, self._since or 0
+        is_unknown = max(before, key=before.__getitem__, default="") == UNKNOWN
+        if not (is_unknown or live.has_moved(WORTH_PUBLISHING - LEAST)):  # suspects below `LEAST` are not published
+            return []
+        suspects = live.suspects()
         if suspects[0].cause == UNKNOWN and suspects[0].probability > CONVINCED and self._may_look_early(since):
             return self._look(time_ns, since)
         probabilities = {item.cause: item.probability for item in suspects}
         changes = (abs(probabilities.get(cause, 0.0) - before.get(cause, 0.0)) for cause in {*probabilities, *before})
-        is_other = suspects[0].cause != max(before, key=before.__getitem__, default="")
-        if max(changes) < WORTH_PUBLISHING and not (is_other and suspects[0].probability >= CONVINCED):
+        if max(changes) < WORTH_PUBLISHING:
             return []
+        live.note_published()
         return self._publish(time_ns, suspects)
 
     def _publish(self, time_ns: int, suspects: Sequence[Suspect], *, stopped: bool = False) -> list[Publication]:
