@@ -8,7 +8,8 @@ from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.references import ProcessReference, Reference
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
-from monitor_node.pipeline.row_step import FilterNumbers, Records, RowStep, numbers_type
+from monitor_node.pipeline.row_frame import Records
+from monitor_node.pipeline.row_step import FilterNumbers, RowStep, numbers_type
 from reactorwatch.arrays import Array
 from reactorwatch.records.record import MINUTE_NS
 
@@ -21,7 +22,7 @@ class OrdinaryRows:
         ranges: ranges of each input and of each output.
 
     Attributes:
-        numbers: numbers of the stages, shape (1,), see `row_step.row_type`.
+        numbers: numbers of the stages, shape (1,), see `row_frame.row_type`.
         kalman: numbers of the filter; None where there is no step.
     """
 

@@ -31,7 +31,8 @@ from monitor_node.pipeline.operating_modes import OperatingModes
 from monitor_node.pipeline.operation import Operation
 from monitor_node.pipeline.pipeline_state import PipelineState
 from monitor_node.pipeline.promise_stage import PromiseStage
-from monitor_node.pipeline.row_step import FilterNumbers, Records
+from monitor_node.pipeline.row_frame import Records
+from monitor_node.pipeline.row_step import FilterNumbers
 from monitor_node.pipeline.training_stage import TIMES_FEWEST, TrainingStage
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication

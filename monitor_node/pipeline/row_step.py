@@ -1,12 +1,9 @@
 """A row through all stages of a monitor in one compiled step, for one plant as for ten thousand.
 
 Most rows of most plants are alike: every signal has a value, the filter predicts it, no alarm changes. All that the
-stages then update are numbers: one record a plant, whose type is composed of the stages' own (`row_type`). A monitor of
-one plant steps over an array of one record, a fleet over one with a record for each plant; the steps themselves are in
-the stages' modules.
-
-The step is compiled once for all plants: it is given the addresses of the stages' arrays (`Frame`) rather than records,
-whose types, and so the machine code, would differ with the numbers of inputs, outputs and alarms.
+stages then update are numbers: one record a plant (`row_frame`). A monitor of one plant steps over an array of one
+record, a fleet over one with a record for each plant; the steps themselves are in the stages' modules. The step is the
+same machine code for all plants.
 
 Any other row is an event, and changes nothing here: the stages process it one by one (`pipeline`), with the same
 numbers. Events are: a row after a gap or a missing row; one by which the filter restarts; a value out of the signal's
@@ -16,146 +13,61 @@ alarm. A point beyond a limit that raises no alarm is no event.
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from monitor_node.alarms.on_off_delay import DELAY, add_point, is_normal, raises
+from monitor_node.alarms.on_off_delay import add_point, is_normal, raises
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.references import GATE
 from monitor_node.baseline.resolution import quantise
 from monitor_node.baseline.signal_range import SignalRange, possible_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import TOLERANCE, WHOLE
+from monitor_node.pipeline.row_frame import (
+    CHARTS,
+    POINT,
+    Records,
+    Words,
+    frame_of,
+    plant_at,
+    row_type,
+    scratch_at,
+    settings_at,
+    settings_type,
+    words_of,
+    work_at,
+    work_type,
+)
 from monitor_node.signal_checks.catalogue import CHECKS
-from monitor_node.signal_checks.stuck import STUCK, is_stuck, take_reading
-from monitor_node.signal_checks.timeout import TIMEOUT, update_timeout
+from monitor_node.signal_checks.stuck import is_stuck, take_reading
+from monitor_node.signal_checks.timeout import update_timeout
 from monitor_node.stages.charts import alarm_names
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
-from reactorwatch.codegen.numba_kernel import Entry, call_at, carray, jit, pointer_at
+from reactorwatch.codegen.numba_kernel import Entry, call_at, jit
 from reactorwatch.identification.black_box.filter import JUDGED, filter_row
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, row_function
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc.charts.base import LARGEST_VALUE
-from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.cusum import _judge as judge_cusum
-from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.ewma import _judge as judge_ewma
-from reactorwatch.spc.charts.mewma import Mewma, count_numbers
+from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.mewma import move as move_mewma
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.charts.shewhart import _judge as judge_shewhart
 from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, STATISTIC, X
-from reactorwatch.spc.prewhitening import WHITENER, expected_value, innovation
+from reactorwatch.spc.prewhitening import expected_value, innovation
 
 ORDINARY, VIOLATING, EVENT = 0, 1, 2
 """Verdict on a row: nothing happened; points beyond limits are remembered; nothing was changed."""
-
-CHARTS = (Shewhart.name, Ewma.name, Cusum.name, Mewma.name)
-"""Charts that the step has, in its order."""
 
 CHECKED = {"silence", "stuck", "spike", "range"}
 """Signal checks that the step has."""
 
 MOST_PERIODS = 1.99 - WHOLE
 """Between rows that are further apart one may be missing."""
-
-POINT = 5
-"""Numbers of a chart's point: those of a `Judgement`."""
-
-_SHEWHART, _EWMA, _CUSUM = Shewhart.numbers, Ewma.numbers, Cusum.numbers
-_COLUMNS = SETTINGS + max(_SHEWHART, _EWMA, _CUSUM)
-
-Records: TypeAlias = NDArray[np.void]
-Words: TypeAlias = NDArray[np.int64]
-
-LAST_NS = 0
-"""Word of a plant's numbers that is the time of its newest row."""
-
-HEAD = np.dtype([("last_ns", "i8"), ("period_ns", "f8"), ("time_min", "f8")])
-"""Time of the newest row; sampling period; time of the filter's newest row."""
-
-CONSTANTS = np.dtype(
-    [
-        ("filter_address", "i8"),  # address of the filter's machine code; 0: a black box
-        ("spacing_min", "f8", (2,)),  # shortest and longest time between two rows
-        ("silence_limit", "f8"),  # see `DataTimeout`
-        ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
-        ("reach", "f8"),  # see `is_normal`
-        ("weight", "f8"),  # weight of the MEWMA chart
-    ],
-    align=True,
-)
-"""Constants of a step whose number is the same for all plants."""
-
-
-def row_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
-    """Type of the numbers of a plant's stages, composed of the stages' own; the filter has its belief elsewhere.
-
-    Args:
-        inputs: number of inputs.
-        outputs: number of monitored outputs.
-        alarms: number of alarms that the charts can raise.
-    """
-    return np.dtype(
-        [
-            *((name, HEAD[name]) for name in HEAD.names or ()),
-            ("inputs", "f8", (inputs,)),  # inputs of that row
-            ("timeouts", TIMEOUT, (1 + inputs + outputs,)),  # of the plant, each input and each output
-            ("whiteners", WHITENER, (outputs,)),
-            ("stuck", STUCK, (outputs,)),
-            ("spike_limits", "f8", (outputs,)),
-            ("shewhart", "f8", (Shewhart.numbers, outputs)),
-            ("ewma", "f8", (Ewma.numbers, outputs)),
-            ("cusum", "f8", (Cusum.numbers, outputs)),
-            ("mewma", "f8", (count_numbers(outputs),)),
-            ("delays", DELAY, (max(alarms, 1),)),
-        ],
-        align=True,
-    )
-
-
-def work_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
-    """Type of the results of a step.
-
-    Args:
-        inputs: number of inputs.
-        outputs: number of monitored outputs.
-        alarms: number of alarms that the charts can raise.
-    """
-    return np.dtype(
-        [
-            ("new", "f8", (3 + 2 * inputs + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
-            ("outputs", "f8", (5 * outputs + 1,)),  # its results
-            ("expected", "f8", (outputs,)),  # expected values of the prewhitening filters
-            ("e", "f8", (outputs,)),  # prewhitened residuals
-            ("columns", "f8", (_COLUMNS, outputs)),  # columns of a bank of charts, see `compiled_chart`
-            ("points", "f8", (max(alarms, 1), POINT)),  # points of the charts, one row an alarm
-        ],
-        align=True,
-    )
-
-
-def settings_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
-    """Type of the constants of a step.
-
-    Args:
-        inputs: number of inputs.
-        outputs: number of monitored outputs.
-        alarms: number of alarms that the charts can raise.
-    """
-    return np.dtype(
-        [
-            ("constants", CONSTANTS),
-            ("resolutions", "f8", (outputs,)),  # stated resolution of each output; 0 where it is learned
-            ("ranges", "f8", (inputs + outputs, 2)),  # smallest and largest value of each signal
-            ("rules", "i8", (max(alarms, 1), 2)),  # violating points that raise each alarm, mask of its window
-        ],
-        align=True,
-    )
 
 
 class FilterNumbers(NamedTuple):
@@ -169,114 +81,6 @@ class FilterNumbers(NamedTuple):
 
     belief: Array
     variances: Array
-
-
-class Plant(NamedTuple):
-    """Numbers of a plant's stages, see `row_type`; within the compiled step."""
-
-    head: Any
-    inputs: Array
-    timeouts: Any
-    whiteners: Any
-    stuck: Any
-    spike_limits: Array
-    shewhart: Array
-    ewma: Array
-    cusum: Array
-    mewma: Array
-    delays: Any
-
-
-class Work(NamedTuple):
-    """Results of a step, see `work_type`; within the compiled step."""
-
-    new: Array
-    outputs: Array
-    expected: Array
-    e: Array
-    columns: Array
-    points: Array
-
-
-class Settings(NamedTuple):
-    """Constants of a step, see `settings_type`; within the compiled step."""
-
-    constants: Any
-    resolutions: Array
-    ranges: Array
-    rules: Words
-
-
-_FIRST = 3
-_P = _FIRST + len(HEAD.names or ()) - 1  # `head` takes the place of its three fields
-_WORK = _P + len(Plant._fields)
-_SETTINGS = _WORK + len(Work._fields)
-
-
-def frame_of(sizes: tuple[int, int, int], scratch: Records, work: Records, settings: Records) -> Words:
-    """Where the compiled step finds its arrays, which the caller keeps alive.
-
-    Args:
-        sizes: numbers of inputs, outputs and alarms.
-        scratch: numbers of one plant, shape (1,), see `row_type`.
-        work: shape (1,), see `work_type`.
-        settings: shape (1,), see `settings_type`.
-
-    Returns:
-        the sizes, then the addresses of the fields.
-    """
-    addresses = [
-        records[name].ctypes.data for records in (scratch, work, settings) for name in records.dtype.names or ()
-    ]
-    return np.array([*sizes, *addresses], dtype=np.int64)
-
-
-def words_of(numbers: Records) -> Words:
-    """Numbers of plants as words, shape (plants, words): a view."""
-    words: Words = numbers.view(np.int64).reshape(len(numbers), -1)
-    return words
-
-
-@jit
-def _plant_at(frame: Words) -> Plant:
-    inputs, outputs, alarms = frame[0], frame[1], max(frame[2], 1)
-    return Plant(
-        carray(pointer_at(frame[_FIRST]), (1,), HEAD),
-        carray(pointer_at(frame[_P + 1]), (inputs,), np.float64),
-        carray(pointer_at(frame[_P + 2]), (1 + inputs + outputs,), TIMEOUT),
-        carray(pointer_at(frame[_P + 3]), (outputs,), WHITENER),
-        carray(pointer_at(frame[_P + 4]), (outputs,), STUCK),
-        carray(pointer_at(frame[_P + 5]), (outputs,), np.float64),
-        carray(pointer_at(frame[_P + 6]), (_SHEWHART, outputs), np.float64),
-        carray(pointer_at(frame[_P + 7]), (_EWMA, outputs), np.float64),
-        carray(pointer_at(frame[_P + 8]), (_CUSUM, outputs), np.float64),
-        carray(pointer_at(frame[_P + 9]), (1 + 2 * outputs + 2 * outputs * outputs,), np.float64),
-        carray(pointer_at(frame[_P + 10]), (alarms,), DELAY),
-    )
-
-
-@jit
-def _work_at(frame: Words) -> Work:
-    inputs, outputs, alarms = frame[0], frame[1], max(frame[2], 1)
-    return Work(
-        carray(pointer_at(frame[_WORK]), (3 + 2 * inputs + 2 * outputs,), np.float64),
-        carray(pointer_at(frame[_WORK + 1]), (5 * outputs + 1,), np.float64),
-        carray(pointer_at(frame[_WORK + 2]), (outputs,), np.float64),
-        carray(pointer_at(frame[_WORK + 3]), (outputs,), np.float64),
-        carray(pointer_at(frame[_WORK + 4]), (_COLUMNS, outputs), np.float64),
-        carray(pointer_at(frame[_WORK + 5]), (alarms, POINT), np.float64),
-    )
-
-
-@jit
-def _settings_at(frame: Words) -> Settings:
-    inputs, outputs, alarms = frame[0], frame[1], max(frame[2], 1)
-    return Settings(
-        carray(pointer_at(frame[_SETTINGS]), (1,), CONSTANTS),
-        carray(pointer_at(frame[_SETTINGS + 1]), (outputs,), np.float64),
-        carray(pointer_at(frame[_SETTINGS + 2]), (inputs + outputs, 2), np.float64),
-        carray(pointer_at(frame[_SETTINGS + 3]), (alarms, 2), np.int64),
-    )
 
 
 @jit
@@ -401,10 +205,10 @@ def step(
         time_min: the same in minutes.
         values: values of the row, the inputs first.
     """
-    scratch = carray(pointer_at(frame[_FIRST]), (numbers.shape[1],), np.int64)
+    scratch = scratch_at(frame, numbers.shape[1])
     for i in range(scratch.size):
         scratch[i] = numbers[plant, i]
-    p, work, settings = _plant_at(frame), _work_at(frame), _settings_at(frame)
+    p, work, settings = plant_at(frame), work_at(frame), settings_at(frame)
     head = p.head[0]
     spacing_ns = time_ns - head.last_ns
     if spacing_ns <= 0 or float(spacing_ns) > MOST_PERIODS * head.period_ns:

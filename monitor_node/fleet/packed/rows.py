@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from monitor_node.fleet.packed.record import LEVELS, Array, Bytes, Ints, Places, Records
 from monitor_node.fleet.packed.ring import VALUE_BYTES, ZERO
-from monitor_node.pipeline.row_step import EVENT, LAST_NS, Words, step
+from monitor_node.pipeline.row_frame import LAST_NS, Words
+from monitor_node.pipeline.row_step import EVENT, step
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.records.record import MINUTE_NS
 
@@ -85,8 +86,8 @@ def step_rows(
 
     Args:
         plants: records.
-        numbers: numbers of the stages, see `row_step.words_of`.
-        frame: see `row_step.frame_of`.
+        numbers: numbers of the stages, see `row_frame.words_of`.
+        frame: see `row_frame.frame_of`.
         beliefs: beliefs of the filters, see `FilterNumbers`.
         variances: variances of the filters, see `FilterNumbers`.
         parameters: see `row_step.step`.
