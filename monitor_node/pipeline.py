@@ -893,7 +893,11 @@ class PlantPipeline:
                 dict(zip(self._config.outputs, self._units, strict=True)),
                 period_min,
             )
-        self.promises.start(rates / arl0, self._chance_alarms / arl0, period_min, watch)
+        excess = trained.after_moves.excess_rate(arl0)
+        if isinstance(trained.reference, BlackBoxReference) and trained.reference.weakness:
+            # each new set point may raise every alarm, and the next may come within the length of the training
+            excess = max(excess, arl0 / len(trained.z))
+        self.promises.start(rates / arl0, self._chance_alarms / arl0, period_min, excess, watch)
 
     def _promise(self, asked: float | None, period_min: float, checks: list[Check]) -> float:
         """False alarms in 30 days that are promised; tests of steps are left out if they would make it impossible."""

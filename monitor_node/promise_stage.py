@@ -26,6 +26,9 @@ from reactorwatch.spc.training_errors import QUANTILE
 
 RAISED = Event.RAISED.value
 
+LEAST_EXCESS = 1.5
+"""Times as many false alarms as promised from which the promise is not kept."""
+
 CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, TrainingState, str], TrainingCheck]
 """Judges a training by itself, see `training_check`."""
 
@@ -57,6 +60,7 @@ class PromiseStage:
         self.states_power = states_power
         self._config, self._failures, self._check, self._points = config, failures, check, points
         self._watch: Watch | None = None
+        self._excess = 1.0
         self._published: Promise | None = None
         self._key = keys.key(config.plant, keys.PROMISE, NODE)
         charts = {name for name, _ in alarm_names(config)}
@@ -79,16 +83,17 @@ class PromiseStage:
         if state is not None:
             self.promise = PlantPromise(state, list(Promise.FromString(power).power))
 
-    def start(self, rates: Array, mean_rate: float, period_min: float, watch: Watch | None) -> None:
+    def start(self, rates: Array, mean_rate: float, period_min: float, excess: float, watch: Watch | None) -> None:
         """State the promise after a training; alarms so far go on to count.
 
         Args:
             rates: see `alarm_rates`.
             mean_rate: false alarms a row, on average over trainings.
             period_min: sampling period.
+            excess: times as many false alarms as promised that residuals after moves of the inputs raise.
             watch: the plant as it is watched, to state its power by; None: that is not stated.
         """
-        self.alarm_rates, self._watch = rates, watch
+        self.alarm_rates, self._watch, self._excess = rates, watch, excess
         rows = false_alarm_budget.DAYS_MIN / period_min
         mean, upper = rows * mean_rate, rows * float(np.quantile(rates, QUANTILE))
         before = PromiseState(0.0, 0.0, rows) if self.promise is None else self.promise.state
@@ -122,6 +127,8 @@ class PromiseStage:
         except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
             self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
             return ""
+        if self._excess > LEAST_EXCESS:
+            check = replace(check, excess=max(check.excess, self._excess))
         self.promise.state = replace(self.promise.state, check=check)
         return "" if self.promise.is_kept else self._note(rows_watched)
 

@@ -6,19 +6,13 @@ import numpy as np
 import pytest
 
 from benchmarks.promise import plants
-from benchmarks.promise.__main__ import (
-    Outcome,
-    Plant,
-    delay,
-    poisson_interval,
-    print_counts,
-    print_delays,
-    share_interval,
-)
+from benchmarks.promise.__main__ import Outcome, Plant, delay, print_counts, print_delays
 from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
+from benchmarks.promise.pool import median_interval, poisson_interval, run_jobs, share_interval
 from plant_node.record import simulate_record
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
+from reactorwatch.runtime.parallel.jobs import SerialExecutor
 
 RANDOM_STEPS = INPUTS["a new flow in 90 to 111 each minute"]
 EFFECT_OF = {
@@ -83,6 +77,17 @@ def test_the_interval_of_a_share_is_that_of_clopper_and_pearson() -> None:
     assert share_interval(0, 10)[0] == 0.0
 
 
+def test_the_interval_of_a_median_is_between_the_values_of_the_sign_test() -> None:
+    """Conover (1999), Practical nonparametric statistics, section 3.2: the 2nd and the 9th of ten, the 6th and 15th."""
+    assert median_interval([float(value) for value in range(10, 0, -1)]) == (2.0, 9.0)
+    assert median_interval([float(value) for value in range(1, 21)]) == (6.0, 15.0)
+
+
+def test_a_job_that_fails_ends_the_table() -> None:
+    with pytest.raises(RuntimeError, match="nothing: "):
+        list(run_jobs(SerialExecutor(), int, ["1", "nothing"]))
+
+
 def test_the_delay_is_that_of_the_first_alarm_after_the_onset() -> None:
     assert delay(Outcome([120.0, 401.5, 430.0], 0.1, True)) == pytest.approx(1.5)
     assert delay(Outcome([120.0], 0.1, True)) == np.inf
@@ -99,5 +104,5 @@ def test_the_tables_count_alarms_by_input_and_plants_whose_promise_is_not_kept(
     assert lines[4].startswith("| all | 3 (95 %: 0.6 to 8.8) | 1 | 1 of 3 |")
     print_delays([Plant(5, 0, is_faulty=True)] * 2, iter([Outcome([401.0], 0.0, True), Outcome([], 0.0, True)]))
     assert capsys.readouterr().out.endswith(
-        "1 of 2 seen within 10 min (95 %: 1 to 99 %), median inf min; unseen: feed that wanders.\n"
+        "1 of 2 seen within 10 min (95 %: 1 to 99 %), median inf min (1.00 to inf); unseen: feed that wanders.\n"
     )
