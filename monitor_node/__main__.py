@@ -17,9 +17,9 @@ from monitor_node.baseline.training_diagnosis import read_equations
 from monitor_node.config import MonitorConfig
 from monitor_node.core import COMMANDS, Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker
-from monitor_node.health import NODE
+from monitor_node.health.message import NODE
+from monitor_node.health.other_monitors import OtherMonitors, log_report
 from monitor_node.isolation import stage
-from monitor_node.other_monitors import OtherMonitors, log_report
 from monitor_node.storage.alarm_file import AlarmFile
 from monitor_node.storage.state_file import StateFile
 from monitor_node.watched_process import load_process

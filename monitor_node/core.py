@@ -20,8 +20,8 @@ from monitor_node.baseline.model_update import ScheduledChange
 from monitor_node.baseline.training import NO_VALUE
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
-from monitor_node.failures import Failures
-from monitor_node.health import NODE, Processed, health_message
+from monitor_node.health.failures import Failures
+from monitor_node.health.message import NODE, Processed, health_message
 from monitor_node.ingest.alignment import Aligner, Row
 from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, ReceiveStats
 from monitor_node.ingest.rejects import RejectCounter
@@ -29,12 +29,12 @@ from monitor_node.ingest.replay_filter import ReplayFilter
 from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, reject_reason
 from monitor_node.ingest.sample_units import make_sample_units
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
-from monitor_node.pipeline import PlantPipeline
-from monitor_node.process_settings import order_inputs
-from monitor_node.promise_stage import PromiseStage
+from monitor_node.pipeline.pipeline import PlantPipeline
+from monitor_node.pipeline.promise_stage import PromiseStage
+from monitor_node.pipeline.training_check import check_training
 from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
-from monitor_node.training_check import check_training
+from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.commands import decode_command

@@ -1,6 +1,7 @@
 """`make outside DATA=FOLDER`: all benchmarks whose data are in the folder, as one page of tables."""
 
 import argparse
+import re
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -50,16 +51,23 @@ def main() -> int:
         for item in BENCHMARKS
         if (options.only or "").lower() in item.title.lower()
     ]
-    text = f"{_stamp()}\n\n" + "\n\n".join(parts)
-    print(text)
+    print("\n\n".join(parts))
     if options.write:
-        page = options.write.read_text(encoding="utf-8")
-        head, _, rest = page.partition(BEGIN)
-        options.write.write_text(f"{head}{BEGIN}\n\n{text}\n\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+        options.write.write_text(replace_tables(options.write.read_text(encoding="utf-8"), parts), encoding="utf-8")
     return 0
 
 
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
+
+
+def replace_tables(page: str, tables: list[str]) -> str:
+    """The page with tables in place of those with the same titles; other titles between the two marks stay."""
+    head, _, rest = page.partition(BEGIN)
+    present, _, tail = rest.partition(END)
+    by_title = {part.partition("\n")[0]: part.strip() for part in re.split(r"(?m)^## ", present)[1:]}
+    by_title |= {part.removeprefix("## ").partition("\n")[0]: part.removeprefix("## ").strip() for part in tables}
+    text = "\n\n".join(f"## {part}" for part in by_title.values())
+    return f"{head}{BEGIN}\n\n{text}\n\n{END}{tail}"
 
 
 def measure_benchmark(benchmark: Benchmark, folder: Path) -> str:
@@ -68,7 +76,7 @@ def measure_benchmark(benchmark: Benchmark, folder: Path) -> str:
     if not path.exists():
         return f"## {benchmark.title}\n\nNot measured: {path.name} is not in the folder."
     rows = benchmark.measure(path, SEED)
-    return f"## {benchmark.title}\n\n{markdown(rows)}"
+    return f"## {benchmark.title}\n\n{_stamp()}\n\n{markdown(rows)}"
 
 
 def _stamp() -> str:

@@ -66,7 +66,11 @@ def _equations(first: Path, second: Path, folder: Path) -> Row:
         run("simulate", str(second), "--process", str(process), "--settle", str(SETTLE), "-o", str(out), "--json")
     )
     error = said["rmse"]["x2"]["value"]
-    return Row("reactorwatch diagnose, equations", f"{found['verdict']}: {named}", {"simulation, V": f"{error:.3f}"})
+    return Row(
+        "reactorwatch diagnose, equations, constants known to a half",
+        f"{found['verdict']}: {named}",
+        {"simulation, V": f"{error:.3f}"},
+    )
 
 
 def _describe(equations: str) -> str:

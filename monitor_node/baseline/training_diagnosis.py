@@ -20,8 +20,8 @@ from reactorwatch.diagnosis.extended import extended_model
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
-from reactorwatch.process import effects_of
-from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
+from reactorwatch.process import EFFECTS_OF, effects_of
+from reactorwatch.process.extended_model import ExtendedModel, extended_model_of, is_complete, parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME
 from reactorwatch.records.record import MINUTE_NS, Record
@@ -123,6 +123,16 @@ def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tupl
         return found.verdict, _reason(found), None
     extended = extended_model(model, effects_of(model), lasting, record.zero_ns)
     return found.verdict, _reason(found), parse_extended_model(_json(extended))
+
+
+def equations_text(model: ProcessModel | None) -> str:
+    """JSON of a model as `diagnose` writes it; empty if the catalogue does not have the model, or no causes for it."""
+    if model is None or model.name not in EFFECTS_OF:
+        return ""
+    extended = extended_model_of(model)
+    if not is_complete(extended, model):
+        return ""
+    return msgspec.json.encode(extended.to_object()).decode()
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)

@@ -18,10 +18,10 @@ from monitor_node.fleet.monitor import Callbacks, FleetMonitor
 from monitor_node.fleet.partition import LeaseMonitor
 from monitor_node.fleet.sharding import ShardGroup
 from monitor_node.fleet.watched_kinds import ANY, PlantKind, WatchedKinds
-from monitor_node.health import NODE
+from monitor_node.health.message import NODE
+from monitor_node.health.other_monitors import OtherMonitors, log_report
 from monitor_node.ingest.pending import PlantHistory
 from monitor_node.ingest.rejects import RejectCounter
-from monitor_node.other_monitors import OtherMonitors, log_report
 from monitor_node.state.monitor_state import OtherSettingsError
 from monitor_node.state.seal import ForeignFileError
 from monitor_node.storage.fleet_states import FleetStates

@@ -8,8 +8,8 @@ from monitor_node.alarms.states import Event
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
+from monitor_node.pipeline.pipeline_state import PipelineState
 from monitor_node.replay.row_log import RowLog
-from monitor_node.state.pipeline_state import PipelineState
 from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication

@@ -11,12 +11,10 @@ import msgspec
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import AlignmentState
 from monitor_node.ingest.sequence_check import SequenceCheck
+from monitor_node.pipeline.pipeline_state import PipelineState
 from monitor_node.state import version_2, version_3
-from monitor_node.state.pipeline_state import PipelineState
 from monitor_node.state.seal import Seal
 from reactorwatch.errors import InputError
-from reactorwatch.process import EFFECTS_OF
-from reactorwatch.process.extended_model import extended_model_of, is_complete
 from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc.charts.catalogue import CHARTS
@@ -106,16 +104,6 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
     fields |= {"points": points, "equations": "" if model is None else fingerprint(model)}
     settings: dict[str, Any] = msgspec.msgpack.decode(msgspec.msgpack.encode(fields))  # as they are read back
     return settings
-
-
-def equations_text(model: ProcessModel | None) -> str:
-    """JSON of a model as `diagnose` writes it; empty if the catalogue does not have the model, or no causes for it."""
-    if model is None or model.name not in EFFECTS_OF:
-        return ""
-    extended = extended_model_of(model)
-    if not is_complete(extended, model):
-        return ""
-    return msgspec.json.encode(extended.to_object()).decode()
 
 
 def seal_state(state: MonitorState) -> bytes:

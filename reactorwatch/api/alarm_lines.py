@@ -49,7 +49,7 @@ def _line(times: Sequence[Raised], zero_ns: int) -> str:
     """Line of one alarm of an incident, which may have been raised several times."""
     (alarm, _), (_, cleared_ns) = times[0], times[-1]
     often = "" if len(times) == 1 else f", raised {len(times)} times"
-    end = "still standing at the end" if cleared_ns is None else f"cleared at {to_minutes(cleared_ns, zero_ns):g} min"
+    end = "active at the end" if cleared_ns is None else f"cleared at {to_minutes(cleared_ns, zero_ns):g} min"
     minute = f"{to_minutes(alarm.raised_ns, zero_ns):9g} min"
     return f"  {minute}  {alarm.alarm} ({priority_word(alarm.priority)}){often}, {end}: {alarm.text}"
 

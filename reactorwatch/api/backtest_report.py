@@ -106,14 +106,15 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path, *, is_trained: boo
     else:
         where = "on another file" if is_trained else f"until {report['trained_until_min']:g} min"
         lines.append(
-            f"trained {where} ({result.training_rows} rows); "
-            f"{report['expected_false_alarms']:.2g} false alarms are to be expected in the rest by chance"
+            f"training: {where} ({result.training_rows} rows); "
+            f"{report['expected_false_alarms']:.2g} false alarms are expected in the rest by chance"
         )
         lines.append(_reference_line(result))
         if result.promise is not None:
             lines.append(f"promise: {result.promise.text}")
         if report["power"]:
-            lines.append(f"seen within an hour, in nine of ten cases: {describe_power(report['power'])}")
+            seen = describe_power(report["power"])
+            lines.append(f"sensitivity: in nine of ten cases these steps are seen within an hour: {seen}")
     lines += alarm_lines(result.raised_alarms, zero_ns)
     lines += [f"  note: {note}" for note in result.notes]
     if not result.raised_alarms and report["trained_until_min"] is not None:
@@ -126,6 +127,6 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path, *, is_trained: boo
 def _reference_line(result: Backtest) -> str:
     """Line with the reference and its noise levels."""
     if result.noise_levels is None:
-        return f"judged by {REFERENCES.get(result.reference or '', result.reference)}"
+        return f"reference: {REFERENCES.get(result.reference or '', result.reference)}"
     levels = (f"{name} {sd:.3g}" for name, sd in result.noise_levels["sensors"].items())
-    return f"judged by the equations, with noise of the sensors (standard deviation) {', '.join(levels)}"
+    return f"reference: the equations; standard deviation of the sensors' noise: {', '.join(levels)}"

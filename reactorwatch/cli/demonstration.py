@@ -227,9 +227,9 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         "",
         headline(delay_s, diagnosis, case.effects),
         "",
-        f"- Fault injected: `{fault}`, set in at {minutes(onset_ns)}."
+        f"- Fault injected: `{fault}`, onset at {minutes(onset_ns)}."
         if onset_ns is not None
-        else f"- Fault `{fault}` never set in: the run was too short.",
+        else f"- Fault `{fault}` did not start: the run was too short.",
     ]
     for alarm in after:
         late = (alarm.time_ns - (onset_ns or 0)) / MINUTE_NS
@@ -242,11 +242,11 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     if suspected:
         last = suspected[-1]
         late = (last.time_ns - (onset_ns or 0)) / MINUTE_NS
-        lines.append(f"- Suspect, {late:.1f} min after the fault: {suspects_text(last.suspects, first_ns)}.")
+        lines.append(f"- Likely cause, {late:.1f} min after the fault: {suspects_text(last.suspects, first_ns)}.")
     lines.append(
         "- False alarms before the fault: "
         + (", ".join(f"`{alarm.alarm}` at {minutes(alarm.time_ns)}" for alarm in before) or "none")
-        + f" ({again.expected_false_alarms:.2g} to be expected in the whole run)."
+        + f" ({again.expected_false_alarms:.2g} expected in the whole run)."
     )
     lines.append(f"- Diagnosis of the whole recording: {describe_verdict(diagnosis)}")
     lines.append(f"- Back-test over the recording: {'the same alarms, value for value' if same else 'OTHER ALARMS'}.")
@@ -255,9 +255,9 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         "# Which file to open",
         "",
         f"- `{drawing.name}`: the run as a dashboard. `{_program('rerun')} {drawing}`",
-        f"- `{DIAGNOSIS_FOLDER}/{PAGE}`: what the simulation gets wrong of this run, in a browser;"
-        f" `{DIAGNOSIS_FOLDER}/{MODEL}` is the simulation that knows of it.",
-        f"- `{recording.name}`: everything that went over the bus; opens in Foxglove and PlotJuggler, too.",
+        f"- `{DIAGNOSIS_FOLDER}/{PAGE}`: the report of the diagnosis, for a browser;"
+        f" `{DIAGNOSIS_FOLDER}/{MODEL}` has the equations with the cause in them.",
+        f"- `{recording.name}`: all messages; it also opens in Foxglove and PlotJuggler.",
         f"- `{SETTINGS_FILE}`: all settings, seeds included; the `.log` files: logs of the nodes.",
         "",
     ]

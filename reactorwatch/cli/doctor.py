@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from cryptography.exceptions import InvalidSignature
 
-from monitor_node.other_monitors import OtherMonitors
+from monitor_node.health.other_monitors import OtherMonitors
 from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode

@@ -4,7 +4,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from monitor_node.config import DEFAULT_TRAINING_ROWS
 from plant_node.config import PlantConfig
 from plant_node.process_settings import fit_settings
 from plant_node.record import load_process
@@ -87,6 +86,10 @@ class Source:
             flags["process"] = self.process
         is_stated = tables.get("monitor", {}).keys() & {"training_min", "training_rows"}
         if self.rows is not None and not is_stated:
+            from monitor_node.config import (
+                DEFAULT_TRAINING_ROWS,
+            )  # only here: a plant needs no charts
+
             flags["training_rows"] = max(1, min(DEFAULT_TRAINING_ROWS, self.rows // 3))
         return flags
 

@@ -26,10 +26,14 @@ def describe_suspects(suspects: Iterable[Suspect]) -> str:
 
 
 def suspects_text(suspects: Iterable[Suspect], zero_ns: int | None = None) -> str:
-    """Likeliest causes by their names, with profile, size and onset; empty if there are none.
+    """Likeliest causes with their sizes in words where they have some, profiles and onsets; empty if there are none.
 
-    >>> suspects_text([Suspect(cause="coolant_flow", probability=0.93, profile="step", size=-0.1502, unit="1")])
+    >>> step = Suspect(cause="coolant_flow", probability=0.93, profile="step", size=-0.1502, unit="1")
+    >>> suspects_text([step])
     'coolant_flow (93 %; step of -0.15)'
+    >>> step.text = "15 % of the coolant lost"
+    >>> suspects_text([step])
+    '15 % of the coolant lost (93 %; coolant_flow, step)'
 
     Args:
         suspects: the suspects of an alarm.
@@ -39,12 +43,13 @@ def suspects_text(suspects: Iterable[Suspect], zero_ns: int | None = None) -> st
     for item in suspects:
         if item.probability < MIN_PROBABILITY:
             continue
-        text = f"{item.cause} ({100 * item.probability:.0f} %"
+        details = [item.cause] if item.text else []
         if item.profile:
-            text += f"; {item.profile} of {item.size:.3g}{'' if item.unit == '1' else f' {item.unit}'}"
-            if zero_ns is not None:
-                text += f" at {(item.onset_ns - zero_ns) / _MINUTE_NS:.1f} min"
-        texts.append(text + ")")
+            size = "" if item.text else f" of {item.size:.3g}{'' if item.unit == '1' else f' {item.unit}'}"
+            onset = "" if zero_ns is None else f" at {(item.onset_ns - zero_ns) / _MINUTE_NS:.1f} min"
+            details.append(f"{item.profile}{size}{onset}")
+        probability = f"{100 * item.probability:.0f} %"
+        texts.append(f"{item.text or item.cause} ({'; '.join(filter(None, (probability, ', '.join(details))))})")
     return ", ".join(texts)
 
 

@@ -79,16 +79,16 @@ class Selection:
 
     def table(self) -> str:
         """The candidates as text, the chosen one marked."""
-        lines = ["  family   order  parameters  one-step %  free run %         BIC"]
+        lines = ["  family order  parameters  one step %  free run %       BIC"]
         for candidate in self.candidates:
             mark = ">" if candidate is self.chosen and self.fits else " "
-            head = f"{mark} {candidate.family:<8} {candidate.order:>5}"
+            head = f"{mark} {candidate.family:<6} {candidate.order:>5}"
             if candidate.refusal:
                 lines.append(f"{head}  {candidate.refusal}")
             else:
                 lines.append(
                     f"{head}  {candidate.parameters:>10}  {candidate.one_step_percent:>10.3f}"
-                    f"  {candidate.free_run_percent:>10.3f}  {candidate.bic:>10.1f}"
+                    f"  {candidate.free_run_percent:>10.3f}  {candidate.bic:>8.1f}"
                 )
         return "\n".join(lines)
 

@@ -53,7 +53,10 @@ class TextTable:
     @property
     def first_row(self) -> int | None:
         """Number of the first row in the file, as a text editor counts; None: lines between the rows are blank."""
-        lines = self.layout.text.count(b"\n") - self.layout.text.endswith(b"\n") + 2 - self.layout.first_row
+        text = np.frombuffer(self.layout.text, dtype=np.uint8)  # bytes.count takes three times as long
+        blocks = (text[start : start + BLOCK_BYTES] for start in range(0, text.size, BLOCK_BYTES))
+        ends = sum(int(np.count_nonzero(block == ord("\n"))) for block in blocks)
+        lines = ends - self.layout.text.endswith(b"\n") + 2 - self.layout.first_row
         return self.layout.first_row if lines == self.rows and not self.layout.transposed else None
 
     def select(self, rows: NDArray[np.intp]) -> "TextTable":
@@ -79,7 +82,8 @@ class TextTable:
         if column not in self._known:
             cells = self._table.column(str(column))
             if str(cells.type) == "double":
-                values = np.array(cells.to_numpy())  # a copy: users may change it
+                values = cells.to_numpy()  # several chunks are copied
+                values = values if values.flags.writeable else values.copy()  # users may change it
             else:
                 text = cells.combine_chunks()
                 values, bad = to_numbers(text, self.layout.decimal, self.layout.missing)

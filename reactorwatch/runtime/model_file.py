@@ -1,13 +1,11 @@
 """Files of extended models, as `diagnose` writes and `--model` reads them."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
-from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
 
 
@@ -23,22 +21,6 @@ def read_extended_model(path: Path) -> ExtendedModel:
         raise InputError(f"model file {path}: cannot be read: {error.strerror}") from error
     except InputError as error:
         raise InputError(f"model file {path}: {error}") from error
-
-
-def read_model_on_bus_clock(path: str | None, zero_ns: int = 0) -> ProcessModel | None:
-    """Read a model and set its clock to that of samples on the bus: minutes since 1970-01-01 UTC.
-
-    Args:
-        path: path of the file; None: no model, and None is returned.
-        zero_ns: the time that its minutes count from, if the file does not give it.
-
-    Raises:
-        InputError: as `read_extended_model`.
-    """
-    if path is None:
-        return None
-    model = read_extended_model(Path(path))
-    return replace(model, zero_ns=model.zero_ns or zero_ns).rebase(0).build()
 
 
 def write_extended_model(path: Path, written: dict[str, Any]) -> None:

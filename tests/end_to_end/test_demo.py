@@ -52,7 +52,7 @@ def test_it_leaves_a_recording_a_drawing_and_a_summary(demo: tuple[Path, str]) -
     assert {"demo.mcap", "demo.rrd", "summary.md", "settings.toml"} <= names
     assert not [name for name in names if name.endswith(".part")]
     summary = (folder / "summary.md").read_text()
-    assert "set in at 150.0 min" in summary
+    assert "onset at 150.0 min" in summary
     headline = summary.splitlines()[2]
     assert re.fullmatch(r"Detected after \d+ s; cause named: coolant leak, 15 % of the coolant lost\.", headline)
     assert "Alarm raised" in summary

@@ -71,6 +71,7 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
 
 def run_command(command: str, folder: Path, machine: Machine, called: Command) -> subprocess.CompletedProcess[str]:
     name, *arguments = words(command)
+    name = Path(name).name
     if name == "make":  # what it would do: the work itself is in other tests, or takes hours
         planned = ["make", "--dry-run", "--assume-new=pyproject.toml", *arguments]
         return subprocess.run(planned, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -159,6 +160,11 @@ def test_every_command_within_a_sentence_or_table_has_arguments_that_are_taken()
             assert known is not None, command
         if arguments:  # a bare name is that of the command, and no line to type
             known.make_context(name, arguments, parent=context)
+
+
+def test_every_page_is_in_the_navigation_of_the_site() -> None:
+    navigation = set(re.findall(r"([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE))
+    assert {page.name for page in (ROOT / "docs").glob("*.md")} <= navigation
 
 
 def test_every_table_of_settings_is_read_by_its_own_structure() -> None:

@@ -14,8 +14,8 @@ import monitor_node.signal_checks
 import reactorwatch.process.library.cstr.effects
 import reactorwatch.spc.charts
 import recorder.panels
-from monitor_node import row_step
 from monitor_node.config import MonitorConfig
+from monitor_node.pipeline import row_step
 from monitor_node.signal_checks.catalogue import CHECKS
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.spc.charts.catalogue import CHARTS

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from monitor_node.fleet.packed.conversion import Conversion, Rest
 from monitor_node.fleet.packed.record import Records
 from monitor_node.fleet.packed.ring import Kept, NewestRows, newest_rows, row_bytes
-from monitor_node.row_step import FilterNumbers
+from monitor_node.pipeline.row_step import FilterNumbers
 from reactorwatch.contract import keys
 from reactorwatch.records.record import NEVER_NS
 

@@ -19,7 +19,6 @@ from monitor_node.alarms.kpis import KpiState
 from monitor_node.baseline.promise import NUMBERS, PromiseState
 from monitor_node.baseline.references import ProcessReferenceState
 from monitor_node.baseline.training import TrainingState
-from monitor_node.chart_stage import ChartsState, alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.packed.pending import (
@@ -35,13 +34,14 @@ from monitor_node.fleet.packed.ring import NewestRows, times_ns_of
 from monitor_node.ingest.alignment import REMEMBERED, AlignmentState
 from monitor_node.ingest.sampling import SamplingState
 from monitor_node.isolation.stage import SuspicionState, has_causes
-from monitor_node.row_step import RowStep
+from monitor_node.pipeline.pipeline_state import PipelineState, TrainedState
+from monitor_node.pipeline.row_step import RowStep
 from monitor_node.signal_checks.spike import SpikeState
 from monitor_node.signal_checks.stage import SignalChecksState
 from monitor_node.signal_checks.stuck import Stuck
 from monitor_node.signal_checks.timeout import DataTimeout
+from monitor_node.stages.charts import ChartsState, alarm_names
 from monitor_node.state.monitor_state import MonitorState
-from monitor_node.state.pipeline_state import PipelineState, TrainedState
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import AlarmKpis
 from reactorwatch.contract.sample_bytes import unit_digest

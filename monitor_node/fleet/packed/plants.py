@@ -15,7 +15,7 @@ from monitor_node.fleet.packed.conversion import Conversion
 from monitor_node.fleet.packed.ring import kept_spacings, kept_values
 from monitor_node.fleet.packed.rows import NEW_MINUTE, step_rows
 from monitor_node.fleet.packed.samples import find_deadlines, take_samples
-from monitor_node.health import NODE, Processed, health_message
+from monitor_node.health.message import NODE, Processed, health_message
 from monitor_node.ingest.alignment import Counts, Row
 from monitor_node.ingest.receive_stats import STALL_NS, ReceiveStats
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE, USABLE

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from monitor_node.fleet.packed.record import LEVELS, Array, Bytes, Ints, Places, Records
 from monitor_node.fleet.packed.ring import VALUE_BYTES, ZERO
-from monitor_node.row_step import EVENT, step
+from monitor_node.pipeline.row_step import EVENT, step
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.records.record import MINUTE_NS
 

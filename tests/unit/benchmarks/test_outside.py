@@ -153,3 +153,12 @@ def test_data_that_are_not_there_are_named(tmp_path: Path, capsys: pytest.Captur
     said = main.measure_benchmark(main.Benchmark("TEP", "tep", tennessee.measure), tmp_path)
     assert said.startswith("## TEP\n\nNot measured: ")
     assert capsys.readouterr().out == ""
+
+
+def test_a_table_replaces_the_one_with_its_title_and_the_others_stay() -> None:
+    from benchmarks.outside.__main__ import BEGIN, END, replace_tables
+
+    page = f"Text.\n\n{BEGIN}\n\n## A\n\nold\n\n## B\n\nkept\n\n{END}\n"
+    assert replace_tables(page, ["## A\n\nnew", "## C\n\nadded"]) == (
+        f"Text.\n\n{BEGIN}\n\n## A\n\nnew\n\n## B\n\nkept\n\n## C\n\nadded\n\n{END}\n"
+    )

@@ -96,11 +96,11 @@ def test_a_rig_is_watched_with_all_its_inputs_and_a_third_of_its_rows_is_the_tra
 
 def test_people_read_how_long_the_training_was() -> None:
     result = CliRunner().invoke(app, ["backtest", "sound.csv", "--process", "rig.toml"], standalone_mode=False)
-    assert "trained until 13.3333 min (200 rows)" in result.stdout
+    assert "training: until 13.3333 min (200 rows)" in result.stdout
     result = CliRunner().invoke(
         app, ["backtest", "faulty.csv", "--process", "rig.toml", "--train", "sound.csv"], standalone_mode=False
     )
-    assert "trained on another file (600 rows)" in result.stdout
+    assert "training: on another file (600 rows)" in result.stdout
 
 
 @pytest.mark.parametrize(

@@ -27,3 +27,11 @@ def test_linear_algebra_has_one_thread_unless_somebody_wants_more(
 def test_it_is_settled_before_numpy_is_imported() -> None:
     question = "import sys, reactorwatch.cli.main; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", question], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("node", ["plant_node", "monitor_node", "recorder"])
+def test_a_node_starts_without_the_slow_parts_of_scipy_and_without_a_viewer(node: str) -> None:
+    slow = {"scipy.signal", "scipy.stats", "scipy.optimize", "sklearn", "rerun", "matplotlib", "pandas"}
+    question = f"import sys, {node}.__main__; sys.exit(' '.join({slow!r} & sys.modules.keys()))"
+    ended = subprocess.run([sys.executable, "-c", question], capture_output=True, text=True, check=False)
+    assert not ended.stderr.strip()

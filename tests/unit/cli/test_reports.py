@@ -28,7 +28,7 @@ def test_the_equations_are_named_with_the_noise_of_the_sensors_and_states(
     assert found["reference"] == "equations"
     assert found["noise_levels"]["sensors"] == {"C": pytest.approx(0.002, rel=0.2), "T": pytest.approx(0.3, rel=0.2)}
     assert set(found["noise_levels"]["states"]) == {"C", "T"}
-    assert "judged by the equations, with noise of the sensors (standard deviation) C 0.00" in backtest_text(
+    assert "reference: the equations; standard deviation of the sensors' noise: C 0.00" in backtest_text(
         result, 0, Path("run.csv")
     )
 
@@ -37,14 +37,14 @@ def test_identified_models_are_named_and_have_no_noise_levels() -> None:
     result = judged("arx")
     found = backtest_object(result, 0)
     assert (found["reference"], found["noise_levels"]) == ("arx", None)
-    assert "judged by identified models (ARX)" in backtest_text(result, 0, Path("run.csv"))
+    assert "reference: identified models (ARX)" in backtest_text(result, 0, Path("run.csv"))
 
 
 def test_a_record_that_was_not_judged_names_nothing() -> None:
     result = judged("auto", 20.0)
     found = backtest_object(result, 0)
     assert (found["reference"], found["noise_levels"]) == (None, None)
-    assert "judged by" not in backtest_text(result, 0, Path("run.csv"))
+    assert "reference: " not in backtest_text(result, 0, Path("run.csv"))
 
 
 def raised(alarm: str, minute: float, cleared_min: float | None, incident: int, text: str = "") -> Raised:
@@ -68,5 +68,5 @@ def test_an_alarm_that_comes_and_goes_within_an_incident_is_one_line() -> None:
         "incident 1, from 100 min",
         "        100 min  ewma/T (high), raised 3 times, cleared at 125 min: ",
         "incident 2, from 400 min",
-        "        400 min  ewma/T (high), still standing at the end: ",
+        "        400 min  ewma/T (high), active at the end: ",
     ]

@@ -11,7 +11,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, ChartPoint
 
-from .samples import leaking_run, samples
+from ..samples import leaking_run, samples
 
 ROWS, SECOND_NS = 1500, 10**9
 SIZES = (2.0, -2.0, 4.0, -20.0)

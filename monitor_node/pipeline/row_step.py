@@ -23,12 +23,12 @@ from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.references import GATE
 from monitor_node.baseline.resolution import quantise
 from monitor_node.baseline.signal_range import SignalRange, possible_ranges
-from monitor_node.chart_stage import alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import TOLERANCE, WHOLE
 from monitor_node.signal_checks.catalogue import CHECKS
 from monitor_node.signal_checks.stuck import STUCK, is_stuck, take_reading
 from monitor_node.signal_checks.timeout import TIMEOUT, update_timeout
+from monitor_node.stages.charts import alarm_names
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.codegen.numba_kernel import Entry, call_at, jit

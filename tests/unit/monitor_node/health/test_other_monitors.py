@@ -9,11 +9,11 @@ from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.monitor import PRESUME_GONE_NS
 from monitor_node.fleet.node import FleetNode
-from monitor_node.other_monitors import GONE, MOST_GROUPS, NOTICED, OtherMonitors
+from monitor_node.health.other_monitors import GONE, MOST_GROUPS, NOTICED, OtherMonitors
 from reactorwatch.contract import keys
 from tests.memory_bus import Exchange, MemoryBus
 
-from .fleets import QUICK, SECOND_NS
+from ..fleets import QUICK, SECOND_NS
 
 PLANT = "cstr"
 SINGLE = "one plant"

@@ -8,11 +8,11 @@ from monitor_node.baseline.predictor import PredictorState
 from monitor_node.baseline.promise import PromiseState
 from monitor_node.baseline.references import ArxReferenceState, ProcessReferenceState
 from monitor_node.baseline.training import TrainingState
-from monitor_node.chart_stage import ChartsState
 from monitor_node.ingest.sampling import SamplingState
 from monitor_node.isolation.stage import SuspicionState
-from monitor_node.operation import CarriedState
+from monitor_node.pipeline.operation import CarriedState
 from monitor_node.signal_checks.stage import SignalChecksState
+from monitor_node.stages.charts import ChartsState
 from reactorwatch.spc.prewhitening import PrewhitenerState
 from reactorwatch.spc.step_test import StepTestState
 from reactorwatch.stored_state import StoredState

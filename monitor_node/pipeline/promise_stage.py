@@ -9,13 +9,13 @@ from msgspec.structs import replace
 from monitor_node.alarms.states import Event
 from monitor_node.baseline.promise import PlantPromise, PromiseState, TrainingCheck
 from monitor_node.baseline.training import TrainingState
-from monitor_node.chart_stage import alarm_names
 from monitor_node.config import MonitorConfig
-from monitor_node.failures import Failures
-from monitor_node.health import NODE
-from monitor_node.power import Watch, state_power
-from monitor_node.shift_stage import NAME as SHIFT
+from monitor_node.health.failures import Failures
+from monitor_node.health.message import NODE
+from monitor_node.pipeline.power import Watch, state_power
 from monitor_node.signal_checks.stage import SignalChecks
+from monitor_node.stages.charts import alarm_names
+from monitor_node.stages.shift import NAME as SHIFT
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication

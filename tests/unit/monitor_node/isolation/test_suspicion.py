@@ -9,8 +9,8 @@ from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 
-from .samples import Rows
-from .watching import Watched, watched
+from ..samples import Rows
+from ..watching import Watched, watched
 
 ONSET_MIN, SPAN_MIN = 130.0, 175.0
 

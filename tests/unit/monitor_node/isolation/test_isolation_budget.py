@@ -20,8 +20,8 @@ from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.step_budget import STEPS_PER_RUN, STEPS_PER_SEARCH, BudgetExceededError, StepBudget
 from reactorwatch.process.library.cstr.model import cstr
 
-from .faulty import SENSORS, rows_of
-from .samples import leaking_run, samples
+from ..faulty import SENSORS, rows_of
+from ..samples import leaking_run, samples
 
 SIGNALS = ("qc", "C", "T")
 CONFIG = MonitorConfig(training_min=20.0)

@@ -17,7 +17,7 @@ from monitor_node.isolation.window import Row
 from reactorwatch.contract.codec import Publication
 from reactorwatch.process.library.cstr.model import cstr
 
-from .faulty import SENSORS, rows_of
+from ..faulty import SENSORS, rows_of
 
 CONFIG = MonitorConfig()
 ALARM = 612

@@ -17,8 +17,8 @@ from monitor_node.core import Monitor
 from reactorwatch.contract.messages_pb2 import Promise
 from reactorwatch.records.record import Record
 
-from .samples import leaking_run
-from .watching import Watched, sound_run, watched
+from ..samples import leaking_run
+from ..watching import Watched, sound_run, watched
 
 QUICK = MonitorConfig(isolation=False, diagnose_training=False, training_min=60.0)
 ROWS_IN_30_DAYS = 432_000.0

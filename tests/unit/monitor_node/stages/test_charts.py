@@ -9,7 +9,7 @@ from monitor_node.config import ChartName, MonitorConfig
 from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.charts.cusum import CEILING, Cusum
 
-from .watching import sound_run, watched
+from ..watching import sound_run, watched
 
 AT_MIN, AT = 130.0, 1300
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import msgspec
 import pytest
 
-from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, read_equations
+from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, equations_text, read_equations
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.replay import backtest
 from monitor_node.replay.verification import verify
-from monitor_node.state.monitor_state import SEAL, equations_text
+from monitor_node.state.monitor_state import SEAL
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Baseline, Sample
 from reactorwatch.diagnosis.result import NAMED, NOMINAL
@@ -21,7 +21,7 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import pack_times, unpack_times
 
-from .warm_plant import CONFIG, GIVEN, LATE, TRAINED, Run, changes, plant, publish, without_baseline
+from ..warm_plant import CONFIG, GIVEN, LATE, TRAINED, Run, changes, plant, publish, without_baseline
 
 START_NS = 1_750_000_000 * 10**9
 SECOND_NS = 10**9

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.chart_stage import ChartWatch
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.failures import Failures
 from monitor_node.fleet.packed.conversion import Conversion
+from monitor_node.health.failures import Failures
 from monitor_node.isolation.candidate import scan_candidates
 from monitor_node.isolation.causes import causes_of
 from monitor_node.isolation.glr_scan import Scan
 from monitor_node.isolation.isolation import Isolation
 from monitor_node.isolation.window import Window
-from monitor_node.pipeline import PlantPipeline
+from monitor_node.pipeline.pipeline import PlantPipeline
 from monitor_node.signal_checks.timeout import SilenceCheck
+from monitor_node.stages.charts import ChartWatch
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
 
-from .fleets import QUICK, SECOND_NS, alarms, alone, fleet, of, row_by_row
+from ..fleets import QUICK, SECOND_NS, alarms, alone, fleet, of, row_by_row
 
 CAUSES = causes_of(cstr())
 

@@ -22,7 +22,7 @@ from monitor_node.baseline.promise import (
 from monitor_node.baseline.training import TrainingState
 from monitor_node.config import LARGEST_FALSE_ALARMS, MonitorConfig
 from monitor_node.ingest.alignment import Row
-from monitor_node.pipeline import PlantPipeline
+from monitor_node.pipeline.pipeline import PlantPipeline
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel

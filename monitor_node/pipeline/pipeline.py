@@ -29,25 +29,24 @@ from monitor_node.baseline.references import (
 )
 from monitor_node.baseline.signal_range import input_bounds, possible_ranges, stated_ranges
 from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
-from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
-from monitor_node.chart_stage import ChartWatch, count_chance_alarms, has_values_only
+from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, equations_text, read_equations
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
-from monitor_node.drift_stage import DriftWatch
-from monitor_node.failures import Failures
-from monitor_node.health import NODE
+from monitor_node.health.failures import Failures
+from monitor_node.health.message import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import Interval, SamplingPeriod, SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
-from monitor_node.operating_modes import OperatingModes, key_of
-from monitor_node.operation import Operation
-from monitor_node.power import Watch
-from monitor_node.promise_stage import PromiseStage
-from monitor_node.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
-from monitor_node.shift_stage import NAME as SHIFT
-from monitor_node.shift_stage import ShiftWatch
+from monitor_node.pipeline.operating_modes import OperatingModes, key_of
+from monitor_node.pipeline.operation import Operation
+from monitor_node.pipeline.pipeline_state import KeptBaseline, ModeTraining, PipelineState, TrainedState
+from monitor_node.pipeline.power import Watch
+from monitor_node.pipeline.promise_stage import PromiseStage
+from monitor_node.pipeline.row_step import EVENT, VIOLATING, FilterNumbers, Records, RowStep, numbers_type
 from monitor_node.signal_checks.stage import SignalChecks
-from monitor_node.state.monitor_state import equations_text
-from monitor_node.state.pipeline_state import KeptBaseline, ModeTraining, PipelineState, TrainedState
+from monitor_node.stages.charts import ChartWatch, count_chance_alarms, has_values_only
+from monitor_node.stages.drift import DriftWatch
+from monitor_node.stages.shift import NAME as SHIFT
+from monitor_node.stages.shift import ShiftWatch
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import (

@@ -15,8 +15,8 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
 from reactorwatch.records.record import to_time_ns
 
-from .fleets import of_plant, stage_by_stage
-from .samples import leaking_run, samples
+from ..fleets import of_plant, stage_by_stage
+from ..samples import leaking_run, samples
 
 TRAINING_MIN = 60.0
 BLACK_BOX = MonitorConfig(

@@ -7,7 +7,7 @@ plant starts up or shuts down, or one that the training has not seen, is watched
 from collections.abc import Mapping
 
 from monitor_node.config import MonitorConfig
-from monitor_node.state.pipeline_state import ModesState
+from monitor_node.pipeline.pipeline_state import ModesState
 
 
 class OperatingModes:

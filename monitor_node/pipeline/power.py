@@ -16,7 +16,6 @@ from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.predictor import ArxPredictor
@@ -239,6 +238,8 @@ def _prewhiten(watch: Watch, z: Array) -> Array:
     e = np.zeros(z.shape)
     for index, (learned, evaluated) in enumerate(zip(watch.learned, watch.evaluated, strict=True)):
         if evaluated:
-            past = [1.0, *(-a for a in learned.coefficients)]
-            e[:, :, index] = lfilter(past, [1.0], z[:, :, index], axis=1) / learned.sd
+            e[:, :, index] = z[:, :, index]
+            for lag, coefficient in enumerate(learned.coefficients, 1):
+                e[:, lag:, index] -= coefficient * z[:, :-lag, index]
+            e[:, :, index] /= learned.sd
     return e

@@ -7,10 +7,10 @@ import pytest
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.operation import Operation
-from monitor_node.process_settings import signal_settings
+from monitor_node.pipeline.operation import Operation
 from monitor_node.replay import backtest
 from monitor_node.replay.verification import verify
+from monitor_node.watched_process import signal_settings
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Quality, Sample
@@ -20,7 +20,7 @@ from reactorwatch.process.library.three_tanks.model import three_tanks
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.config import section
 
-from .test_many_inputs import FAULT_ROW, ROW_NS, ROWS, START_NS, linear_plant, live, recording
+from ..test_many_inputs import FAULT_ROW, ROW_NS, ROWS, START_NS, linear_plant, live, recording
 
 CONFIG = linear_plant(2, 2, seed=1).config(
     setpoints=("sp",), modes=("auto",), labels=("lab",), bounds={"u0": (-2.0, 1.7)}, units={"sp": "K", "u0": "l/h"}

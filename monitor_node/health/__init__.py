@@ -1,0 +1,1 @@
+"""Health of a monitor: its message, contained errors, other monitors of its plants."""

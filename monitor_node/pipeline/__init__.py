@@ -1,0 +1,1 @@
+"""Pipeline of a plant: rows in, through the stages, to alarms."""

@@ -1,0 +1,1 @@
+"""Stages of an evaluated row: charts, lasting steps and drift."""
