@@ -48,9 +48,9 @@ class Step(NamedTuple):
     """An injected step.
 
     Attributes:
-        cause: its cause.
-        size: its size.
-        factor: its size relative to the stated one.
+        cause: cause of the catalogue.
+        size: size in the unit of the cause.
+        factor: size relative to the stated one.
         seed: seed of the record.
     """
 
@@ -160,12 +160,12 @@ def sees(step: Step) -> bool:
     """True if an injected step raises an alarm in time."""
     rows = round(10 * (ONSET_MIN + HORIZON_MIN))
     messages = _messages(rows, step.seed, f"{step.cause}:step:{step.size!r}@{ONSET_MIN}min")
-    result = backtest.run(messages, CONFIG, trained=_trained())
+    result = backtest.run(messages, CONFIG, trained=_training())
     return any(alarm.raised_ns / 60e9 >= ONSET_MIN for alarm, _ in result.raised_alarms)
 
 
 @cache
-def _trained() -> Any:
+def _training() -> Any:
     return backtest.train(_messages(1000, 1), CONFIG)
 
 

@@ -206,6 +206,11 @@ class BlackBoxReference:
         return z
 
     @property
+    def is_trusted(self) -> bool:
+        """True if it simulates, or its dynamics are determined; if not, it is an ARX model with products."""
+        return self.model.is_determined or self.model.gain == 0.0
+
+    @property
     def weakness(self) -> str:
         """Reason why the promise may not hold at set points that the training has not seen; empty if it does."""
         if self.model.is_determined:

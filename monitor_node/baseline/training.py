@@ -333,8 +333,8 @@ class Training:
         if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven and is_long):
             black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
         if black_box is not None:
-            residuals = black_box[1] * np.array(black_box[0].typical_sd)
-            if self._config.reference == "black-box" or _predicts_as_well(residuals, identified):
+            residuals, is_trusted = black_box[1] * np.array(black_box[0].typical_sd), black_box[0].is_trusted
+            if self._config.reference == "black-box" or (is_trusted and _predicts_as_well(residuals, identified)):
                 return black_box
         return self._arx_reference(given_inputs), identified, screenings
 

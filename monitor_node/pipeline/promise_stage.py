@@ -60,7 +60,6 @@ class PromiseStage:
         self.states_power = states_power
         self._config, self._failures, self._check, self._points = config, failures, check, points
         self._watch: Watch | None = None
-        self._excess = 1.0
         self._published: Promise | None = None
         self._key = keys.key(config.plant, keys.PROMISE, NODE)
         charts = {name for name, _ in alarm_names(config)}
@@ -93,12 +92,14 @@ class PromiseStage:
             excess: times as many false alarms as promised that residuals after moves of the inputs raise.
             watch: the plant as it is watched, to state its power by; None: that is not stated.
         """
-        self.alarm_rates, self._watch, self._excess = rates, watch, excess
+        self.alarm_rates, self._watch = rates, watch
         rows = false_alarm_budget.DAYS_MIN / period_min
         mean, upper = rows * mean_rate, rows * float(np.quantile(rates, QUANTILE))
         before = PromiseState(0.0, 0.0, rows) if self.promise is None else self.promise.state
         state = replace(before, per_30_days=mean, upper_per_30_days=max(mean, upper), rows_in_30_days=rows)
-        self.promise = PlantPromise(replace(state, check=TrainingCheck()))
+        self.promise = PlantPromise(
+            replace(state, check=TrainingCheck(excess=excess if excess > LEAST_EXCESS else 0.0))
+        )
 
     def check(self, rows: TrainingState, model: ProcessModel | None, kind: str, rows_watched: int) -> str:
         """Judge the training by itself, and state the power; an error there leaves the promise without them.
@@ -120,16 +121,14 @@ class PromiseStage:
                 self.promise.power = state_power(watch, rows)
             except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
                 self._failures.add("power", error, "the deviations that would be seen are not stated")
-        if self._check is None:
-            return ""
-        try:
-            check = self._check(self._config, model, rows, kind)
-        except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
-            self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
-            return ""
-        if self._excess > LEAST_EXCESS:
-            check = replace(check, excess=max(check.excess, self._excess))
-        self.promise.state = replace(self.promise.state, check=check)
+        if self._check is not None:
+            try:
+                check = self._check(self._config, model, rows, kind)
+            except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
+                self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
+            else:
+                check = replace(check, excess=max(check.excess, self.promise.state.check.excess))
+                self.promise.state = replace(self.promise.state, check=check)
         return "" if self.promise.is_kept else self._note(rows_watched)
 
     @property

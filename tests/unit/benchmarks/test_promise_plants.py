@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.promise import plants
+from benchmarks.promise import black_box, faults, plants
 from benchmarks.promise.__main__ import Outcome, Plant, delay, print_counts, print_delays
 from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
 from benchmarks.promise.pool import median_interval, poisson_interval, run_jobs, share_interval
@@ -106,3 +106,22 @@ def test_the_tables_count_alarms_by_input_and_plants_whose_promise_is_not_kept(
     assert capsys.readouterr().out.endswith(
         "1 of 2 seen within 10 min (95 %: 1 to 99 %), median inf min (1.00 to inf); unseen: feed that wanders.\n"
     )
+
+
+def test_the_tables_of_black_boxes_and_of_faults_have_a_line_for_each_kind(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def result(job: black_box.Job) -> black_box.Result:
+        return black_box.Result(2 * (job.inputs == "wide"), 0.5, 100, 90, job.seed > black_box.SEED)
+
+    monkeypatch.setattr(black_box, "watch", result)
+    black_box.print_table(SerialExecutor(), [job for job in black_box.jobs_of(2) if job.noise == "low"])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2] == "| low | wide | 4 | 1.00 | 4.00 (1.09 to 10.24) | 1 of 2 | 90.0 % |"
+    assert [line.split(" | ")[1] for line in lines[2:]] == [*black_box.INPUTS, "all", "all that are said to be kept"]
+    monkeypatch.setattr(faults, "watch", lambda job: 1.0 if job.has_equations else np.inf)
+    faults.print_table(SerialExecutor(), 1)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2] == "| steps, with equations | 13 | 100 % (75 to 100) | 1.00 (1.00 to 1.00) |"
+    assert lines[4].startswith("| steps, without equations | 13 | 0 % (0 to 25) | inf (inf to inf) |")
+    assert lines[6].startswith("| all, with equations | 16 |")
