@@ -9,11 +9,13 @@ import msgspec
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.find import find_process
 from reactorwatch.runtime.setting_rules import check_bounds
-from reactorwatch.spc.charts.catalogue import CHARTS
+from reactorwatch.spc.charts.base import Setting, SignalSetting
+from reactorwatch.spc.charts.catalogue import CHARTS, chart
 from reactorwatch.spc.m_of_n import check_rule
 from reactorwatch.spc.value_chart import FEWEST_SIGNALS
 
-CHART_SETTINGS = [setting for chart in CHARTS for setting in chart.settings]
+CHART_SETTINGS = [setting for chart in CHARTS for setting in chart.settings if isinstance(setting, Setting)]
+CHART_SIGNALS = [setting for chart in CHARTS for setting in chart.settings if isinstance(setting, SignalSetting)]
 
 if TYPE_CHECKING:
     ChartName: TypeAlias = str
@@ -25,7 +27,8 @@ else:
         [
             (item.key, Annotated[float, msgspec.Meta(ge=item.lower, le=item.upper)], item.default)
             for item in CHART_SETTINGS
-        ],
+        ]
+        + [(item.key, tuple[str, ...], ()) for item in CHART_SIGNALS],
         frozen=True,
     )
 
@@ -57,6 +60,12 @@ USUAL_CHARTS = DefaultCharts(("shewhart", "ewma", "mewma"))
 
 CHARTS_OF_MANY = DefaultCharts(("residual_space",))
 """Charts where the settings name none, of many outputs that no equations judge."""
+
+CHARTS_OF_DOZENS = DefaultCharts(("residual_space", "cva_residual"))
+"""Charts where the settings name none, of `DOZENS` outputs or more that no equations judge."""
+
+DOZENS = 20
+"""Outputs from which on the relations between them are worth a second chart, with half of the false alarms."""
 
 WITHOUT_EQUATIONS = ""
 """Setting `process` of a plant that no equations judge."""
@@ -122,7 +131,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
             nominal reactor where its signals are watched; empty: no equations judge.
         charts: charts of the residuals and of the values; where none are named, `residual_space` for 8 outputs or more
-            that no equations judge, else `shewhart`, `ewma` and `mewma`.
+            that no equations judge, with `cva_residual` from 20 on, else `shewhart`, `ewma` and `mewma`.
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
             nearest number that the charts can keep for the number of alarms and the sampling period.
         smallest_sd: least standard deviation of the residual by output, in its unit; smaller deviations do not matter.
@@ -209,12 +218,14 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
                 f"{self.training_rows}; leave one out"
             )
         if isinstance(self.charts, DefaultCharts):
-            are_many = len(self.outputs) >= FEWEST_SIGNALS and not self._may_have_equations
-            msgspec.structs.force_setattr(self, "charts", CHARTS_OF_MANY if are_many else USUAL_CHARTS)
+            count = 0 if self._may_have_equations else len(self.outputs)
+            usual = CHARTS_OF_DOZENS if count >= DOZENS else CHARTS_OF_MANY if count >= FEWEST_SIGNALS else USUAL_CHARTS
+            msgspec.structs.force_setattr(self, "charts", usual)
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
         if self.process is not None and self.outputs == DEFAULT_SIGNALS["outputs"]:
             return  # the outputs are those of the process, which `watched_process` sets
+        self._check_chart_signals()
         for signal in self.startup_modes:
             if signal not in self.modes:
                 raise ValueError(f"startup_modes are by mode, {self.modes}, got {signal!r}")
@@ -275,3 +286,22 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     def chart_settings(self) -> dict[str, float]:
         """The charts' own settings, by key."""
         return {setting.key: getattr(self, setting.key) for setting in CHART_SETTINGS}
+
+    @property
+    def chart_signals(self) -> dict[str, tuple[str, ...]]:
+        """Signals that the settings name for charts, by key."""
+        return {setting.key: getattr(self, setting.key) for setting in CHART_SIGNALS}
+
+    def _check_chart_signals(self) -> None:
+        for item in CHART_SIGNALS:
+            names, kinds = (
+                self.chart_signals[item.key],
+                [kind for kind in map(chart, self.charts) if item in kind.settings],
+            )
+            if not names and kinds:
+                raise ValueError(
+                    f"the chart {kinds[0].name} needs {item.key}, got none; name at most {item.most} of {self.signals}"
+                )
+            unknown = [name for name in names if name not in self.signals]
+            if unknown or len(set(names)) != len(names) or len(names) > item.most:
+                raise ValueError(f"{item.key} must be at most {item.most} of {self.signals}, each once, got {names}")

@@ -30,7 +30,7 @@ from reactorwatch.spc.charts.shewhart import designed_width
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalState
 from reactorwatch.spc.detection import Detector
 from reactorwatch.spc.joint_chart import JointChart
-from reactorwatch.spc.m_of_n import false_alarm_rate
+from reactorwatch.spc.m_of_n import false_alarm_rates
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.training_errors import TrainingErrors
 from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
@@ -220,7 +220,7 @@ class _OfValues:
     """
 
     def __init__(self, values: ValueChart, config: MonitorConfig) -> None:
-        self._chart, self._has_inputs = values, bool(config.inputs)
+        self._chart, self._has_inputs, self.locates = values, bool(config.inputs), values.locates
         self._indices = [config.signals.index(name) for name in values.names]
 
     def to_bytes(self) -> bytes:
@@ -295,7 +295,7 @@ class ChartWatch:
         return list(self._watched) == self._names and self._board.is_at_rest(self._alarms.values())
 
     def load(self, p: np.void) -> None:
-        """Fill the numbers of a plant, see `row_step.row_type`, from the charts and their alarms."""
+        """Fill the numbers of a plant, see `row_frame.row_type`, from the charts and their alarms."""
         for name, watched in self._watched.items():
             assert isinstance(watched.charts, _Banked | _OfAll)
             p[name] = watched.charts.numbers
@@ -356,7 +356,8 @@ class ChartWatch:
         obstacles |= {
             name: why
             for name in self._names
-            if issubclass(kind := chart(name), ValueChart) and (why := kind.obstacle(complete, self._signals))
+            if issubclass(kind := chart(name), ValueChart)
+            and (why := kind.obstacle(complete, self._signals, self._config.chart_signals))
         }
         charts = [name for name in dict.fromkeys(self._config.charts) if name in self._names and name not in obstacles]
         self._evaluated, self._chosen = evaluated, charts or [name for name in self._names if name not in obstacles]
@@ -402,7 +403,9 @@ class ChartWatch:
         self._watch(design_charts)
 
     def _value_baseline(self, values: Array, arl0: float) -> ValueBaseline:
-        return ValueBaseline(*self._complete_values(values), arl0, self._config.chart_settings)
+        return ValueBaseline(
+            *self._complete_values(values), arl0, self._config.chart_settings, self._config.chart_signals
+        )
 
     def _baseline(self, learned: list[Prewhitening], e: Array, arl0: float) -> Baseline:
         config = self._config
@@ -453,7 +456,7 @@ class ChartWatch:
         """Relative rate of an alarm that takes several points, from that of single points."""
         count, window, p = self._config.raise_count, self._config.window, baseline.point_probability
         nodes = np.geomspace(0.1 * p, 1.0, 40)  # rates of far rarer points are rounding errors, and nothing
-        of_rule = [max(false_alarm_rate(count, window, float(node)) * baseline.arl0, 1e-9) for node in nodes]
+        of_rule = np.maximum(false_alarm_rates(count, window, nodes) * baseline.arl0, 1e-9)
         return np.asarray(np.exp(np.interp(np.log(np.maximum(rates * p, nodes[0])), np.log(nodes), np.log(of_rule))))
 
     @property
@@ -546,7 +549,7 @@ class ChartWatch:
                     continue
                 explanation = self._explain(watched.charts, index, judgement, scales, row.units) if raised else None
                 publications.append(self._board.record_change(alarm, row.time_ns, judgement, SD, explanation))
-                if explanation is not None and isinstance(watched.charts, _OfValues):
+                if explanation is not None and isinstance(watched.charts, _OfValues) and watched.charts.locates:
                     publications += self._board.set_suspects(row.time_ns, _entries(explanation.contributions))
                 if not raised:
                     watched.charts.restart(index)

@@ -104,12 +104,16 @@ def t2(
 
 def list_charts() -> None:
     """List the charts of a monitor, with their keys in its settings."""
+    from reactorwatch.spc.charts.base import Setting
     from reactorwatch.spc.charts.catalogue import CHARTS
 
     for kind in CHARTS:
         print_text(f"{kind.name:<11} {(kind.__doc__ or '').partition(chr(10))[0]}")
         for item in kind.settings:
-            print_text(f"{'':<11} {item.key} = {item.default:g}, in [{item.lower:g}, {item.upper:g}]")
+            if isinstance(item, Setting):
+                print_text(f"{'':<11} {item.key} = {item.default:g}, in [{item.lower:g}, {item.upper:g}]")
+            else:
+                print_text(f"{'':<11} {item.key}: at most {item.most} of the signals")
 
 
 def design(

@@ -16,6 +16,20 @@ BLOCK_BYTES = 1 << 22
 _MISSING_CURE = "--missing {} reads it as not measured"
 
 
+def _to_numpy(cells: Any) -> NDArray[np.float64]:
+    """Values of a pyarrow array of numbers, NaN where null. Its `to_numpy` would import pandas, which takes long.
+
+    Args:
+        cells: pyarrow array of doubles, shape (rows,).
+    """
+    valid, stored = cells.buffers()
+    rows = slice(cells.offset, cells.offset + len(cells))
+    values = np.frombuffer(stored or b"", np.float64)[rows].copy()
+    if valid is not None:
+        values[np.unpackbits(np.frombuffer(valid, np.uint8), bitorder="little")[rows] == 0] = np.nan
+    return values
+
+
 class TextTable:
     """Columns of a table, by number from 0.
 
@@ -82,8 +96,7 @@ class TextTable:
         if column not in self._known:
             cells = self._table.column(str(column))
             if str(cells.type) == "double":
-                values = cells.to_numpy()  # several chunks are copied
-                values = values if values.flags.writeable else values.copy()  # users may change it
+                values = _to_numpy(cells.combine_chunks())
             else:
                 text = cells.combine_chunks()
                 values, bad = to_numbers(text, self.layout.decimal, self.layout.missing)

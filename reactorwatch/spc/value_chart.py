@@ -2,7 +2,8 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Self
+from types import MappingProxyType
+from typing import ClassVar, NamedTuple, Self
 
 from numpy.typing import ArrayLike
 
@@ -26,12 +27,14 @@ class ValueBaseline(NamedTuple):
         values: rows in which no signal is missing, shape (rows, signals); each varies.
         arl0: run length of the alarm of a single signal without a fault, in rows.
         settings: settings of the charts, by key.
+        signals: signals that the settings name for charts, by key.
     """
 
     names: tuple[str, ...]
     values: Array
     arl0: float
     settings: Mapping[str, float]
+    signals: Mapping[str, tuple[str, ...]] = MappingProxyType({})
 
 
 class ValueChart(Chart):
@@ -41,9 +44,13 @@ class ValueChart(Chart):
 
     Attributes:
         names: names of its signals, in the order of a sample.
+        locates: whether the first signals of its explanation are those at which a disturbance may enter.
+        fewest_signals: least number of its signals.
     """
 
     names: tuple[str, ...]
+    locates: ClassVar[bool] = False
+    fewest_signals: ClassVar[int] = FEWEST_SIGNALS
 
     @classmethod
     @abstractmethod
@@ -68,15 +75,20 @@ class ValueChart(Chart):
         """The text of an alarm at the newest sample, and each signal's share of it, the largest first."""
 
     @classmethod
-    def obstacle(cls, values: Array, names: Sequence[str]) -> str:
+    def obstacle(cls, values: Array, names: Sequence[str], signals: Mapping[str, tuple[str, ...]]) -> str:
         """The reason why there can be no chart after a training; empty if there can.
 
         Args:
             values: rows in which no signal is missing, shape (rows, signals); each varies.
             names: names of the signals.
+            signals: see `ValueBaseline`.
         """
-        if len(names) < FEWEST_SIGNALS:
-            return f"it needs {FEWEST_SIGNALS} signals or more that vary, got {len(names)}"
+        for item in cls.settings:
+            lost = [name for name in signals.get(item.key, ()) if name not in names]
+            if lost:
+                return f"{item.key} names {lost[0]}, which does not vary in the training or has no values there"
+        if len(names) < cls.fewest_signals:
+            return f"it needs {cls.fewest_signals} signals or more that vary, got {len(names)}"
         needed = max(ROWS_A_SIGNAL * len(names), FEWEST_ROWS)
         if len(values) < needed:
             return (

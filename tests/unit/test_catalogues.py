@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,8 @@ import monitor_node.signal_checks
 import reactorwatch.process.library.cstr.effects
 import reactorwatch.spc.charts
 import recorder.panels
-from monitor_node.config import MonitorConfig
-from monitor_node.pipeline import row_step
+from monitor_node.config import CHART_SIGNALS, MonitorConfig
+from monitor_node.pipeline import row_frame, row_step
 from monitor_node.signal_checks.catalogue import CHECKS
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.spc.charts.catalogue import CHARTS
@@ -162,8 +163,9 @@ def test_one_file_and_one_line_make_an_effect_that_is_simulated(sources: Path, t
 def test_a_chart_or_check_that_is_not_compiled_for_fleets_leaves_plants_to_the_ordinary_path(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    signals: dict[str, Any] = {item.key: ("C",) for item in CHART_SIGNALS}
     for kind in CHARTS:
-        config = MonitorConfig(charts=(kind.name,))
-        assert (row_step.RowStep.of(config, cstr()) is None) == (kind.name not in row_step.CHARTS)
+        config = MonitorConfig(charts=(kind.name,), **signals)
+        assert (row_step.RowStep.of(config, cstr()) is None) == (kind.name not in row_frame.CHARTS)
     monkeypatch.setattr(row_step, "CHECKS", CHECKS[:-1])
     assert row_step.RowStep.of(MonitorConfig(), cstr()) is None

@@ -69,6 +69,18 @@ class Setting(NamedTuple):
     upper: float
 
 
+class SignalSetting(NamedTuple):
+    """Signals that a user must name for a chart: a key of the monitor's settings.
+
+    Attributes:
+        key: begins with the chart's name.
+        most: largest number of signals.
+    """
+
+    key: str
+    most: int
+
+
 class Shown(NamedTuple):
     """A signal as texts of alarms show it.
 
@@ -112,7 +124,7 @@ class Chart(ABC):
     name: ClassVar[str]
     State: ClassVar[type[ChartState]]
     has_memory: ClassVar[bool] = True
-    settings: ClassVar[tuple[Setting, ...]] = ()
+    settings: ClassVar[tuple[Setting | SignalSetting, ...]] = ()
 
     @classmethod
     def detector(cls, baseline: Baseline) -> "tuple[float, float, Array] | None":

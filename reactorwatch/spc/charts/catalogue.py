@@ -5,15 +5,29 @@ From it come the names that `[monitor] charts` takes, the charts' own keys there
 
 from reactorwatch.spc.charts.base import Chart
 from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.cva_residual import CvaResidual
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.charts.pca import PcaSpe, PcaT2
+from reactorwatch.spc.charts.pls import Pls
 from reactorwatch.spc.charts.residual_space import ResidualSpace
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.charts.t2 import T2
 
-CHARTS: tuple[type[Chart], ...] = (Shewhart, Ewma, Cusum, T2, Mewma, PcaT2, PcaSpe, ResidualSpace, ParameterT2)
+CHARTS: tuple[type[Chart], ...] = (
+    Shewhart,
+    Ewma,
+    Cusum,
+    T2,
+    Mewma,
+    PcaT2,
+    PcaSpe,
+    ResidualSpace,
+    CvaResidual,
+    Pls,
+    ParameterT2,
+)
 
 
 def chart(name: str) -> type[Chart]:

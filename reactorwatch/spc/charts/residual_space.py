@@ -116,6 +116,7 @@ class ResidualSpace(ValueChart):
     """
 
     name = "residual_space"
+    locates = True
     State = ResidualSpaceState
     settings = (Setting("residual_space_weight", 0.1, 0.01, 1.0),)
 
@@ -184,15 +185,7 @@ class ResidualSpace(ValueChart):
 
     def fill(self, x: Array) -> Array | None:
         """See `ValueChart`: a missing signal gets its mean given the others, so its residual is 0."""
-        missing = ~np.isfinite(x)
-        count = int(np.count_nonzero(missing))
-        if not count:
-            return x
-        if count > MOST_MISSING * x.size:
-            return None
-        off = np.where(missing, 0.0, x - self._centre)
-        off[missing] = -np.linalg.solve(self._matrix[np.ix_(missing, missing)], self._matrix[missing] @ off)
-        return np.asarray(np.where(missing, self._centre + off, x))
+        return fill_missing(x, self._centre, self._matrix)
 
     def explain(self) -> tuple[str, dict[str, float]]:
         """See `ValueChart`: shares of the squared averages."""
@@ -210,6 +203,25 @@ class ResidualSpace(ValueChart):
     def restart(self) -> None:
         """Forget the rows seen."""
         self._averages[:] = 0.0
+
+
+def fill_missing(x: Array, centre: Array, matrix: Array) -> Array | None:
+    """The sample with the mean given the others in place of missing signals; None if too many are missing.
+
+    Args:
+        x: values of the signals, shape (p,); NaN where missing.
+        centre: mean of each signal, shape (p,).
+        matrix: matrix from deviations of the signals to residuals, each in any unit, shape (p, p).
+    """
+    missing = ~np.isfinite(x)
+    count = int(np.count_nonzero(missing))
+    if not count:
+        return x
+    if count > MOST_MISSING * x.size:
+        return None
+    off = np.where(missing, 0.0, x - centre)
+    off[missing] = -np.linalg.solve(matrix[np.ix_(missing, missing)], matrix[missing] @ off)
+    return np.asarray(np.where(missing, centre + off, x))
 
 
 def limit_of(baseline: ValueBaseline, freedom: float, largest: float) -> float:

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from monitor_node.config import CHARTS_OF_MANY, USUAL_CHARTS, DefaultCharts, MonitorConfig
+from monitor_node.config import CHARTS_OF_DOZENS, CHARTS_OF_MANY, DOZENS, USUAL_CHARTS, DefaultCharts, MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm
@@ -51,6 +51,7 @@ def raised(said: list[Publication]) -> list[Alarm]:
     ("config", "charts"),
     [
         (settings(), CHARTS_OF_MANY),
+        (settings(outputs=tuple(f"y{i}" for i in range(DOZENS))), CHARTS_OF_DOZENS),
         (settings(7), USUAL_CHARTS),
         (settings(7, inputs=("u", "v")), USUAL_CHARTS),
         (settings(process="plant.toml"), USUAL_CHARTS),

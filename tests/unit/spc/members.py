@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from reactorwatch.spc import run_length
 from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.cva_residual import CvaResidual
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.charts.pca import PcaModel, PcaSpe, PcaT2
+from reactorwatch.spc.charts.pls import Pls
 from reactorwatch.spc.charts.residual_space import ResidualSpace
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.charts.t2 import T2
@@ -64,6 +66,16 @@ def related(rng: np.random.Generator, rows: int) -> Array:
 
 MODEL = PcaModel.fit(related(np.random.default_rng(1), 20_000), components=2, false_alarm=0.05)
 
+
+def known(statistics: int) -> dict[str, Array]:
+    """Averages of cube roots that are shown as they are, of three signals."""
+    one = np.ones(statistics)
+    return {"means": 0.0 * one, "row_sds": one, "sds": one, "usual_parts": np.zeros((statistics, 3))}
+
+
+NEWEST = np.hstack([np.zeros((3, 6)), np.linalg.inv(ROOT)])
+"""Relations of the newest of three rows: Tr2 is a third of its T2."""
+
 MEMBERS: dict[type, Member] = {
     Shewhart: Member(
         lambda: Shewhart(MEAN, SIGMA, rules=(1, 2, 3, 4)), value, run_length.shewhart(SHIFT, rules=(1, 2, 3, 4))
@@ -83,6 +95,36 @@ MEMBERS: dict[type, Member] = {
     ),
     PcaT2: Member(lambda: PcaT2(MODEL), related, 20.0),
     PcaSpe: Member(lambda: PcaSpe(MODEL), related, 20.0),
+    CvaResidual: Member(  # without memory, whose first two rows are not judged
+        lambda: CvaResidual(
+            ["C", "T", "qc"],
+            {"centre": MEANS, "scale": np.ones(3), "rest": NEWEST, **known(1)},
+            weight=1.0,
+            limit=float(np.cbrt(10.0 / 3.0)),
+        ),
+        vector,
+        run_length.t2(SHIFT, 3, 10.0) + 2.0,
+    ),
+    Pls: Member(  # all three signals are white scores, so nothing is left for SPE
+        lambda: Pls(
+            ["C", "T", "qc"],
+            {
+                "centre": MEANS,
+                "scale": np.ones(3),
+                "is_quality": np.zeros(3),
+                "rotations": np.linalg.inv(ROOT).T,
+                "loadings": ROOT,
+                "of_quality": np.zeros((0, 3)),
+                "variances": np.ones(3),
+                "rest": np.ones(1),
+                **known(2),
+            },
+            weight=1.0,
+            limit=float(np.cbrt(10.0 / 3.0)),
+        ),
+        vector,
+        run_length.t2(SHIFT, 3, 10.0),
+    ),
     ResidualSpace: Member(  # of one signal, whose average it is
         lambda: ResidualSpace(["T"], [MEAN], [[sqrt(1.9 / 0.1) / SIGMA]], weight=0.1, limit=2.8),
         lambda rng, rows: value(rng, rows)[:, None],

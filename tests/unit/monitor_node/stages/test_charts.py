@@ -1,11 +1,12 @@
 """The charts of a plant together: every kind finds what it is for, says whose it is, and begins anew afterwards."""
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 
-from monitor_node.config import ChartName, MonitorConfig
+from monitor_node.config import CHART_SIGNALS, ChartName, MonitorConfig
 from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.charts.cusum import CEILING, Cusum
 
@@ -44,7 +45,9 @@ def test_each_chart_alone_finds_a_lasting_shift_of_a_sensor_and_says_whose_it_is
 
 
 def test_all_charts_together_are_quiet_on_a_sound_plant_and_share_the_budget() -> None:
-    config = MonitorConfig(charts=tuple(kind.name for kind in CHARTS if kind.name != "parameters"), isolation=False)
+    names = tuple(kind.name for kind in CHARTS if kind.name != "parameters")
+    signals: dict[str, Any] = {item.key: ("C",) for item in CHART_SIGNALS}
+    config = MonitorConfig(charts=names, isolation=False, **signals)
     run = watched(*sound_run(400.0, seed=2), config)
     assert run.raised == []
     alone = watched(*sound_run(110.0, seed=2), MonitorConfig(charts=("shewhart",), isolation=False))

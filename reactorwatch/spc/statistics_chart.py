@@ -1,0 +1,289 @@
+"""Charts of statistics of a model of all signals, such as T2 and SPE: averaged, with limits from held-out blocks.
+
+A model that was fitted to few rows fits them better than new ones, and the statistics of a plant remember. So the
+training is cut into blocks, the model of the other blocks judges each, and from the cube roots of these statistics,
+which are nearly normal (Wilson & Hilferty 1931, The distribution of chi-square, Proc. Nat. Acad. Sci. 17), an
+autoregression is learned. It gives the variance of their exponentially weighted average, and its own errors widen the
+limit, as they do for charts of residuals (`false_alarm_budget`). The chart plots the largest of the averages, in
+standard deviations.
+
+Two bounds change nothing in sound rows: a cube root counts at most `OUTLIER` standard deviations, so one wild row
+is no lasting change; an average stays below `RELEASE` limits, so the alarm of a large change ends soon after it.
+"""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from math import sqrt
+from typing import ClassVar, NamedTuple, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import special
+
+from reactorwatch.spc.charts.base import Array, ChartState, Judgement, positive, vector
+from reactorwatch.spc.charts.residual_space import BLOCKS, adjustment, fill_missing
+from reactorwatch.spc.false_alarm_budget import degrees_of_freedom
+from reactorwatch.spc.prewhitening import Prewhitening, learn
+from reactorwatch.spc.run_length.design import ewma_limit
+from reactorwatch.spc.training_errors import TrainingErrors
+from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
+from reactorwatch.stored_state import pack_numbers, unpack_numbers
+
+OUTLIER = 6.0
+"""Largest deviation of a row's cube root that counts, in standard deviations."""
+
+RELEASE = 1.25
+"""Largest average, in limits."""
+
+RESPONSE = 20.0
+"""Length of the average's impulse response in units of its memory."""
+
+SUSPICIOUS = 0.5
+"""Share of the limit from which on the parts of the signals are summed."""
+
+NAMED = 3
+"""Signals that the text of an alarm names."""
+
+Model: TypeAlias = dict[str, Array]
+"""Arrays of a model, by name."""
+
+
+class StatisticsState(ChartState, frozen=True):
+    """State of such a chart: arrays of its model and limits by name, each with its shape, and its memory."""
+
+    names: list[str]
+    weight: float
+    limit: float
+    model: dict[str, tuple[list[int], bytes]]
+    averages: bytes
+    parts: bytes
+    before: bytes
+
+
+class Averages(NamedTuple):
+    """Averages of sound statistics' cube roots, one each.
+
+    Attributes:
+        means: mean of the cube roots.
+        row_sds: standard deviation of a row's cube root.
+        sds: standard deviation of the average, errors of the mean included.
+        freedom: degrees of freedom of the least known one.
+    """
+
+    means: Array
+    row_sds: Array
+    sds: Array
+    freedom: float
+
+
+class StatisticsChart(ValueChart):
+    """Averages of the statistics of a model of all signals.
+
+    Args:
+        names: names of the signals.
+        model: arrays of the model, with those of `Averages` and of the missing signals.
+        weight: lambda, of the newest row, in (0, 1].
+        limit: limit of the averages in standard deviations.
+
+    Attributes:
+        labels: names of the statistics.
+        rows_before: number of rows before the newest one that the statistics need.
+        pieces: number of separate pieces of a held-out block.
+        weight_key: key of the setting of the weight.
+        reason: what a large statistic means, for the text of an alarm.
+    """
+
+    State = StatisticsState
+    labels: ClassVar[tuple[str, ...]]
+    rows_before: ClassVar[int] = 0
+    pieces: ClassVar[int] = 1
+    weight_key: ClassVar[str]
+    reason: ClassVar[str]
+
+    def __init__(self, names: Sequence[str], model: Mapping[str, Array], weight: float, limit: float) -> None:
+        self.names, self.weight, self.limit = tuple(names), float(weight), positive("limit", limit)
+        self.model: Model = {name: np.ascontiguousarray(item, np.float64) for name, item in model.items()}
+        if any(self.model[name].shape != (len(self.labels),) for name in ("means", "row_sds", "sds")):
+            raise ValueError(f"a chart of {', '.join(self.labels)} must have a mean and deviations of each")
+        self._averages, self._parts = np.zeros(len(self.labels)), np.zeros((len(self.labels), len(self.names)))
+        self._before: Array = np.empty((0, len(self.names)))
+        self._newest: Array = np.zeros(len(self.names))
+
+    @classmethod
+    @abstractmethod
+    def fit(cls, values: Array, baseline: ValueBaseline) -> Model:
+        """The model of rows, shape (rows, signals); `baseline` has their names and the settings."""
+
+    @classmethod
+    @abstractmethod
+    def parts(cls, model: Model, window: Array) -> Array:
+        """Each signal's part of the statistics of a row, whose sums they are, shape (statistics, signals).
+
+        Args:
+            model: from `fit`.
+            window: the row and those before it, the newest last, shape (rows_before + 1, signals).
+        """
+
+    @classmethod
+    def statistics(cls, model: Model, window: Array) -> Array:
+        """Statistics of a row, shape (statistics,); arguments as for `parts`."""
+        return np.asarray(cls.parts(model, window).sum(axis=1))
+
+    @classmethod
+    def edges(cls, baseline: ValueBaseline) -> list[int]:
+        """First row of each piece of the training, and the number of its rows; see `pieces`."""
+        edges: list[int] = np.linspace(0, len(baseline.values), BLOCKS * cls.pieces + 1).astype(int).tolist()
+        return edges
+
+    @classmethod
+    def shrinkage(cls, model: Model, held_out: int, rows: int) -> float:
+        """Ratio of the statistics of new rows after a fit to some rows, to that after a fit to fewer; at most 1."""
+        return 1.0
+
+    @classmethod
+    def design(cls, baseline: ValueBaseline) -> Self:
+        """See `ValueChart`."""
+        model, averages = cls.fit(baseline.values, baseline), cls.averages(baseline)
+        centre, matrix = adjustment(baseline.values / (scale := baseline.values.std(axis=0, ddof=1)))
+        model |= {"means": averages.means, "row_sds": averages.row_sds, "sds": averages.sds}
+        model["usual_parts"] = cls._usual_parts(model, baseline.values)
+        model |= {"centre_of_missing": centre * scale, "matrix_of_missing": matrix / scale}
+        return cls(baseline.names, model, baseline.settings[cls.weight_key], cls.limit_of(baseline, averages))
+
+    @classmethod
+    def _usual_parts(cls, model: Model, values: Array) -> Array:
+        windows = (values[row - cls.rows_before : row + 1] for row in range(cls.rows_before, len(values)))
+        return np.asarray(np.mean([cls.parts(model, window) for window in windows], axis=0))
+
+    @classmethod
+    def averages(cls, baseline: ValueBaseline) -> Averages:
+        """Averages of the training's statistics, each row judged by the model of the other blocks."""
+        roots, weight = cls.held_out_roots(baseline), baseline.settings[cls.weight_key]
+        learned = [learn(column, 1e-12) for column in roots.T]
+        variances = [(item.sd / item.shift_gain) ** 2 / item.rows for item in learned]
+        sds = [sqrt(average_variance(item, weight) + v) for item, v in zip(learned, variances, strict=True)]
+        rows = np.nanstd(roots, axis=0)
+        freedom = min(degrees_of_freedom(item, weight) for item in learned)
+        return Averages(np.nanmean(roots, axis=0), rows, np.array(sds), freedom)
+
+    @classmethod
+    def held_out_roots(cls, baseline: ValueBaseline) -> Array:
+        """Cube roots of the statistics of each row by the model of the other blocks, shape (rows, statistics).
+
+        Those of the first rows of a block, whose rows before are in another one, are NaN.
+        """
+        values = baseline.values
+        roots = np.full((len(values), len(cls.labels)), np.nan)
+        for block in range(BLOCKS):
+            pieces = list(pairwise(cls.edges(baseline)))[block::BLOCKS]
+            others = np.delete(values, np.concatenate([np.arange(*piece) for piece in pieces]), axis=0)
+            model = cls.fit(others, baseline)
+            factor = cls.shrinkage(model, len(others), len(values))
+            for first, end in pieces:
+                for row in range(first + cls.rows_before, end):
+                    window = values[row - cls.rows_before : row + 1]
+                    roots[row] = np.cbrt(factor * cls.statistics(model, window))
+        return roots
+
+    @classmethod
+    def limit_of(cls, baseline: ValueBaseline, averages: Averages) -> float:
+        """Limit of the averages for the false alarms of the chart, in standard deviations."""
+        return -float(special.stdtrit(averages.freedom, float(special.ndtr(-cls._known_limit(baseline)))))
+
+    @classmethod
+    def _known_limit(cls, baseline: ValueBaseline) -> float:
+        """Limit of the averages if all about them were known; the alarms of one side are half of those of two."""
+        arl0 = baseline.arl0 * len(cls.labels) / len(baseline.names)
+        return ewma_limit(max(0.5 * arl0, 10.0), baseline.settings[cls.weight_key])
+
+    @classmethod
+    def relative_rates(cls, baseline: ValueBaseline) -> Array:
+        """See `ValueChart`: an average whose variance is off crosses the limit more or less often."""
+        averages, known = cls.averages(baseline), cls._known_limit(baseline)
+        errors = TrainingErrors.draw(1).scale[:, 0]
+        chi2 = 2.0 * special.gammainccinv(0.5 * averages.freedom, special.ndtr(-errors))
+        beyond = special.ndtr(-cls.limit_of(baseline, averages) * np.sqrt(chi2 / averages.freedom))
+        return np.asarray(len(baseline.names) * beyond / special.ndtr(-known))
+
+    @classmethod
+    def from_state(cls, state: StatisticsState) -> Self:
+        """Resume a chart, bit for bit, from its state.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        model = {name: unpack_numbers(data, 1).reshape(shape) for name, (shape, data) in state.model.items()}
+        chart = cls(state.names, model, state.weight, state.limit)
+        averages, parts = unpack_numbers(state.averages, 1)[:, 0], unpack_numbers(state.parts, len(state.names))
+        if averages.shape != chart._averages.shape or not np.all(np.isfinite(averages)):
+            raise ValueError(f"averages must be {chart._averages.size} finite numbers, got {averages.tolist()}")
+        chart._averages, chart._parts, chart._before = averages, parts, unpack_numbers(state.before, len(state.names))
+        return chart
+
+    @property
+    def state(self) -> StatisticsState:
+        """A copy of the full state."""
+        model = {name: (list(item.shape), pack_numbers(item)) for name, item in self.model.items()}
+        memory = (pack_numbers(item) for item in (self._averages, self._parts, self._before))
+        return StatisticsState(list(self.names), self.weight, self.limit, model, *memory)
+
+    def update(self, x: ArrayLike) -> Judgement:
+        """See `Chart`; x has shape (signals,)."""
+        self._newest = vector(x, len(self.names))
+        window = np.concatenate([self._before, self._newest[None]])
+        self._before = window[max(len(window) - self.rows_before, 0) :]
+        if len(window) > self.rows_before:
+            off = np.cbrt(self.statistics(self.model, window)) - self.model["means"]
+            off = np.minimum(off, OUTLIER * self.model["row_sds"]) / self.model["sds"]
+            averages = (1.0 - self.weight) * self._averages + self.weight * off
+            self._averages = np.minimum(averages, RELEASE * self.limit)
+            if self._averages.max() > SUSPICIOUS * self.limit:
+                parts = self.parts(self.model, window) - self.model["usual_parts"]
+                self._parts = (1.0 - self.weight) * self._parts + self.weight * parts
+            else:
+                self._parts = np.zeros_like(self._parts)
+        statistic = max(float(self._averages.max()), 0.0)
+        return Judgement(statistic, 0.0, 0.0, self.limit, statistic > self.limit)
+
+    def fill(self, x: Array) -> Array | None:
+        """See `ValueChart`: a missing signal gets its mean given the others."""
+        return fill_missing(x, self.model["centre_of_missing"], self.model["matrix_of_missing"])
+
+    def explain(self) -> tuple[str, dict[str, float]]:
+        """See `ValueChart`: shares of what the signals' parts of the largest statistic have gained."""
+        largest = int(np.argmax(self._averages))
+        gains = np.maximum(self._parts[largest], 0.0) + 1e-300
+        order = np.argsort(-gains, kind="stable").tolist()
+        shares = {self.names[i]: float(gains[i] / gains.sum()) for i in order}
+        named = " and ".join(f"{name} ({100 * share:.0f} %)" for name, share in list(shares.items())[:NAMED])
+        text = (
+            f"{self.labels[largest]} of the signals {self.reason}: on average {self._averages[largest]:.1f} sd above "
+            f"that of the training (allowed: {self.limit:.1f} sd), most of it of {named}"
+        )
+        return text, shares
+
+    def restart(self) -> None:
+        """Forget the rows seen."""
+        self._averages, self._parts = np.zeros(len(self.labels)), np.zeros_like(self._parts)
+        self._before = np.empty((0, len(self.names)))
+
+
+def average_variance(learned: Prewhitening, weight: float) -> float:
+    """Variance of the exponentially weighted average of an autoregressive signal.
+
+    >>> white = Prewhitening(0.0, (), 2.0, 100, 0.0, 0.0)
+    >>> round(average_variance(white, 0.1), 4)  # 4 * 0.1 / 1.9
+    0.2105
+
+    Args:
+        learned: autoregression of the signal.
+        weight: lambda, of the newest value.
+    """
+    response, past, average, total = 1.0, [0.0] * len(learned.coefficients), 0.0, 0.0
+    for _ in range(int(RESPONSE / weight * max(1.0, 1.0 / learned.shift_gain))):
+        average = (1.0 - weight) * average + weight * response
+        total += average**2
+        past = [response, *past[:-1]] if past else []
+        response = sum(a * value for a, value in zip(learned.coefficients, past, strict=True))
+    return learned.sd**2 * total
