@@ -63,10 +63,8 @@ fuzz: $(READY) ## 200,000 random messages, commands, states and settings: no fai
 soak: $(READY) ## a fleet for ten minutes of kills, cuts and garbage (MINUTES=10 PLANTS=200 SEED=): what is missing or repeated
 	@$(BIN)/python -m benchmarks.soak $(or $(MINUTES),10) $(or $(PLANTS),200) $(SEED)
 
-promise: $(READY) ## false alarms beside the number promised: 80 runs without a fault, 33 sound plants that are not quite the model
-	@$(BIN)/python benchmarks/false_alarms.py
+promise: $(READY) ## false alarms beside the number promised, with equations and without; delays, statements, costs: 20 minutes
 	@$(BIN)/python -m benchmarks.promise
-	@$(BIN)/python -m benchmarks.promise.statements
 
 outside: $(READY) ## public benchmarks beside other methods (DATA=folder of their data, ONLY=words of titles); writes its tables into docs/outside.md
 	@$(BIN)/python -m benchmarks.outside --data $(DATA) $(if $(ONLY),--only "$(ONLY)") --write docs/outside.md

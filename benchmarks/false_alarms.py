@@ -3,15 +3,17 @@
 Both sensors' noise is an autoregression with the coefficient 0.5, and each run has a training of its own. Alarms come
 nearly independently, so the standard error of their number is its square root.
 
-    python benchmarks/false_alarms.py
+    python -m benchmarks.false_alarms
 """
 
 from collections import Counter
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
 
+from benchmarks.promise.pool import poisson_interval, run_jobs
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from reactorwatch.arrays import Array
@@ -19,6 +21,7 @@ from reactorwatch.contract.codec import encode
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
+from reactorwatch.runtime.parallel.jobs import Executor, choose_executor
 from recorder.tools.player import samples_of
 
 RUNS, PER_30_DAYS = 80, 200.0
@@ -43,11 +46,11 @@ class FalseAlarms(NamedTuple):
         return self.raised.total() / self.promised
 
 
-def count_false_alarms(runs: int, per_30_days: float, *, diagnose_training: bool = True) -> FalseAlarms:
+def count_false_alarms(seeds: Iterable[int], per_30_days: float, *, diagnose_training: bool = True) -> FalseAlarms:
     """Count the alarms of runs without a fault.
 
     Args:
-        runs: number of runs of `SPAN_MIN`; the seeds count from 0.
+        seeds: seeds of runs of `SPAN_MIN`.
         per_30_days: promised false alarms in 30 days.
         diagnose_training: see `MonitorConfig`; four fifths of the time of a run.
     """
@@ -55,7 +58,7 @@ def count_false_alarms(runs: int, per_30_days: float, *, diagnose_training: bool
     config = MonitorConfig(false_alarms_per_30_days=per_30_days, isolation=False, diagnose_training=diagnose_training)
     rows = round(SPAN_MIN / PERIOD_MIN)
     time_min: Array = np.arange(rows, dtype=np.float64) * PERIOD_MIN
-    for seed in range(runs):
+    for seed in seeds:
         random = np.random.default_rng(seed)
         qc = np.repeat(random.uniform(90, 111, rows // 10), 10)
         outputs = simulator.run(time_min, qc, np.array([0.1, 438.54])).outputs
@@ -68,14 +71,21 @@ def count_false_alarms(runs: int, per_30_days: float, *, diagnose_training: bool
     return FalseAlarms(raised, promised)
 
 
-def main() -> None:
-    """Print what was raised and what was promised."""
-    found = count_false_alarms(RUNS, PER_30_DAYS)
-    print(f"{RUNS} runs of {SPAN_MIN:g} min, {PER_30_DAYS:g} false alarms in 30 days promised")
-    print(f"alarms raised {found.raised.total()}, promised {found.promised:.1f}, ratio {found.ratio:.2f}")
-    for name, count in found.raised.most_common():
-        print(f"  {name:12s} {count}")
+def watch(seed: int) -> FalseAlarms:
+    """Count the alarms of one run."""
+    return count_false_alarms([seed], PER_30_DAYS)
+
+
+def print_table(executor: Executor, runs: int = RUNS) -> None:
+    """Print what was raised and what was promised in a number of runs."""
+    found = list(run_jobs(executor, watch, range(runs)))
+    raised, promised = sum((item.raised for item in found), Counter[str]()), sum(item.promised for item in found)
+    low, high = poisson_interval(raised.total())
+    print(f"{runs} runs of {SPAN_MIN:g} min, noise with AR {COEFFICIENT:g}, {PER_30_DAYS:g} false alarms in 30 days:")
+    names = ", ".join(f"{name} {count}" for name, count in raised.most_common())
+    ratio = f"{raised.total() / promised:.2f} (95 %: {low / promised:.2f} to {high / promised:.2f})"
+    print(f"alarms raised {raised.total()}, promised {promised:.1f}, ratio {ratio}; {names}", flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    print_table(choose_executor())

@@ -1,16 +1,18 @@
 """`make promise`: false alarms on sound plants that are not quite the model, and faults seen on such plants."""
 
 import argparse
-import os
+import time
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import beta, chi2
 
 import reactorwatch as rw
+from benchmarks import false_alarms
+from benchmarks.promise import black_box, costs, faults, statements
 from benchmarks.promise.plants import INPUTS, KINDS, simulate
+from benchmarks.promise.pool import median_interval, poisson_interval, run_jobs, share_interval
+from reactorwatch.runtime.parallel.jobs import Executor, choose_executor
 
 SEED, SEED_STEP = 100, 1000
 """Seed of the first plant of the first set, and the difference to that of the next set."""
@@ -70,18 +72,43 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kinds", type=int, default=len(KINDS), help="number of kinds of plants")
-    parser.add_argument("--processes", type=int, default=os.cpu_count(), help="processes that work side by side")
+    parser.add_argument("--processes", type=int, help="processes that work side by side (default: one a core)")
+    parser.add_argument("--plants-only", action="store_true", help="without the tables of the other modules")
     options = parser.parse_args(arguments)
-    kinds, moves = range(options.kinds), range(len(INPUTS))
+    executor, start = choose_executor(options.processes), time.perf_counter()
+    print_plants(executor, options.kinds)
+    if not options.plants_only:
+        print("\n## Without equations\n")
+        black_box.print_table(executor, black_box.jobs_of(black_box.SEEDS))
+        print("\n## Medium faults, on a plant as the model\n")
+        faults.print_table(executor, faults.SEEDS)
+        print("\n## Statements held to simulation\n")
+        statements.print_tables(executor)
+        print("\n## Noise with memory\n")
+        false_alarms.print_table(executor)
+        print("\n## Costs\n")
+        costs.main()
+    print(f"\n{time.perf_counter() - start:.0f} s")
+    return 0
+
+
+def print_plants(executor: Executor, count: int) -> None:
+    """Watch sound plants and plants with a fault, and print the tables.
+
+    Args:
+        executor: executor of the jobs.
+        count: number of kinds of plants.
+    """
+    kinds, moves = range(count), range(len(INPUTS))
     sound = [Plant(kind, move) for kind in kinds for move in moves]
     often = [Plant(kind, move, number, HIGH_RATE) for number in (0, 1) for kind in kinds for move in moves]
     faulty = [item._replace(is_faulty=True) for item in sound if KINDS[item.kind].name not in NOT_WATCHED]
-    with ProcessPoolExecutor(options.processes) as pool:
-        outcomes = pool.map(watch, [*sound, *often, *faulty])
-        print_counts("the default promise", sound, outcomes)
-        print_counts(f"{HIGH_RATE:g} false alarms promised in 30 days, each plant twice", often, outcomes)
-        print_delays(faulty, outcomes)
-    return 0
+    outcomes = run_jobs(executor, watch, [*sound, *often, *faulty])
+    print_counts("the default promise", sound, outcomes)
+    for number in (0, 1):
+        own = [item for item in often if item.set == number]
+        print_counts(f"{HIGH_RATE:g} false alarms promised in 30 days, set {number + 1}", own, outcomes)
+    print_delays(faulty, outcomes)
 
 
 def print_counts(title: str, plants: Sequence[Plant], outcomes: Iterator[Outcome]) -> None:
@@ -102,9 +129,8 @@ def print_counts(title: str, plants: Sequence[Plant], outcomes: Iterator[Outcome
     raised = sum(len(item.raised_min) for _, item in found)
     promised, broken = sum_up(item for _, item in found)
     low, high = poisson_interval(raised)
-    print(
-        f"| all | {raised} (95 %: {low:.1f} to {high:.1f}) | {promised:.2g} | {broken} of {len(found)} |\n", flush=True
-    )
+    interval = f"(95 %: {low:.1f} to {high:.1f})"
+    print(f"| all | {raised} {interval} | {promised:.2g} | {broken} of {len(found)} |\n", flush=True)
 
 
 def sum_up(outcomes: Iterable[Outcome]) -> tuple[float, int]:
@@ -119,9 +145,11 @@ def print_delays(plants: Sequence[Plant], outcomes: Iterator[Outcome]) -> None:
     seen = sum(size <= WITHIN_MIN for _, size in found)
     low, high = share_interval(seen, len(found))
     unseen = sorted({name for name, size in found if size > WITHIN_MIN})
+    delays = [size for _, size in found]
+    least, most = median_interval(delays)
     print(
         f"Feed 1.5 K warmer from {ONSET_MIN:g} min on: {seen} of {len(found)} seen within {WITHIN_MIN:g} min (95 %: "
-        f"{100 * low:.0f} to {100 * high:.0f} %), median {np.median([size for _, size in found]):.2f} min"
+        f"{100 * low:.0f} to {100 * high:.0f} %), median {np.median(delays):.2f} min ({least:.2f} to {most:.2f})"
         f"{'; unseen: ' + ', '.join(unseen) if unseen else ''}."
     )
 
@@ -129,18 +157,6 @@ def print_delays(plants: Sequence[Plant], outcomes: Iterator[Outcome]) -> None:
 def delay(outcome: Outcome) -> float:
     """Minutes from the fault to the first alarm after it."""
     return min((time - ONSET_MIN for time in outcome.raised_min if time >= ONSET_MIN), default=np.inf)
-
-
-def poisson_interval(count: int) -> tuple[float, float]:
-    """Exact 95 % interval of the mean of a Poisson number."""
-    low = float(chi2.ppf(0.025, 2 * count)) / 2.0 if count else 0.0
-    return low, float(chi2.ppf(0.975, 2 * count + 2)) / 2.0
-
-
-def share_interval(count: int, total: int) -> tuple[float, float]:
-    """Exact 95 % interval of a share (Clopper & Pearson 1934, Biometrika 26)."""
-    low = float(beta.ppf(0.025, count, total - count + 1)) if count else 0.0
-    return low, float(beta.ppf(0.975, count + 1, total - count)) if count < total else 1.0
 
 
 if __name__ == "__main__":

@@ -4,17 +4,22 @@ python -m benchmarks.promise.statements
 """
 
 import argparse
+from collections import Counter
 from collections.abc import Sequence
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
 from scipy.signal import lfilter
 
+from benchmarks.promise.pool import run_jobs, share_interval
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import Encoded, encode
+from reactorwatch.runtime.parallel.jobs import Executor, choose_executor
 from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.ewma import Ewma, designed_limit
 from reactorwatch.spc.charts.shewhart import Shewhart, designed_width
@@ -27,6 +32,32 @@ PLANTS, TRAININGS, COEFFICIENTS = 1000, (100, 1000, 5000), (0.0, 0.5)
 ARL0, WEIGHT = 20_000.0, 0.1
 CAUSES = ("coolant_flow", "feed_temperature", "reaction_rate", "temperature_bias", "concentration_bias")
 RUNS, FACTOR, ONSET_MIN, HORIZON_MIN = 40, 1.3, 20.0, 60.0
+CONFIG = MonitorConfig(diagnose_training=False, isolation=False)
+"""Settings of the runs: the search for causes changes no alarm."""
+
+
+class Group(NamedTuple):
+    """Simulated plants with trainings of one kind."""
+
+    rows: int
+    coefficient: float
+    plants: int
+
+
+class Step(NamedTuple):
+    """An injected step.
+
+    Attributes:
+        cause: cause of the catalogue.
+        size: size in the unit of the cause.
+        factor: size relative to the stated one.
+        seed: seed of the record.
+    """
+
+    cause: str
+    size: float
+    factor: float
+    seed: int
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,18 +65,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--plants", type=int, default=PLANTS, help="simulated plants for each length of the training")
     parser.add_argument("--runs", type=int, default=RUNS, help="faults injected for each size")
+    parser.add_argument("--processes", type=int, help="processes (default: one a core)")
     options = parser.parse_args(arguments)
-    print("| rows of the training | noise of the residual | plants worse than their bound at 90 % |\n|---|---|---|")
-    for rows in TRAININGS:
-        for coefficient in COEFFICIENTS:
-            share = share_worse(rows, coefficient, options.plants)
-            error = 1.96 * np.sqrt(share * (1.0 - share) / options.plants)
-            print(f"| {rows:,} | AR {coefficient:g} | {100 * share:.1f} % (+- {100 * error:.1f}) |", flush=True)
-    print(f"\n| step, seen within {HORIZON_MIN:g} min | stated size | seen at / {FACTOR:g} | at 1 | at x {FACTOR:g} |")
-    print("|---|---|---|---|---|")
-    for cause, size, shares in seen_shares(options.runs):
-        print(f"| {cause} | {size:.3g} | {' | '.join(f'{100 * share:.0f} %' for share in shares)} |", flush=True)
+    print_tables(choose_executor(options.processes), options.plants, options.runs)
     return 0
+
+
+def print_tables(executor: Executor, plants: int = PLANTS, runs: int = RUNS) -> None:
+    """Print both tables.
+
+    Args:
+        executor: executor of the jobs.
+        plants: simulated plants for each length of the training.
+        runs: faults injected for each size.
+    """
+    print("| rows of the training | noise of the residual | plants worse than their bound at 90 % (95 %) |")
+    print("|---|---|---|", flush=True)
+    groups = [Group(rows, coefficient, plants) for rows in TRAININGS for coefficient in COEFFICIENTS]
+    for group, share in zip(groups, run_jobs(executor, share_of, groups), strict=True):
+        low, high = share_interval(round(share * plants), plants)
+        interval = f"{100 * low:.1f} to {100 * high:.1f}"
+        print(f"| {group.rows:,} | AR {group.coefficient:g} | {100 * share:.1f} % ({interval}) |", flush=True)
+    print(f"\n| step, seen within {HORIZON_MIN:g} min (95 %) | size | at / {FACTOR:g} | at 1 | at x {FACTOR:g} |")
+    print("|---|---|---|---|---|", flush=True)
+    stated = stated_sizes()
+    steps = [
+        Step(cause, factor * stated[cause] * (1.0 if number % 2 else -1.0), factor, 1000 + number)
+        for cause in CAUSES
+        for factor in (1.0 / FACTOR, 1.0, FACTOR)
+        for number in range(runs)
+    ]
+    seen = Counter[tuple[str, float]]()
+    for step, is_seen in zip(steps, run_jobs(executor, sees, steps), strict=True):
+        seen[step.cause, step.factor] += is_seen
+    for cause in CAUSES:
+        cells = []
+        for factor in (1.0 / FACTOR, 1.0, FACTOR):
+            count = seen[cause, factor]
+            low, high = share_interval(count, runs)
+            cells.append(f"{100 * count / runs:.0f} % ({100 * low:.0f} to {100 * high:.0f})")
+        print(f"| {cause} | {stated[cause]:.3g} | {' | '.join(cells)} |", flush=True)
+
+
+def share_of(group: Group) -> float:
+    """Share of a group of plants whose true rate of false alarms is above the stated bound."""
+    return share_worse(group.rows, group.coefficient, group.plants)
 
 
 def share_worse(rows: int, coefficient: float, plants: int, quantile: float = QUANTILE) -> float:
@@ -84,29 +148,25 @@ def _true_rates(learned: Prewhitening, coefficient: float) -> tuple[float, float
     return point * ARL0, ARL0 / ewma(abs(mean) / spread, WEIGHT, limit)
 
 
-def seen_shares(runs: int) -> list[tuple[str, float, list[float]]]:
-    """Cause, stated size, and shares of injected steps seen in time: of that size over a factor, itself, times it."""
+def stated_sizes() -> dict[str, float]:
+    """Size of a step of each cause that is seen within an hour, as a monitor states it after a training."""
     config = MonitorConfig(diagnose_training=False)
     first = backtest.run(_messages(30, 2), config, trained=backtest.train(_messages(1000, 1), config))
     assert first.promise is not None
-    config = MonitorConfig(diagnose_training=False, isolation=False)  # the search for causes changes no alarm
-    trained = backtest.train(_messages(1000, 1), config)
-    stated = {item.deviation: item.within_1_h for item in first.promise.power if not item.profile}
-    found = []
-    for cause in CAUSES:
-        shares = []
-        for factor in (1.0 / FACTOR, 1.0, FACTOR):
-            seen = 0
-            for number in range(runs):
-                size = factor * stated[cause] * (1.0 if number % 2 else -1.0)
-                rows = _messages(
-                    round(10 * (ONSET_MIN + HORIZON_MIN)), 1000 + number, f"{cause}:step:{size!r}@{ONSET_MIN}min"
-                )
-                result = backtest.run(rows, config, trained=trained)
-                seen += any(alarm.raised_ns / 60e9 >= ONSET_MIN for alarm, _ in result.raised_alarms)
-            shares.append(seen / runs)
-        found.append((cause, stated[cause], shares))
-    return found
+    return {item.deviation: item.within_1_h for item in first.promise.power if not item.profile}
+
+
+def sees(step: Step) -> bool:
+    """True if an injected step raises an alarm in time."""
+    rows = round(10 * (ONSET_MIN + HORIZON_MIN))
+    messages = _messages(rows, step.seed, f"{step.cause}:step:{step.size!r}@{ONSET_MIN}min")
+    result = backtest.run(messages, CONFIG, trained=_training())
+    return any(alarm.raised_ns / 60e9 >= ONSET_MIN for alarm, _ in result.raised_alarms)
+
+
+@cache
+def _training() -> Any:
+    return backtest.train(_messages(1000, 1), CONFIG)
 
 
 def _messages(rows: int, seed: int, *faults: str) -> list[Encoded]:

@@ -46,15 +46,20 @@ class Screening(NamedTuple):
         usable: shape (n,), False where left out or missing.
         disturbed_intervals: disturbed rows, each (first, last), both included.
         shifts: deviation of each interval's mean, in robust standard deviations of single values.
-        outliers: number of single values left out.
+        single: shape (n,), True for single values that are left out.
         left_out: shape (n,), True in disturbed rows and for outliers.
     """
 
     usable: Mask
     disturbed_intervals: list[tuple[int, int]]
     shifts: list[float]
-    outliers: int
+    single: Mask
     left_out: Mask
+
+    @property
+    def outliers(self) -> int:
+        """Number of single values left out."""
+        return int(np.count_nonzero(self.single))
 
     @property
     def refused(self) -> bool:
@@ -72,7 +77,7 @@ def screen_baseline(z: Array, smallest_sd: float = 0.0) -> Screening:
     """
     present = np.isfinite(z)
     if not present.any():
-        return Screening(present, [], [], 0, np.zeros(z.size, np.bool_))
+        return Screening(present, [], [], none := np.zeros(z.size, np.bool_), none)
     centre, sd = _centre_and_sd(z[present], smallest_sd)
     size = max(SMALLEST_BLOCK, z.size // BLOCKS)
     starts = np.arange(0, z.size - size + 1, size)
@@ -88,7 +93,7 @@ def screen_baseline(z: Array, smallest_sd: float = 0.0) -> Screening:
     shifts = [float(np.nanmean(z[first : last + 1]) - centre) / max(sd, 1e-300) for first, last in disturbed_intervals]
     single = screen_baseline & (np.abs(np.where(present, z, centre) - centre) > OUTLIER * sd) & (sd > 0)
     usable = screen_baseline & ~single
-    return Screening(usable, disturbed_intervals, shifts, int(np.count_nonzero(single)), present & ~usable)
+    return Screening(usable, disturbed_intervals, shifts, single, present & ~usable)
 
 
 def _centre_and_sd(z: Array, smallest_sd: float) -> tuple[float, float]:

@@ -160,10 +160,11 @@ class PlantPromise:
                 else "the training was too short to be judged by itself"
             )
         else:
+            found = f"{_count(check.found)}, {check.expected:.2g} promised"
             parts = [
-                f"in the second half of its training, judged by the first, {_count(check.found)}, "
-                f"{check.expected:.2g} promised: this plant wanders, or its training has not seen enough of it; from "
-                f"this training {describe_rate(self.can_keep_per_30_days)} can be promised; {REMEDY}"
+                (f"in the second half of its training, judged by the first, {found}: " if check.rows else "")
+                + "this plant wanders, its model errs after moves of the inputs, or its training has not seen enough of"
+                f" it; from this training {describe_rate(self.can_keep_per_30_days)} can be promised; {REMEDY}"
             ]
         if state.found:
             parts.append(f"{_count(state.found)} since, {self.mean_count(rows):.2g} promised")

@@ -19,6 +19,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from monitor_node.baseline.black_box_reference import BlackBoxReference
+from monitor_node.baseline.move_check import AfterMoves, compare_after_moves
 from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
 from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_structure, fewest_rows
 from monitor_node.baseline.references import ArxReference, ProcessReference, Reference
@@ -83,6 +84,8 @@ class TrainingResult(NamedTuple):
         responses: response of each residual to a lasting step of one unit of its output, shape (outputs, rows); NaN
             where there is no model; None for equations.
         outliers: number of single values of each output that were left out.
+        after_moves: size of the residuals after moves of the inputs, those that were left out too; as usual for
+            equations, whose limits allow for what is not known of the response to a move.
     """
 
     reference: Reference
@@ -96,6 +99,19 @@ class TrainingResult(NamedTuple):
     left_out: dict[str, str]
     responses: Array | None
     outliers: list[int]
+    after_moves: AfterMoves
+
+    def excess_rate(self, arl0: float) -> float:
+        """Times as many false alarms as promised, by what the training shows of moves of the inputs.
+
+        Where it did not determine the dynamics, each new set point may raise every alarm, and the next may come within
+        the length of the training.
+
+        Args:
+            arl0: in-control run length of each alarm, in rows.
+        """
+        is_weak = isinstance(self.reference, BlackBoxReference) and bool(self.reference.weakness)
+        return max(self.after_moves.excess_rate(arl0), arl0 / len(self.z) if is_weak else 0.0)
 
 
 MOST_OUT_OF_RANGE = 1.0 / 3.0
@@ -158,10 +174,11 @@ class Training(TrainingRows):
             _refusal(outputs, screenings, evaluated) if any(evaluated) else "; ".join(dict.fromkeys(left_out.values()))
         )
         if refused and last_chance and any(evaluated):
-            refused, screenings = "", [Screening(known, [], [], 0, np.zeros_like(known)) for known in np.isfinite(z).T]
+            none = np.zeros(len(z), dtype=np.bool_)
+            refused, screenings = "", [Screening(known, [], [], none, none) for known in np.isfinite(z).T]
         usable = np.column_stack([item.usable for item in screenings]) & np.array(evaluated)
         disturbed = np.column_stack([item.left_out for item in screenings]) | ~np.array(evaluated)
-        z = np.where(usable, z, np.nan)
+        all_z, z = z, np.where(usable, z, np.nan)
         if isinstance(reference, ProcessReference | BlackBoxReference):
             smallest = [sd / typical for sd, typical in zip(smallest, reference.typical_sd, strict=True)]
         learned = [
@@ -169,6 +186,13 @@ class Training(TrainingRows):
             for column, sd, is_evaluated in zip(z.T, smallest, evaluated, strict=True)
         ]
         e = np.column_stack([_prewhiten(column, item) for column, item in zip(z.T, learned, strict=True)])
+        after_moves = AfterMoves()
+        if not isinstance(reference, ProcessReference):
+            columns = [
+                np.where(screenings[i].single, np.inf, _prewhiten(all_z[:, i], learned[i]))
+                for i in np.flatnonzero(evaluated)
+            ]
+            after_moves = compare_after_moves(np.column_stack(columns), inputs)
         checks = [
             Check(
                 name="training", result=refused or _screening_summary(outputs, time_min, screenings, evaluated) or "ok"
@@ -186,7 +210,18 @@ class Training(TrainingRows):
         measured = np.where(usable, measured, np.nan)
         responses, outliers = self._step_responses(reference), [item.outliers for item in screenings]
         return TrainingResult(
-            reference, learned, z, e, measured, values, checks, refused, left_out, responses, outliers
+            reference,
+            learned,
+            z,
+            e,
+            measured,
+            values,
+            checks,
+            refused,
+            left_out,
+            responses,
+            outliers,
+            after_moves,
         )
 
     def _step_responses(self, reference: Reference) -> Array | None:
@@ -241,8 +276,8 @@ class Training(TrainingRows):
         if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven and is_long):
             black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
         if black_box is not None:
-            residuals, is_sure = black_box[1] * np.array(black_box[0].typical_sd), not black_box[0].weakness
-            if self._config.reference == "black-box" or (is_sure and _predicts_as_well(residuals, identified)):
+            residuals, is_trusted = black_box[1] * np.array(black_box[0].typical_sd), black_box[0].is_trusted
+            if self._config.reference == "black-box" or (is_trusted and _predicts_as_well(residuals, identified)):
                 return black_box
         return self._arx_reference(given_inputs), identified, screenings
 

@@ -225,7 +225,7 @@ class Evaluation:
         self.signals.learn_spike_rates(trained.outliers, len(trained.e), period_ns, arl0)
         watch = self._watch(trained, units, period_min) if self.promises.states_power else None
         rates = self._budget.alarm_rates(trained, self._evaluated, arl0)
-        self.promises.start(rates, self.chance_alarms / arl0, period_min, watch)
+        self.promises.start(rates, self.chance_alarms / arl0, period_min, trained.excess_rate(arl0), watch)
         if not again:
             self.notes += self._drift.start(self._models.predictors, self._evaluated, arl0)
         self.notes += [f"training: {check.result}" for check in trained.checks if check.result != "ok"]

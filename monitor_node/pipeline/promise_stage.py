@@ -27,6 +27,9 @@ from reactorwatch.spc.training_errors import QUANTILE
 
 RAISED = Event.RAISED.value
 
+LEAST_EXCESS = 1.5
+"""Times as many false alarms as promised from which the promise is not kept."""
+
 CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, TrainingState, str], TrainingCheck]
 """Judges a training by itself, see `training_check`."""
 
@@ -88,13 +91,14 @@ class PromiseStage:
             self.promise = PlantPromise(state, list(Promise.FromString(power).power))
             self._board.warning = self.promise.warning
 
-    def start(self, rates: Array, mean_rate: float, period_min: float, watch: Watch | None) -> None:
+    def start(self, rates: Array, mean_rate: float, period_min: float, excess: float, watch: Watch | None) -> None:
         """State the promise after a training; alarms so far go on to count.
 
         Args:
             rates: see `alarm_rates`.
             mean_rate: false alarms a row, on average over trainings.
             period_min: sampling period.
+            excess: times as many false alarms as promised that residuals after moves of the inputs raise.
             watch: the plant as it is watched, to state its power by; None: that is not stated.
         """
         self.alarm_rates, self._watch = rates, watch
@@ -102,7 +106,9 @@ class PromiseStage:
         mean, upper = rows * mean_rate, rows * float(np.quantile(rates, QUANTILE))
         before = PromiseState(0.0, 0.0, rows) if self.promise is None else self.promise.state
         state = replace(before, per_30_days=mean, upper_per_30_days=max(mean, upper), rows_in_30_days=rows)
-        self.promise = PlantPromise(replace(state, check=TrainingCheck()))
+        self.promise = PlantPromise(
+            replace(state, check=TrainingCheck(excess=excess if excess > LEAST_EXCESS else 0.0))
+        )
         self._board.warning = self.promise.warning
 
     def check(self, rows: TrainingState, model: ProcessModel | None, kind: str, rows_watched: int) -> str:
@@ -125,15 +131,15 @@ class PromiseStage:
                 self.promise.power = state_power(watch, rows)
             except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
                 self._failures.add("power", error, "the deviations that would be seen are not stated")
-        if self._check is None:
-            return ""
-        try:
-            check = self._check(self._config, model, rows, kind)
-        except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
-            self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
-            return ""
-        self.promise.state = replace(self.promise.state, check=check)
-        self._board.warning = self.promise.warning
+        if self._check is not None:
+            try:
+                check = self._check(self._config, model, rows, kind)
+            except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
+                self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
+            else:
+                check = replace(check, excess=max(check.excess, self.promise.state.check.excess))
+                self.promise.state = replace(self.promise.state, check=check)
+                self._board.warning = self.promise.warning
         return "" if self.promise.is_kept else self._note(rows_watched)
 
     def messages(self, time_ns: int, rows: int) -> list[Publication]:

@@ -37,15 +37,21 @@ def _power(power: Power) -> dict[str, Any]:
 
 
 def describe_power(power: Sequence[dict[str, Any]]) -> str:
-    """Steps that are seen within an hour, as one line.
+    """Steps that are seen within an hour, and those of which no size is stated, as one line.
 
     >>> describe_power([{"deviation": "T.bias", "unit": "K", "within_1_h": 0.21}])
     'T.bias 0.21 K'
+    >>> describe_power([{"deviation": "T.bias", "unit": "K", "within_1_h": None}])
+    'none stated: only charts of values watch, or none within its bounds is seen'
     """
     steps = [item for item in power if not item.get("profile") and item["within_1_h"] is not None]
+    if not steps:
+        return "none stated: only charts of values watch, or none within its bounds is seen"
+    are_causes = any(not item["deviation"].endswith(".bias") for item in steps)
+    untraced = "; not stated: causes with states of their own or jumps, as lags" if are_causes else ""
     units = ("" if item["unit"] == "1" else f" {item['unit']}" for item in steps)
     sizes = (f"{item['deviation']} {item['within_1_h']:.2g}" for item in steps)
-    return ", ".join(f"{size}{unit}" for size, unit in zip(sizes, units, strict=True))
+    return ", ".join(f"{size}{unit}" for size, unit in zip(sizes, units, strict=True)) + untraced
 
 
 def describe_sizes(power: dict[str, Any]) -> str:

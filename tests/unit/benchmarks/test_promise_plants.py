@@ -5,20 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.promise import plants
-from benchmarks.promise.__main__ import (
-    Outcome,
-    Plant,
-    delay,
-    poisson_interval,
-    print_counts,
-    print_delays,
-    share_interval,
-)
+from benchmarks.promise import black_box, faults, plants
+from benchmarks.promise.__main__ import Outcome, Plant, delay, print_counts, print_delays
 from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
+from benchmarks.promise.pool import median_interval, poisson_interval, run_jobs, share_interval
 from plant_node.record import simulate_record
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
+from reactorwatch.runtime.parallel.jobs import SerialExecutor
 
 RANDOM_STEPS = INPUTS["a new flow in 90 to 111 each minute"]
 EFFECT_OF = {
@@ -83,6 +77,17 @@ def test_the_interval_of_a_share_is_that_of_clopper_and_pearson() -> None:
     assert share_interval(0, 10)[0] == 0.0
 
 
+def test_the_interval_of_a_median_is_between_the_values_of_the_sign_test() -> None:
+    """Conover (1999), Practical nonparametric statistics, section 3.2: the 2nd and the 9th of ten, the 6th and 15th."""
+    assert median_interval([float(value) for value in range(10, 0, -1)]) == (2.0, 9.0)
+    assert median_interval([float(value) for value in range(1, 21)]) == (6.0, 15.0)
+
+
+def test_a_job_that_fails_ends_the_table() -> None:
+    with pytest.raises(RuntimeError, match="nothing: "):
+        list(run_jobs(SerialExecutor(), int, ["1", "nothing"]))
+
+
 def test_the_delay_is_that_of_the_first_alarm_after_the_onset() -> None:
     assert delay(Outcome([120.0, 401.5, 430.0], 0.1, True)) == pytest.approx(1.5)
     assert delay(Outcome([120.0], 0.1, True)) == np.inf
@@ -99,5 +104,24 @@ def test_the_tables_count_alarms_by_input_and_plants_whose_promise_is_not_kept(
     assert lines[4].startswith("| all | 3 (95 %: 0.6 to 8.8) | 1 | 1 of 3 |")
     print_delays([Plant(5, 0, is_faulty=True)] * 2, iter([Outcome([401.0], 0.0, True), Outcome([], 0.0, True)]))
     assert capsys.readouterr().out.endswith(
-        "1 of 2 seen within 10 min (95 %: 1 to 99 %), median inf min; unseen: feed that wanders.\n"
+        "1 of 2 seen within 10 min (95 %: 1 to 99 %), median inf min (1.00 to inf); unseen: feed that wanders.\n"
     )
+
+
+def test_the_tables_of_black_boxes_and_of_faults_have_a_line_for_each_kind(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def result(job: black_box.Job) -> black_box.Result:
+        return black_box.Result(2 * (job.inputs == "wide"), 0.5, 100, 90, job.seed > black_box.SEED)
+
+    monkeypatch.setattr(black_box, "watch", result)
+    black_box.print_table(SerialExecutor(), [job for job in black_box.jobs_of(2) if job.noise == "low"])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2] == "| low | wide | 4 | 1.00 | 4.00 (1.09 to 10.24) | 1 of 2 | 90.0 % |"
+    assert [line.split(" | ")[1] for line in lines[2:]] == [*black_box.INPUTS, "all", "all that are said to be kept"]
+    monkeypatch.setattr(faults, "watch", lambda job: 1.0 if job.has_equations else np.inf)
+    faults.print_table(SerialExecutor(), 1)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2] == "| steps, with equations | 13 | 100 % (75 to 100) | 1.00 (1.00 to 1.00) |"
+    assert lines[4].startswith("| steps, without equations | 13 | 0 % (0 to 25) | inf (inf to inf) |")
+    assert lines[6].startswith("| all, with equations | 16 |")
