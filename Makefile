@@ -68,8 +68,8 @@ promise: $(READY) ## false alarms beside the number promised: 80 runs without a 
 	@$(BIN)/python -m benchmarks.promise
 	@$(BIN)/python -m benchmarks.promise.statements
 
-outside: $(READY) ## public benchmarks beside other methods (DATA=folder of their data); writes its tables into docs/outside.md
-	@$(BIN)/python -m benchmarks.outside --data $(DATA) --write docs/outside.md
+outside: $(READY) ## public benchmarks beside other methods (DATA=folder of their data, ONLY=words of titles); writes its tables into docs/outside.md
+	@$(BIN)/python -m benchmarks.outside --data $(DATA) $(if $(ONLY),--only "$(ONLY)") --write docs/outside.md
 
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
 	@$(BIN)/python docs/pictures/make.py

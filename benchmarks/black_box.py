@@ -83,8 +83,8 @@ def watch(records: list[Record], reference: ReferenceName) -> Result:
             publications = monitor.on_message(encode(item), 0)
             alarms += sum(isinstance(item.message, Alarm) and item.message.event == "raised" for item in publications)
         expected += monitor.expected_false_alarms
-        rows += monitor.pipeline.rows_watched
-        judged += monitor.pipeline.rows_watched - monitor.unjudged_rows
+        rows += monitor.pipeline.evaluation.rows_watched
+        judged += monitor.pipeline.evaluation.rows_watched - monitor.unjudged_rows
     return Result(alarms, expected, judged / max(rows, 1))
 
 

@@ -31,6 +31,8 @@ PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "CONTRIBUTING.md", "CHANGEL
 
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)")
 _MERMAID = re.compile(r"```mermaid\nstateDiagram-v2\n(.*?)```", re.DOTALL)
+_INLINE_CODE = re.compile(r"(?<!</span>)<code>[^<\n]+</code>")
+_BOX = re.compile(r"^┏[^\n]*\n(.*?)^└[^\n]*\n", re.DOTALL | re.MULTILINE)
 _MARK = re.compile(r"^<!-- run: .* -->\n", re.MULTILINE)
 
 
@@ -111,7 +113,18 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     if page.file.src_uri.startswith("examples/"):
         return markdown
-    return _MARK.sub("", _MERMAID.sub(lambda match: _transitions(match[1]), _LINK.sub(rewrite, markdown)))
+    tables = _BOX.sub(lambda match: f"```\n\n{_table(match[1])}\n\n```\n", _LINK.sub(rewrite, markdown))
+    return _MARK.sub("", _MERMAID.sub(lambda match: _transitions(match[1]), tables))
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Keep the names of options whole, and let long names break after `_`, `/` and `.`."""
+
+    def mark(match: re.Match[str]) -> str:
+        whole = re.sub(r"(?<![\w-])--?[a-z][\w-]*", r'<span class="option">\g<0></span>', match[0])
+        return re.sub(r"(?<=\w)[_/.](?=[\w*])", r"\g<0><wbr>", whole)
+
+    return _INLINE_CODE.sub(mark, html)
 
 
 # --- generated pages ---------------------------------------------------------------------------------------------
@@ -261,6 +274,13 @@ def _transitions(diagram: str) -> str:
         for start, end, events in re.findall(r"^\s+(\w+) --> (\w+):([^\n]*)", diagram, re.MULTILINE)
     ]
     return "\n".join(["| from | event | to |", "|---|---|---|", *rows])
+
+
+def _table(boxed: str) -> str:
+    """A table drawn with lines, as of a terminal, in Markdown."""
+    rows = [re.split("[┃│]", line)[1:-1] for line in boxed.splitlines() if line[0] in "┃│"]
+    rows.insert(1, ["---"] * len(rows[0]))
+    return "\n".join(f"|{'|'.join(cells)}|" for cells in rows)
 
 
 def _escape(text: str) -> str:

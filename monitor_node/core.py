@@ -469,14 +469,14 @@ class Monitor:
     @property
     def promise(self) -> Promise | None:
         """Promise of false alarms, as it is now; None before the end of the training."""
-        promise = self.pipeline.promises.promise
-        return None if promise is None else promise.message(self.last_ns or 0, self.pipeline.rows_watched)
+        promise = self.pipeline.evaluation.promises.promise
+        return None if promise is None else promise.message(self.last_ns or 0, self.pipeline.evaluation.rows_watched)
 
     @property
     def excluded_signals(self) -> dict[str, str]:
         """Signals that are not monitored, with the reason: no value came, or the training could not use them."""
         never_came = (signal for signal in self._signals if signal not in self._heard_from_ns)
-        return dict.fromkeys(never_came, NO_VALUE) | self.pipeline.left_out
+        return dict.fromkeys(never_came, NO_VALUE) | self.pipeline.evaluation.left_out
 
     @property
     def refused_trainings(self) -> int:
@@ -486,7 +486,7 @@ class Monitor:
     @property
     def notes(self) -> list[str]:
         """Notes to log; the caller empties the list."""
-        notes, failures = self.pipeline.notes, self.failures.notes
+        notes, failures = self.pipeline.evaluation.notes, self.failures.notes
         notes += failures
         failures.clear()
         return notes
@@ -495,7 +495,7 @@ class Monitor:
 
     @property
     def _silence(self) -> SilenceCheck:
-        return self.pipeline.signals.silence
+        return self.pipeline.evaluation.signals.silence
 
     @property
     def receipts_ns(self) -> tuple[int | None, int | None]:
@@ -582,7 +582,7 @@ class Monitor:
             changes=self._changes,
             diagnose=self._diagnose,
             promises=PromiseStage(
-                self.config, self.failures, check=check_training, states_power=self._power, points=self._points
+                self.config, board, self.failures, check=check_training, states_power=self._power, points=self._points
             ),
         )
 
@@ -594,9 +594,9 @@ class Monitor:
         self.failures.add(stage, error, "the plant is learned again, its alarms stay")
         alarms = self.alarms.all_alarms()
         self._changes = deque(item for item in self._changes if item.at_ns is not None)  # findings on its training
-        notes, receipts_ns = self.pipeline.notes, self.receipts_ns
+        notes, receipts_ns = self.pipeline.evaluation.notes, self.receipts_ns
         self.pipeline = self._new_pipeline(self.alarms)
-        self.pipeline.notes, self.receipts_ns = notes, receipts_ns
+        self.pipeline.evaluation.notes, self.receipts_ns = notes, receipts_ns
         self._watching_since_ns = None
         self.resume_from_alarms(alarms)
 

@@ -101,6 +101,8 @@ class Annunciator:
         self.has_unexplained = False
         self.describe_operation: Callable[[int], str] = lambda time_ns: ""
         """Operation of the plant at a time, which the text of a raised alarm then states; empty: as usual."""
+        self.warning = ""
+        """Warning of false alarms, which the text of a raised alarm states; empty: none."""
 
     def declare(
         self,
@@ -149,8 +151,9 @@ class Annunciator:
         Arguments as for `ChartAlarm.record`.
         """
         before = alarm.memory.state
-        if explanation is not None and (operation := self.describe_operation(time_ns)):
-            explanation = explanation._replace(text=f"{explanation.text}; {operation}")
+        if explanation is not None:
+            parts = (explanation.text, self.describe_operation(time_ns), self.warning)
+            explanation = explanation._replace(text="; ".join(filter(None, parts)))
         event = alarm.record(time_ns, judgement, unit, explanation)
         self._on_change(alarm, event, before, time_ns)
         return self._publication(alarm, event, time_ns)

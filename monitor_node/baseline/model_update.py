@@ -11,8 +11,9 @@ from typing import NamedTuple
 from monitor_node.baseline.commands import is_command
 from monitor_node.baseline.predictor import ArxPredictor, arx_structure
 from monitor_node.baseline.references import ProcessReference
-from monitor_node.baseline.training import Training, TrainingResult, TrainingState
+from monitor_node.baseline.training import Training, TrainingResult
 from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, Finding, read_equations
+from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract.messages_pb2 import Baseline
 from reactorwatch.diagnosis.result import NOMINAL

@@ -103,16 +103,17 @@ class PlantPromise:
     def __init__(self, state: PromiseState, power: Sequence[Power] = ()) -> None:
         self.state, self.power = state, power
 
-    def count_alarms(self, count: int, row: int) -> None:
-        """Count alarms that chance can raise.
+    def count_alarms(self, count: int, row: int) -> tuple[bool, bool]:
+        """Count alarms that chance can raise; returns whether the plant had drifted before, and has now.
 
         Args:
             count: number of alarms of a row.
             row: number of rows judged since the training.
         """
-        state = self.state
+        state, had_drifted = self.state, self.has_drifted(row)
         is_new = not state.found or row - state.last_row > SAME_EVENT_ROWS
         self.state = replace(state, found=state.found + count, events=state.events + is_new, last_row=row)
+        return had_drifted, self.has_drifted(row)
 
     def mean_count(self, rows: int) -> float:
         """False alarms promised in a number of rows, on average."""

@@ -9,10 +9,9 @@ A signal with too few values is left out with the reason, and the others are mon
 without the inputs that are left out.
 """
 
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import compress
-from math import isfinite, log10
+from math import log10
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -25,6 +24,7 @@ from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_
 from monitor_node.baseline.references import ArxReference, ProcessReference, Reference
 from monitor_node.baseline.resolution import resolution_sd
 from monitor_node.baseline.signal_range import possible_ranges
+from monitor_node.baseline.training_rows import TrainingRows
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals
 from reactorwatch.contract.messages_pb2 import Check
@@ -33,12 +33,8 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.prewhitening import Prewhitening, learn
 from reactorwatch.spc.step_test import ROWS as STEP_ROWS
-from reactorwatch.stored_state import StoredState, pack_numbers, pack_times, unpack_numbers, unpack_times
 
 Array = NDArray[np.float64]
-
-MOST_ROWS = 10_000
-"""The newest rows used of a longer training; memory stays bounded."""
 
 FEWEST_ROWS = 50
 """Least number of residuals; the training continues until there are as many."""
@@ -106,21 +102,7 @@ MOST_OUT_OF_RANGE = 1.0 / 3.0
 """Share of impossible values of a signal; with more of them the plant is not the model's process."""
 
 
-class TrainingState(StoredState, frozen=True):
-    """State of a training.
-
-    Attributes:
-        times_ns: times of the rows, 64 bits each.
-        rows: doubles: the inputs and the outputs of each row.
-        known: number of values of each output.
-    """
-
-    times_ns: bytes
-    rows: bytes
-    known: list[int]
-
-
-class Training:
+class Training(TrainingRows):
     """Training of one plant.
 
     Args:
@@ -130,63 +112,13 @@ class Training:
     """
 
     def __init__(self, config: MonitorConfig, model: ProcessModel | None, predictors: list[ArxPredictor]) -> None:
-        self._config = config
-        self._model = model
-        self._predictors = predictors
+        super().__init__(len(config.inputs), len(config.outputs))
+        self._config, self._model, self._predictors = config, model, predictors
         self._without_black_box = ""
-        self._rows: deque[tuple[int, Sequence[float], list[float]]] = deque(maxlen=MOST_ROWS)
-        self._counts = [0] * len(config.outputs)
         of_one_input = replace(structure := arx_structure(config), inputs=min(structure.inputs, 1))
         of_identified = max(fewest_rows(of_one_input), FEWEST_ROWS)
         self.fewest_rows = FEWEST_ROWS if model is not None else of_identified
         """Least number of values of each output that a training needs."""
-
-    @property
-    def state(self) -> TrainingState:
-        """A copy of the state."""
-        rows = [(*inputs, *values) for _, inputs, values in self._rows]
-        return TrainingState(pack_times(row[0] for row in self._rows), pack_numbers(rows), list(self._counts))
-
-    def restore(self, state: TrainingState) -> None:
-        """Resume from a state of the same settings.
-
-        Raises:
-            ValueError: the state is damaged.
-        """
-        inputs, outputs = len(self._config.inputs), len(self._config.outputs)
-        times_ns, rows = unpack_times(state.times_ns), unpack_numbers(state.rows, inputs + outputs).tolist()
-        if len(times_ns) != len(rows) or len(state.known) != outputs:
-            raise ValueError(f"a training must have a time a row and {outputs} counts, got {len(times_ns)} times")
-        if len(times_ns) > MOST_ROWS:
-            self.keep_all_rows()
-        self._rows.extend(
-            (time_ns, tuple(row[:inputs]), row[inputs:]) for time_ns, row in zip(times_ns, rows, strict=True)
-        )
-        self._counts = list(state.known)
-
-    def add(self, time_ns: int, inputs: Sequence[float], values: list[float]) -> None:
-        """Add a row.
-
-        Args:
-            time_ns: time of the row.
-            inputs: one value an input; NaN if missing.
-            values: outputs; NaN if missing.
-        """
-        if self._rows and time_ns <= self._rows[-1][0]:  # the publisher was restarted: so is the record
-            self._rows.clear()
-            self._counts = [0] * len(values)
-        self._rows.append((time_ns, inputs, values))
-        for index, value in enumerate(values):
-            self._counts[index] += isfinite(value)
-
-    @property
-    def rows(self) -> int:
-        """Number of rows so far."""
-        return len(self._rows)
-
-    def keep_all_rows(self) -> None:
-        """Use all rows of the training, however many they are."""
-        self._rows = deque(self._rows)
 
     def is_enough(self, timed_out: list[bool]) -> bool:
         """True if there are enough rows, without regard to outputs whose data timeout is active.
@@ -203,8 +135,7 @@ class Training:
         Args:
             last_chance: True to use the training even if it is disturbed.
         """
-        rows, self._rows = list(self._rows), deque(maxlen=MOST_ROWS)
-        self._counts = [0] * len(self._config.outputs)
+        rows = self.take()
         time_min = np.array([row[0] for row in rows]) / MINUTE_NS
         inputs = np.array([row[1] for row in rows], dtype=np.float64).reshape(len(rows), len(self._config.inputs))
         measured = np.array([row[2] for row in rows])

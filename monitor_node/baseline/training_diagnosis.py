@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from monitor_node.baseline.training import TrainingState
+from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.baseline.uncertainty import Uncertain, describe_uncertain, find_uncertain
 from reactorwatch.contract.messages_pb2 import Baseline
 from reactorwatch.diagnosis.extended import extended_model

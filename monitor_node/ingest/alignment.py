@@ -60,6 +60,22 @@ class MeasuredRow:
     follows: bool
     publications: list[Publication]
 
+    @classmethod
+    def of(
+        cls, row: "Row", inputs: int, units: list[str], interval: Interval, publications: list[Publication]
+    ) -> "MeasuredRow":
+        """A row for the stages.
+
+        Args:
+            row: the row, its inputs first.
+            inputs: number of inputs.
+            units: units of the outputs.
+            interval: interval before the row.
+            publications: list to which the stages add publications.
+        """
+        follows = interval.follows and not row.restarted
+        return cls(row.time_ns, row.values[:inputs], list(row.values[inputs:]), units, interval, follows, publications)
+
 
 @dataclass
 class Counts:

@@ -31,11 +31,13 @@ from monitor_node.isolation.candidate import (
     select_plausible,
 )
 from monitor_node.isolation.glr_scan import Scan
+from monitor_node.isolation.live_posterior import Member
 from monitor_node.isolation.residual import log_evidence_of_residual
+from monitor_node.isolation.suspect import Evidence
 from monitor_node.isolation.window import Window
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, huber_clip
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import EndedRamp, FittedProfile, Ramp, Step
 from reactorwatch.diagnosis.run import Run
@@ -51,6 +53,7 @@ _MARGIN_ROWS = 8
 _STEPS, _LAST_STEPS = 3, 8
 _SHRINKS = (0.5, 0.2, 0.08)
 _HOLDS, _NOISE, _KEPT = 0.05, 5.0, 0.5
+_SHARE = 0.02  # difference of a relative size, for derivatives
 
 
 class Fitter:
@@ -115,6 +118,23 @@ class Fitter:
             end_min = float(window.time_min[-1])
             self.progress = Progress(fitted[0].onset_min, end_min, 1, select_plausible(fitted, 0.0))
         return [*(segment.add_deviations(item, item.onset_sd_min) for item in fitted), *best[MOST:]]
+
+    def members(
+        self, window: Window, items: Sequence[tuple[Candidate, Evidence]]
+    ) -> tuple[list[Member], tuple[Array, Array]]:
+        """Filters of causes at the end of a window, and of the plant without a fault, for a `LivePosterior`.
+
+        Args:
+            window: the rows.
+            items: fitted causes, each with its evidence.
+
+        Raises:
+            BudgetExceededError: the budget is spent.
+        """
+        without = self.run_without_fault(window.run).innovations
+        segment = _Segment(self, window, 0, window.time_min.size, without)
+        found = (segment.member(candidate, evidence, window) for candidate, evidence in items)
+        return [item for item in found if np.isfinite(item.x).all()], (without.x[-1], without.P[-1])
 
     def _follow(self, window: Window, early: Scan, without_fault: FilterResult) -> list[Candidate]:
         """Fit the plausible causes of a large fault, from where it is still small or from the last progress."""
@@ -235,6 +255,26 @@ class _Segment:
         fit = self._hypothesis(candidate).fit(self._run, (start,), steps, self._like_of(candidate))
         gain = self.loss_without_fault - fit.loss
         return replace(candidate, parameters=fit.parameters[0], gain=gain, w=np.nan_to_num(fit.w), fit=fit)
+
+    def member(self, candidate: Candidate, evidence: Evidence, window: Window) -> Member:
+        """Filter of a cause after the last row, with its derivatives by the relative size."""
+        parameters, smaller = candidate.parameters, candidate.parameters.copy()
+        smaller[0] *= 1.0 - _SHARE
+        several = [(parameters,), (smaller,)]
+        fit, less = self._hypothesis(candidate).evaluate_all(self._run, several, self._like_of(candidate))
+        n, w = fit.innovations.x.shape[1], np.nan_to_num(fit.w)
+        g = (huber_clip(less.w) - huber_clip(fit.w)) / _SHARE
+        since = int(np.searchsorted(self._run.time_min, candidate.onset_min))
+        return Member(
+            evidence,
+            float(parameters[2]) if candidate.profile is EndedRamp else inf,
+            fit.innovations.x[-1],
+            fit.innovations.P[-1].reshape(n, n),
+            (fit.innovations.x[-1] - less.innovations.x[-1]) / _SHARE,
+            1.0 / (1.0 + float(np.sum(g**2))),
+            w[since:],
+            np.isfinite(window.measured[since:]),
+        )
 
     def has_left(self, candidate: Candidate, since_min: float) -> bool:
         """Return true if the plant no longer follows a candidate after a time: more than noise is left."""

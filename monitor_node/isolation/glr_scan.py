@@ -10,7 +10,7 @@ scans: of the rows up to the first at which some cause stands out by `STANDS_OUT
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from monitor_node.isolation.window import Window
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.augmented_model import augment_model
+from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.run import input_uncertainty_of
 from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
@@ -67,7 +68,8 @@ class GlrScan:
     def __init__(self, model: ProcessModel, noise: NoiseLevels, effects: Sequence[Effect]) -> None:
         self._lower = np.array([effect.lower for effect in effects])
         self._upper = np.array([effect.upper for effect in effects])
-        self._errors = augment_model(model, tuple(effects)).errors.with_noise(noise)
+        self._augmented = augment_model(model, tuple(effects))
+        self._errors = self._augmented.errors.with_noise(noise)
 
     def prepare(self) -> None:
         """Compile now what the first scan would compile."""
@@ -102,9 +104,13 @@ class GlrScan:
         return early, Scan(rows, *(item[before:] for item in arrays))
 
     def dynamics(self, window: Window) -> ErrorDynamics:
-        """Error dynamics of the filter about its run over the window."""
-        inputs = np.hstack([window.inputs, np.zeros((window.time_min.size, 2 * self._lower.size))])
-        return self._errors.dynamics(
+        """Error dynamics of the filter about its run over the window, by the sizes of the effects.
+
+        The constants of an effect have their nominal values: without the effect no row depends on them.
+        """
+        nothing = np.zeros(window.time_min.size)
+        inputs = self._augmented.inputs(window.time_min, window.inputs, [Signal(nothing, nothing)] * self._lower.size)
+        dynamics = self._errors.dynamics(
             window.time_min,
             inputs,
             window.x,
@@ -112,6 +118,10 @@ class GlrScan:
             window.residual,
             window.used,
             uncertainty=input_uncertainty_of(window.run, inputs),
+        )
+        of_sizes = np.s_[:, :, : self._lower.size]
+        return replace(
+            dynamics, G=np.ascontiguousarray(dynamics.G[of_sizes]), D=np.ascontiguousarray(dynamics.D[of_sizes])
         )
 
     def _scan_rows(self, times: Array, dynamics: ErrorDynamics, first: int, rows: int) -> Scan:

@@ -22,22 +22,21 @@ Causes that imitate each other share the probability, as they should: these rows
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from math import exp, inf, isfinite, log, nan
+from math import inf, isfinite, log
 
-from monitor_node.isolation.candidate import Candidate, Progress, ProgressState
+from monitor_node.isolation.candidate import BEHIND, Candidate, Progress, ProgressState
 from monitor_node.isolation.causes import causes_of
 from monitor_node.isolation.fit import Fitter
 from monitor_node.isolation.glr_scan import GlrScan
+from monitor_node.isolation.live_posterior import MOST_MEMBERS, LivePosterior
 from monitor_node.isolation.residual import log_evidence_of_residual
-from monitor_node.isolation.window import Row, newest_rows, window_of
+from monitor_node.isolation.suspect import Evidence, Suspect, rank_suspects, unknown_suspect
+from monitor_node.isolation.window import Row, Window, newest_rows, window_of
 from reactorwatch.diagnosis.fitting.profiles import Ramp, Step
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.kalman.step_budget import BudgetExceededError, StepBudget
-from reactorwatch.process.effect import Effect, SensorEffect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
-
-UNKNOWN, SENSOR, PROCESS = "unknown", "sensor", "process"
 
 SHARE_OF_RAMPS = 0.3
 """Prior probability that a cause grows as a ramp, rather than as a step."""
@@ -50,31 +49,6 @@ with rows some minutes apart the later looks at a large fault may stop where tho
 
 LEAST_ROWS = 100
 """Minimum number of rows of a look at rows that are far apart, besides two for each row since the first alarm."""
-
-
-@dataclass(frozen=True)
-class Suspect:
-    """A cause with its probability, and its size and onset if it is the cause.
-
-    Attributes:
-        cause: its name in the catalogue, or `UNKNOWN`.
-        profile: `step` or `ramp`; empty if unknown.
-        probability: posterior probability; those of all suspects sum to 1.
-        size: size in the effect's unit; for a ramp, in the last row.
-        size_sd: standard deviation of the size.
-        onset_min: onset in minutes.
-        onset_sd_min: standard deviation of the onset.
-        kind: `sensor` or `process`; `UNKNOWN` if unknown.
-    """
-
-    cause: str
-    profile: str
-    probability: float
-    size: float
-    size_sd: float
-    onset_min: float
-    onset_sd_min: float
-    kind: str
 
 
 class Isolation:
@@ -110,6 +84,7 @@ class Isolation:
         self._scan = GlrScan(model, noise, self._effects)
         self._fitter = Fitter(model, noise, self._effects)
         self.budget, self.stopped = StepBudget(1), False
+        self._compared: tuple[Window, list[tuple[Candidate, Evidence]]] | None = None
 
     @property
     def progress(self) -> ProgressState | None:
@@ -126,7 +101,8 @@ class Isolation:
 
         Each takes some hundredths of a second for the first isolation of a model in this process.
         """
-        return [self._nominal.prepare, self._scan.prepare, *self._fitter.preparations]
+        live = self.new_live_posterior()
+        return [self._nominal.prepare, self._scan.prepare, *self._fitter.preparations, live.prepare]
 
     def suspects(self, rows: Sequence[Row], since_rows: int = 0, not_before_min: float = -inf) -> list[Suspect]:
         """Compute the plausible causes, most likely first, `UNKNOWN` among them.
@@ -139,35 +115,47 @@ class Isolation:
                 not those in which the fault may have begun.
             not_before_min: time before which nothing was wrong.
         """
-        self.budget, self.stopped = StepBudget(self.steps), False
+        self.budget, self.stopped, self._compared = StepBudget(self.steps), False, None
         try:
             return self._compare(newest_rows(rows, LEAST_ROWS + 2 * since_rows), not_before_min)
         except BudgetExceededError:  # fitted hypotheses cannot be compared with others that are not
             self.stopped = True
-            return [_unknown(1.0)]
+            return [unknown_suspect(1.0)]
 
     def _compare(self, rows: Sequence[Row], not_before_min: float) -> list[Suspect]:
         self._nominal.budget = self.budget
         window = window_of(rows, self._nominal, not_before_min)
         if window is None:
-            return [_unknown(1.0)]
+            return [unknown_suspect(1.0)]
         scans = self._scan.scan(window)
         candidates = [item for item in self._fitter.fit(window, *scans, self.budget) if isfinite(item.gain)]
         if not candidates:  # no measurement would show a cause, or every filter diverged
-            return [_unknown(1.0)]
-        evidence = [_log_evidence(item) for item in candidates]
-        none = evidence[0] + log_evidence_of_residual(*candidates[0].residual(window))
-        top = max(*evidence, none, 0.0)
-        weights = [exp(value - top) for value in evidence]
-        unknown = exp(none - top) + exp(-top)
-        total = sum(weights) + unknown
-        suspects = [_unknown(unknown / total)]
-        for effect in self._effects:
-            indices = [index for index, item in enumerate(candidates) if item.effect is effect]
-            if indices:
-                likeliest = candidates[max(indices, key=weights.__getitem__)]
-                suspects.append(_suspect(likeliest, sum(weights[index] for index in indices) / total))
-        return sorted(suspects, key=lambda item: -item.probability)
+            return [unknown_suspect(1.0)]
+        items = [(item, _evidence(item)) for item in candidates]
+        self._compared = (window, items)
+        none = items[0][1].log_evidence + log_evidence_of_residual(*candidates[0].residual(window))
+        return rank_suspects([evidence for _, evidence in items], none)
+
+    def follow(self) -> LivePosterior | None:
+        """Start to follow the causes of the last look row by row; None if it compared none."""
+        if self._compared is None:
+            return None
+        window, items = self._compared
+        least = max(evidence.log_evidence for _, evidence in items) - BEHIND
+        chosen = [item for item in items if item[1].log_evidence >= least][:MOST_MEMBERS]
+        try:
+            members, without_fault = self._fitter.members(window, chosen)
+        except BudgetExceededError:
+            return None
+        if not members:
+            return None
+        live = self.new_live_posterior()
+        live.start(members, without_fault, window.time_min, window.inputs[-1].tolist())
+        return live
+
+    def new_live_posterior(self) -> LivePosterior:
+        """Make a live posterior that has not started."""
+        return LivePosterior(self._nominal.model, self._nominal.noise, self._effects)
 
 
 def _log_evidence(item: Candidate) -> float:
@@ -180,12 +168,8 @@ def _log_evidence(item: Candidate) -> float:
     )
 
 
-def _suspect(item: Candidate, probability: float) -> Suspect:
-    kind = SENSOR if isinstance(item.effect, SensorEffect) else PROCESS
+def _evidence(item: Candidate) -> Evidence:
     size, onset_min = item.parameters[:2].tolist()
     profile = (Step if item.profile is Step else Ramp).name
-    return Suspect(item.effect.name, profile, probability, size, item.size_sd, onset_min, item.onset_sd_min, kind)
-
-
-def _unknown(probability: float) -> Suspect:
-    return Suspect(UNKNOWN, "", probability, nan, nan, nan, nan, UNKNOWN)
+    evidence = _log_evidence(item)
+    return Evidence(item.effect, evidence, profile, size, item.size_sd, onset_min, item.onset_sd_min)

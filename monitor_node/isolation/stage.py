@@ -6,6 +6,10 @@ one that others imitate, is only distinguished by many rows: the last looks foll
 then the rows since the alarm are kept, and `ROWS_BEFORE` before it: a slow ramp is noticed hundreds of rows after its
 onset. A plant without an unexplained alarm keeps `isolation_rows` rows.
 
+Between looks and after the last one the probabilities follow the rows (`live_posterior`). They are published when one
+has moved by `WORTH_PUBLISHING`. If the rows come to contradict what the last look named, as when a ramp ends, the next
+look is taken at once.
+
 The result depends on the samples alone. While the most likely cause is a sensor, its true reading is reconstructed.
 """
 
@@ -21,8 +25,10 @@ from monitor_node.baseline.references import ProcessReference, output_indices
 from monitor_node.config import MonitorConfig
 from monitor_node.isolation.candidate import ProgressState
 from monitor_node.isolation.causes import causes_of
-from monitor_node.isolation.isolation import UNKNOWN, Isolation, Suspect
+from monitor_node.isolation.isolation import Isolation
+from monitor_node.isolation.live_posterior import LivePosterior, LivePosteriorState
 from monitor_node.isolation.reconstruction import Reconstruction, ReconstructionState
+from monitor_node.isolation.suspect import UNKNOWN, Suspect
 from monitor_node.isolation.window import Row, newest_rows
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
@@ -44,6 +50,12 @@ ROWS_BEFORE = 400
 
 LEAST = 0.01
 """Probability below which a suspect is not published."""
+
+LEAST_GROWTH = 1.3
+"""Factor by which the rows since the alarm have to grow until a look that is not in `LOOKS`."""
+
+WORTH_PUBLISHING = 0.1
+"""Change of a probability since the last publication that is worth another one."""
 
 CONVINCED = 0.5
 """Probability from which a suspected sensor is reconstructed."""
@@ -86,6 +98,9 @@ class SuspicionState(StoredState, frozen=True):
         output: output output of the newest reconstruction.
         cause: cause of the reconstruction.
         reconstruction: state of the reconstruction; None without one.
+        live: state of the probabilities that follow the rows; None without an active alarm of unknown cause.
+        published: probabilities of the suspects that were published last, by cause.
+        named_rows: number of rows since the first alarm at the last look, if it named a cause; else 0.
     """
 
     rows: bytes
@@ -95,6 +110,9 @@ class SuspicionState(StoredState, frozen=True):
     output: str
     cause: str
     reconstruction: ReconstructionState | None
+    live: LivePosteriorState | None = None
+    published: dict[str, float] = {}  # noqa: RUF012 # msgspec copies it
+    named_rows: int = 0
 
 
 class Suspicion:
@@ -112,6 +130,9 @@ class Suspicion:
         self._all_watched = self._indices == list(range(len(reference.equations.outputs)))
         self._effects = {effect.name: effect for effect in causes_of(reference.equations)}
         self._isolation: Isolation | None = None
+        self._live: LivePosterior | None = None
+        self._published: dict[str, float] = {}
+        self._named_rows = 0
         # Flat, as most of the memory of a plant: time in minutes, inputs, outputs of the model.
         self._rows: deque[tuple[float, ...]] = deque(maxlen=config.isolation_rows)
         self._incident = 0
@@ -131,6 +152,9 @@ class Suspicion:
             self._output,
             self._cause,
             None if self._reconstruction is None else self._reconstruction.state,
+            None if self._live is None else self._live.state,
+            dict(self._published),
+            self._named_rows,
         )
 
     def restore(self, state: SuspicionState) -> None:
@@ -146,6 +170,10 @@ class Suspicion:
         if state.way is not None:
             with suppress(msgspec.ValidationError):  # stored by an earlier version
                 self._made_isolation().progress = msgspec.convert(state.way, ProgressState)
+        if state.live is not None:
+            live = self._made_isolation().new_live_posterior()
+            self._live = live if live.restore(state.live) else None
+        self._published, self._named_rows = dict(state.published), state.named_rows
         if state.reconstruction is not None:
             self._reconstruct(state.output, state.cause, 0.0, ())
             assert self._reconstruction is not None
@@ -182,16 +210,22 @@ class Suspicion:
             return publications
         is_new = self._since is None or board.incident != self._incident
         self._incident = board.incident
-        if is_new and self._isolation is not None:
-            self._isolation.progress = None
+        if is_new:
+            self._live = None
+            if self._isolation is not None:
+                self._isolation.progress = None
         self._set_since(1 if is_new or self._since is None else self._since + 1)
         if self._since is not None and self._is_look_due(self._since):
             publications += self._look(time_ns, self._since)
+        elif self._live is not None:
+            publications += self._follow_causes(self._live, time_ns, inputs, measured)
         return publications
 
     def _set_since(self, since: int | None) -> None:
         """Set the number of rows since the first alarm; more rows are kept as long as looks follow."""
         self._since = since
+        if since is None:
+            self._live, self._published, self._named_rows = None, {}, 0
         usual = self._config.isolation_rows
         if since is not None and since <= LOOKS[-1]:
             usual = max(usual, min(usual, ROWS_BEFORE) + LOOKS[-1])
@@ -201,8 +235,16 @@ class Suspicion:
             self._rows = deque(self._rows, maxlen=usual)
 
     def _is_look_due(self, since: int) -> bool:
-        """Return true for a row with a look; late looks need rows that are not far apart."""
-        return since in LOOKS and (since <= FEW_ROWS or len(newest_rows(self._rows_of_look(since))) > since)
+        """Return true for a row with a look."""
+        return since in LOOKS and self._has_rows(since)
+
+    def _may_look_early(self, since: int) -> bool:
+        """Return true if a look may be taken because the rows contradict what the last one named."""
+        return 0 < LEAST_GROWTH * self._named_rows <= since < LOOKS[-1] and self._has_rows(since)
+
+    def _has_rows(self, since: int) -> bool:
+        """Return true if the rows for a look are known; late looks need rows that are not far apart."""
+        return since <= FEW_ROWS or len(newest_rows(self._rows_of_look(since))) > since
 
     def _rows_of_look(self, since: int) -> list[Row]:
         """Rows for a look: the usual number, and later `ROWS_BEFORE` rows before the first alarm and all since."""
@@ -216,8 +258,36 @@ class Suspicion:
     def _look(self, time_ns: int, since: int) -> list[Publication]:
         isolation = self._made_isolation()
         suspects = isolation.suspects(self._rows_of_look(since), min(since, FEW_ROWS))
+        publications = self._publish(time_ns, suspects, stopped=isolation.stopped)
+        self._live = isolation.follow()
+        self._named_rows = since if suspects[0].cause != UNKNOWN else 0
+        return publications
+
+    def _follow_causes(
+        self, live: LivePosterior, time_ns: int, inputs: Sequence[float], measured: Sequence[float]
+    ) -> list[Publication]:
+        """Update the probabilities of the causes, and publish them if they changed."""
+        if not live.update(time_ns / MINUTE_NS, inputs, measured):
+            self._live = None
+            return []
+        before, since = self._published, self._since or 0
+        is_unknown = max(before, key=before.__getitem__, default="") == UNKNOWN
+        if not (is_unknown or live.has_moved(WORTH_PUBLISHING - LEAST)):  # suspects below `LEAST` are not published
+            return []
+        suspects = live.suspects()
+        if suspects[0].cause == UNKNOWN and suspects[0].probability > CONVINCED and self._may_look_early(since):
+            return self._look(time_ns, since)
+        probabilities = {item.cause: item.probability for item in suspects}
+        changes = (abs(probabilities.get(cause, 0.0) - before.get(cause, 0.0)) for cause in {*probabilities, *before})
+        if max(changes) < WORTH_PUBLISHING:
+            return []
+        live.note_published()
+        return self._publish(time_ns, suspects)
+
+    def _publish(self, time_ns: int, suspects: Sequence[Suspect], *, stopped: bool = False) -> list[Publication]:
+        self._published = {item.cause: item.probability for item in suspects if item.probability >= LEAST}
         causes = [self._suspected_cause(item) for item in suspects if item.probability >= LEAST]
-        publications = self._board.set_suspects(time_ns, causes, stopped=isolation.stopped)
+        publications = self._board.set_suspects(time_ns, causes, stopped=stopped)
         self._follow(suspects[0])
         return publications
 
@@ -226,7 +296,7 @@ class Suspicion:
         measured = self._model_outputs(values)
         if self._rows and time_min <= self._rows[-1][0]:  # the plant's clock was set back
             self._rows.clear()
-            self._isolation = None
+            self._isolation = self._live = None
         self._rows.append((time_min, *inputs, *measured))
         return measured
 

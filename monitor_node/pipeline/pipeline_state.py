@@ -7,7 +7,7 @@ from monitor_node.baseline.black_box_reference import BlackBoxReferenceState
 from monitor_node.baseline.predictor import PredictorState
 from monitor_node.baseline.promise import PromiseState
 from monitor_node.baseline.references import ArxReferenceState, ProcessReferenceState
-from monitor_node.baseline.training import TrainingState
+from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.ingest.sampling import SamplingState
 from monitor_node.isolation.stage import SuspicionState
 from monitor_node.pipeline.operation import CarriedState

@@ -6,9 +6,10 @@ from typing import TypeAlias
 import numpy as np
 from msgspec.structs import replace
 
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.alarms.states import Event
 from monitor_node.baseline.promise import PlantPromise, PromiseState, TrainingCheck
-from monitor_node.baseline.training import TrainingState
+from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.config import MonitorConfig
 from monitor_node.health.failures import Failures
 from monitor_node.health.message import NODE
@@ -35,6 +36,7 @@ class PromiseStage:
 
     Args:
         config: settings of the monitor.
+        board: alarms of the plant, whose texts warn of a promise that is not kept.
         failures: counter of errors, which leave the promise without what they concern.
         check: judges the training by itself; None: that is not done.
         states_power: True to state the deviations that would be seen.
@@ -48,6 +50,7 @@ class PromiseStage:
     def __init__(
         self,
         config: MonitorConfig,
+        board: Annunciator,
         failures: Failures,
         *,
         check: CheckTraining | None = None,
@@ -55,14 +58,19 @@ class PromiseStage:
         points: bool = True,
     ) -> None:
         self.states_power = states_power
-        self._config, self._failures, self._check, self._points = config, failures, check, points
+        self._config, self._board, self._failures, self._check, self._points = config, board, failures, check, points
         self._watch: Watch | None = None
         self._published: Promise | None = None
         self._key = keys.key(config.plant, keys.PROMISE, NODE)
         charts = {name for name, _ in alarm_names(config)}
         self._names = {*charts, *config.charts, SHIFT, *SignalChecks.CHANCE_NAMES}
-        self.promise: PlantPromise | None = None
         self.alarm_rates = np.zeros(0)
+        self.end()
+
+    def end(self) -> None:
+        """End the promise: no rows are evaluated."""
+        self.promise: PlantPromise | None = None
+        self._board.warning = ""
 
     @property
     def state(self) -> PromiseState | None:
@@ -78,6 +86,7 @@ class PromiseStage:
         """Resume from `state` and `power`."""
         if state is not None:
             self.promise = PlantPromise(state, list(Promise.FromString(power).power))
+            self._board.warning = self.promise.warning
 
     def start(self, rates: Array, mean_rate: float, period_min: float, watch: Watch | None) -> None:
         """State the promise after a training; alarms so far go on to count.
@@ -94,6 +103,7 @@ class PromiseStage:
         before = PromiseState(0.0, 0.0, rows) if self.promise is None else self.promise.state
         state = replace(before, per_30_days=mean, upper_per_30_days=max(mean, upper), rows_in_30_days=rows)
         self.promise = PlantPromise(replace(state, check=TrainingCheck()))
+        self._board.warning = self.promise.warning
 
     def check(self, rows: TrainingState, model: ProcessModel | None, kind: str, rows_watched: int) -> str:
         """Judge the training by itself, and state the power; an error there leaves the promise without them.
@@ -123,19 +133,17 @@ class PromiseStage:
             self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
             return ""
         self.promise.state = replace(self.promise.state, check=check)
+        self._board.warning = self.promise.warning
         return "" if self.promise.is_kept else self._note(rows_watched)
-
-    @property
-    def warning(self) -> str:
-        """Text of alarms about a promise that is not kept; empty if it is."""
-        return "" if self.promise is None else self.promise.warning
 
     def messages(self, time_ns: int, rows: int) -> list[Publication]:
         """The promise after a number of rows, if it is to be published and has changed."""
         promise = self.promise
         if promise is None or not (self._points or not promise.is_kept or promise.has_drifted(rows)):
             return []
-        message = promise.message(time_ns, rows)
+        return self._publish(promise.message(time_ns, rows))
+
+    def _publish(self, message: Promise) -> list[Publication]:
         if message == self._published:  # it was published for another reason in this row
             return []
         self._published = message
@@ -154,10 +162,10 @@ class PromiseStage:
         count = sum(alarm.alarm.partition("/")[0] in self._names for alarm in raised)
         if not count:
             return ""
-        had_drifted = self.promise.has_drifted(rows)
-        self.promise.count_alarms(count, rows)
-        publications.extend(self.messages(time_ns, rows))
-        return self._note(rows) if self.promise.has_drifted(rows) and not had_drifted else ""
+        had_drifted, has_drifted = self.promise.count_alarms(count, rows)
+        if self._points or self._board.warning or has_drifted:
+            publications.extend(self._publish(self.promise.message(time_ns, rows)))
+        return self._note(rows) if has_drifted and not had_drifted else ""
 
     def _note(self, rows: int) -> str:
         assert self.promise is not None

@@ -1,9 +1,9 @@
 """A row through all stages of a monitor in one compiled step, for one plant as for ten thousand.
 
 Most rows of most plants are alike: every signal has a value, the filter predicts it, no alarm changes. All that the
-stages then update are numbers: one record a plant, whose type is composed of the stages' own (`row_type`). A monitor of
-one plant steps over an array of one record, a fleet over one with a record for each plant; the steps themselves are in
-the stages' modules.
+stages then update are numbers: one record a plant (`row_frame`). A monitor of one plant steps over an array of one
+record, a fleet over one with a record for each plant; the steps themselves are in the stages' modules. The step is the
+same machine code for all plants.
 
 Any other row is an event, and changes nothing here: the stages process it one by one (`pipeline`), with the same
 numbers. Events are: a row after a gap or a missing row; one by which the filter restarts; a value out of the signal's
@@ -13,21 +13,35 @@ alarm. A point beyond a limit that raises no alarm is no event.
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from monitor_node.alarms.on_off_delay import DELAY, add_point, is_normal, raises
+from monitor_node.alarms.on_off_delay import add_point, is_normal, raises
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.references import GATE
 from monitor_node.baseline.resolution import quantise
 from monitor_node.baseline.signal_range import SignalRange, possible_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import TOLERANCE, WHOLE
+from monitor_node.pipeline.row_frame import (
+    CHARTS,
+    POINT,
+    Records,
+    Words,
+    frame_of,
+    plant_at,
+    row_type,
+    scratch_at,
+    settings_at,
+    settings_type,
+    words_of,
+    work_at,
+    work_type,
+)
 from monitor_node.signal_checks.catalogue import CHECKS
-from monitor_node.signal_checks.stuck import STUCK, is_stuck, take_reading
-from monitor_node.signal_checks.timeout import TIMEOUT, update_timeout
+from monitor_node.signal_checks.stuck import is_stuck, take_reading
+from monitor_node.signal_checks.timeout import update_timeout
 from monitor_node.stages.charts import alarm_names
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
@@ -37,107 +51,23 @@ from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, row_function
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc.charts.base import LARGEST_VALUE
-from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.cusum import _judge as judge_cusum
-from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.ewma import _judge as judge_ewma
-from reactorwatch.spc.charts.mewma import Mewma, count_numbers
+from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.mewma import move as move_mewma
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.charts.shewhart import _judge as judge_shewhart
 from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, STATISTIC, X
-from reactorwatch.spc.prewhitening import WHITENER, expected_value, innovation
+from reactorwatch.spc.prewhitening import expected_value, innovation
 
 ORDINARY, VIOLATING, EVENT = 0, 1, 2
 """Verdict on a row: nothing happened; points beyond limits are remembered; nothing was changed."""
-
-CHARTS = (Shewhart.name, Ewma.name, Cusum.name, Mewma.name)
-"""Charts that the step has, in its order."""
 
 CHECKED = {"silence", "stuck", "spike", "range"}
 """Signal checks that the step has."""
 
 MOST_PERIODS = 1.99 - WHOLE
 """Between rows that are further apart one may be missing."""
-
-POINT = 5
-"""Numbers of a chart's point: those of a `Judgement`."""
-
-Records: TypeAlias = NDArray[np.void]
-
-
-def row_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
-    """Type of the numbers of a plant's stages, composed of the stages' own; the filter has its belief elsewhere.
-
-    Args:
-        inputs: number of inputs.
-        outputs: number of monitored outputs.
-        alarms: number of alarms that the charts can raise.
-    """
-    return np.dtype(
-        [
-            ("last_ns", "i8"),  # time of the newest row
-            ("period_ns", "f8"),  # sampling period
-            ("time_min", "f8"),  # time of the filter's newest row
-            ("inputs", "f8", (inputs,)),  # inputs of that row
-            ("timeouts", TIMEOUT, (1 + inputs + outputs,)),  # of the plant, each input and each output
-            ("whiteners", WHITENER, (outputs,)),
-            ("stuck", STUCK, (outputs,)),
-            ("spike_limits", "f8", (outputs,)),
-            ("shewhart", "f8", (Shewhart.numbers, outputs)),
-            ("ewma", "f8", (Ewma.numbers, outputs)),
-            ("cusum", "f8", (Cusum.numbers, outputs)),
-            ("mewma", "f8", (count_numbers(outputs),)),
-            ("delays", DELAY, (max(alarms, 1),)),
-        ],
-        align=True,
-    )
-
-
-def work_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
-    """Type of the results of a step.
-
-    Args:
-        inputs: number of inputs.
-        outputs: number of monitored outputs.
-        alarms: number of alarms that the charts can raise.
-    """
-    rows = SETTINGS + max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
-    return np.dtype(
-        [
-            ("new", "f8", (3 + 2 * inputs + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
-            ("outputs", "f8", (5 * outputs + 1,)),  # its results
-            ("expected", "f8", (outputs,)),  # expected values of the prewhitening filters
-            ("e", "f8", (outputs,)),  # prewhitened residuals
-            ("columns", "f8", (rows, outputs)),  # columns of a bank of charts, see `compiled_chart`
-            ("points", "f8", (max(alarms, 1), POINT)),  # points of the charts, one row an alarm
-        ],
-        align=True,
-    )
-
-
-def settings_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
-    """Type of the constants of a step.
-
-    Args:
-        inputs: number of inputs.
-        outputs: number of monitored outputs.
-        alarms: number of alarms that the charts can raise.
-    """
-    return np.dtype(
-        [
-            ("filter_address", "i8"),  # address of the filter's machine code; 0: a black box
-            ("spacing_min", "f8", (2,)),  # shortest and longest time between two rows
-            ("resolutions", "f8", (outputs,)),  # stated resolution of each output; 0 where it is learned
-            ("ranges", "f8", (inputs + outputs, 2)),  # smallest and largest value of each signal
-            ("silence_limit", "f8"),  # see `DataTimeout`
-            ("charts", "i8", (len(CHARTS),)),  # index of the first alarm of each chart; -1: there is no such chart
-            ("rules", "i8", (max(alarms, 1), 2)),  # violating points that raise each alarm, mask of its window
-            ("reach", "f8"),  # see `is_normal`
-            ("weight", "f8"),  # weight of the MEWMA chart
-        ],
-        align=True,
-    )
 
 
 class FilterNumbers(NamedTuple):
@@ -166,10 +96,10 @@ def _predict(
     values: Array,
 ) -> bool:
     """Filter a row that is not too far from the one before; returns True if all went well."""
-    inputs, new = p.inputs.size, work.new
+    inputs, new, constants = p.inputs.size, work.new, settings.constants[0]
     count = values.size - inputs
-    spacing_min = time_min - p.time_min
-    if not settings.spacing_min[0] < spacing_min <= settings.spacing_min[1]:
+    spacing_min = time_min - p.head[0].time_min
+    if not constants.spacing_min[0] < spacing_min <= constants.spacing_min[1]:
         return False
     step = 0.5 * spacing_min
     for i in range(inputs):
@@ -181,10 +111,10 @@ def _predict(
     first = parameters.size - variances.size
     for i in range(variances.size):
         parameters[first + i] = variances[i]
-    if settings.filter_address == 0:
+    if constants.filter_address == 0:
         return filter_row(belief, new, parameters, after, work.outputs) == JUDGED
-    before, given, constants = belief.ctypes.data, new.ctypes.data, parameters.ctypes.data
-    call_at(settings.filter_address, (1, before, given, constants, after.ctypes.data, work.outputs.ctypes.data))
+    before, given, fixed = belief.ctypes.data, new.ctypes.data, parameters.ctypes.data
+    call_at(constants.filter_address, (1, before, given, fixed, after.ctypes.data, work.outputs.ctypes.data))
     return bool(work.outputs[work.outputs.size - 1] != 0.0)
 
 
@@ -194,7 +124,7 @@ def _add_point(p: Any, point: Array, settings: Any, alarm: int) -> int:
     is_out = point[4] > 0.0
     if not (is_out or p.recent):
         return ORDINARY
-    normal = not is_out and is_normal(point[0], point[1], point[2], point[3], p.above != 0, settings.reach)
+    normal = not is_out and is_normal(point[0], point[1], point[2], point[3], p.above != 0, settings.constants[0].reach)
     p.recent, p.in_a_row = add_point(p.recent, p.in_a_row, settings.rules[alarm, 1], is_out, normal)
     return EVENT if raises(p.recent, settings.rules[alarm, 0], is_out) else VIOLATING
 
@@ -224,7 +154,8 @@ def _take_points(p: Any, work: Any, numbers: Array, settings: Any, first: int) -
 @jit
 def _update_charts(p: Any, work: Any, settings: Any) -> int:
     """Update the charts with the prewhitened residuals; returns the verdict."""
-    charts, columns, e, verdict = settings.charts, work.columns, work.e, ORDINARY
+    constants, columns, e, verdict = settings.constants[0], work.columns, work.e, ORDINARY
+    charts = constants.charts
     if charts[0] >= 0:
         _lay_out(columns, p.shewhart, e)
         judge_shewhart(columns)
@@ -238,7 +169,7 @@ def _update_charts(p: Any, work: Any, settings: Any) -> int:
         judge_cusum(columns)
         verdict = max(verdict, _take_points(p, work, p.cusum, settings, charts[2]))
     if charts[3] >= 0:
-        statistic, limit, point = move_mewma(p.mewma, e, settings.weight), p.mewma[0], work.points[charts[3]]
+        statistic, limit, point = move_mewma(p.mewma, e, constants.weight), p.mewma[0], work.points[charts[3]]
         if statistic < 0.0:
             return EVENT
         point[0], point[1], point[2], point[3] = statistic, float(e.size), 0.0, limit
@@ -249,10 +180,8 @@ def _update_charts(p: Any, work: Any, settings: Any) -> int:
 
 @jit
 def step(
-    numbers: Records,
-    scratch: Records,
-    works: Records,
-    constants: Records,
+    numbers: Words,
+    frame: Words,
     beliefs: Array,
     variances: Array,
     parameters: Array,
@@ -265,10 +194,8 @@ def step(
     """Take a row through all stages; returns the verdict.
 
     Args:
-        numbers: numbers of the plants, shape (plants,), see `row_type`.
-        scratch: numbers of one plant, to work in, shape (1,).
-        works: filled, shape (1,), see `work_type`.
-        constants: constants of the step, shape (1,), see `settings_type`.
+        numbers: numbers of the plants, see `words_of`.
+        frame: see `frame_of`.
         beliefs: beliefs of the filters, see `FilterNumbers`.
         variances: variances of the filters, see `FilterNumbers`.
         parameters: parameters of the model, and room for the variances, shape (parameters + outputs + states,).
@@ -278,10 +205,13 @@ def step(
         time_min: the same in minutes.
         values: values of the row, the inputs first.
     """
-    scratch[0] = numbers[plant]
-    p, work, settings = scratch[0], works[0], constants[0]
-    spacing_ns = time_ns - p.last_ns
-    if spacing_ns <= 0 or float(spacing_ns) > MOST_PERIODS * p.period_ns:
+    scratch = scratch_at(frame, numbers.shape[1])
+    for i in range(scratch.size):
+        scratch[i] = numbers[plant, i]
+    p, work, settings = plant_at(frame), work_at(frame), settings_at(frame)
+    head = p.head[0]
+    spacing_ns = time_ns - head.last_ns
+    if spacing_ns <= 0 or float(spacing_ns) > MOST_PERIODS * head.period_ns:
         return EVENT
     for i in range(values.size):
         if not settings.ranges[i, 0] <= values[i] <= settings.ranges[i, 1]:
@@ -290,7 +220,7 @@ def step(
     if not _predict(p, belief, variances[plant], parameters, after, work, settings, time_min, values):
         return EVENT
     for i in range(p.timeouts.size):
-        if update_timeout(p.timeouts[i], time_ns, True, settings.silence_limit, -1)[0]:
+        if update_timeout(p.timeouts[i], time_ns, True, settings.constants[0].silence_limit, -1)[0]:
             return EVENT
     inputs = p.inputs.size
     outputs = values.size - inputs
@@ -306,19 +236,17 @@ def step(
     verdict = _update_charts(p, work, settings)
     if verdict == EVENT:
         return EVENT
-    p.last_ns, p.time_min = time_ns, time_min
+    head.last_ns, head.time_min = time_ns, time_min
     for i in range(inputs):
         p.inputs[i] = values[i]
     for i in range(belief.size):
         belief[i] = after[i]
-    numbers[plant] = scratch[0]
+    for i in range(scratch.size):
+        numbers[plant, i] = scratch[i]
     return verdict
 
 
-@lru_cache
-def step_entry(inputs: int, outputs: int, alarms: int) -> Entry:
-    """Machine code of the step for the types of these numbers of inputs, outputs and alarms."""
-    return Entry(step)
+_STEP = Entry(step)
 
 
 class RowFilter(NamedTuple):
@@ -352,31 +280,33 @@ class RowStep:
     Attributes:
         numbers_type: type of the numbers of a plant's stages.
         filter_sizes: sizes of belief and variances of a filter.
-        settings: constants of the step, shape (1,).
         parameters: parameters of the model, and room for the variances of a filter.
         work: results of the newest step, shape (1,).
-        scratch: numbers of one plant, to work in, shape (1,).
+        frame: see `frame_of`.
         after: belief of a filter, to work in.
     """
 
     def __init__(self, config: MonitorConfig, row_filter: RowFilter, ranges: Sequence[SignalRange]) -> None:
         kinds = [chart for chart, _ in alarm_names(config)]
         sizes = len(config.inputs), len(config.outputs), len(kinds)
-        self._code, self._step = row_filter.code, step_entry(*sizes)
+        self._code = row_filter.code
         self.numbers_type = numbers_type(config)
         self.filter_sizes = row_filter.belief, row_filter.constants
-        self.settings = np.zeros(1, settings_type(*sizes))
-        p = self.settings[0]
-        p["filter_address"], p["spacing_min"] = row_filter.address, row_filter.spacing_min
-        p["silence_limit"] = config.silence_periods
+        self._settings = np.zeros(1, settings_type(*sizes))
+        p = self._settings[0]
+        constants = p["constants"]
+        constants["filter_address"], constants["spacing_min"] = row_filter.address, row_filter.spacing_min
+        constants["silence_limit"] = config.silence_periods
         p["resolutions"] = [config.resolution.get(name, 0.0) for name in config.outputs]
         p["ranges"] = [[item.lower, item.upper] for item in ranges]
-        p["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
+        constants["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
         for i, kind in enumerate(kinds):
             p["rules"][i] = (1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1)
-        p["reach"], p["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
+        constants["reach"], constants["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
         self.work = np.zeros(1, work_type(*sizes))
-        self.scratch = np.zeros(1, self.numbers_type)
+        self._scratch = np.zeros(1, self.numbers_type)
+        self.frame = frame_of(sizes, self._scratch, self.work, self._settings)
+        self._numbers, self._words = self._scratch, words_of(self._scratch)
         self.after: Array = np.empty(row_filter.belief)
         self.parameters: Array = np.concatenate([row_filter.parameters, np.empty(row_filter.constants)])
 
@@ -420,8 +350,11 @@ class RowStep:
 
     def update(self, numbers: Records, kalman: FilterNumbers, time_ns: int, time_min: float, values: Array) -> int:
         """Take a row of one plant through all stages; returns the verdict."""
-        own = (self.scratch, self.work, self.settings, *kalman, self.parameters, self.after)
-        verdict: int = self._step.call(numbers, *own, 0, time_ns, time_min, values)
+        if numbers is not self._numbers:
+            self._numbers, self._words = numbers, words_of(numbers)
+        verdict: int = _STEP.call(
+            self._words, self.frame, *kalman, self.parameters, self.after, 0, time_ns, time_min, values
+        )
         return verdict
 
 

@@ -19,7 +19,7 @@ from monitor_node.baseline.promise import (
     extrapolate_count,
     probability_of,
 )
-from monitor_node.baseline.training import TrainingState
+from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.config import LARGEST_FALSE_ALARMS, MonitorConfig
 from monitor_node.ingest.alignment import Row
 from monitor_node.pipeline.pipeline import PlantPipeline
@@ -99,8 +99,10 @@ def check_training(
 
 def _watch(pipeline: PlantPipeline, rows: Sequence[Row], units: list[str]) -> _Trial:
     """Watch rows with a trained pipeline."""
-    promise = pipeline.promises.promise
+    promise = pipeline.evaluation.promises.promise
     assert promise is not None
     for row in rows:
         pipeline.update(row, units, [])
-    return _Trial(promise, pipeline.rows_watched, pipeline.promises.alarm_rates, pipeline.opportunities)
+    evaluation = pipeline.evaluation
+    opportunities = float(evaluation.rows_watched * evaluation.chance_alarms)
+    return _Trial(promise, evaluation.rows_watched, evaluation.promises.alarm_rates, opportunities)

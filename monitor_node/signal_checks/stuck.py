@@ -145,11 +145,6 @@ def _allowed_readings(numbers: Any) -> float:
 
 
 @jit
-def _movement(numbers: Any) -> float:
-    return movement(numbers[0])
-
-
-@jit
 def _take_all(numbers: Any, values: NDArray[np.float64], resolutions: NDArray[np.float64]) -> bool:
     found = False
     for i in range(values.size):
@@ -159,8 +154,22 @@ def _take_all(numbers: Any, values: NDArray[np.float64], resolutions: NDArray[np
     return found
 
 
-_TAKE, _ALLOWED, _MOVEMENT = Entry(_take), Entry(_allowed_readings), Entry(_movement)
-_TAKE_ALL = Entry(_take_all)
+@jit
+def _learn_all(numbers: Any, values: NDArray[np.float64], repeats: NDArray[np.int64]) -> int:
+    """Count readings of a training; writes the repeats of each run that ends, and returns the number of these runs."""
+    p, ended = numbers[0], 0
+    for value in values:
+        before = p.repeats
+        if take_reading(p, value):
+            repeats[ended] = before
+            ended += 1
+            if p.step_count == MOVEMENT_STEPS:
+                p.quietest = min(p.quietest, movement(p))
+    return ended
+
+
+_TAKE, _TAKE_ALL, _LEARN_ALL = Entry(_take), Entry(_take_all), Entry(_learn_all)
+_ALLOWED = Entry(_allowed_readings)
 
 
 class StuckState(StoredState, frozen=True):
@@ -278,11 +287,15 @@ class Stuck:
         Raises:
             ValueError: the reading is not finite.
         """
+        self.learn_all(np.array([finite(value)]))
+
+    def learn_all(self, values: NDArray[np.float64]) -> None:
+        """Learn from the next readings of the training, all of which are finite."""
         self._learning = True
-        if self._take(finite(value)):
-            p = self.numbers[0]
-            if p["step_count"] == MOVEMENT_STEPS:
-                p["quietest"] = min(float(p["quietest"]), _MOVEMENT.call(self.numbers))
+        repeats = np.empty(values.size, np.int64)
+        ended = _LEARN_ALL.call(self.numbers, values, repeats)
+        for count, runs in zip(*np.unique(repeats[:ended], return_counts=True), strict=True):
+            self._runs[int(count)] = self._runs.get(int(count), 0) + int(runs)
 
     def update(self, value: float) -> Judgement:
         """Evaluate the next reading; leave missing ones out. The statistic is the number of equal readings in a row.
@@ -293,7 +306,7 @@ class Stuck:
         if not abs(value) < LARGEST_VALUE:
             finite(value)
         self.end_learning()
-        self._take(value)
+        _TAKE.call(self.numbers, value)
         return self.judge()
 
     def judge(self) -> Judgement:
@@ -308,14 +321,6 @@ class Stuck:
         self.end_learning()
         p = self.numbers[0]
         p["last"], p["repeats"], p["step_count"] = nan, 0, 0
-
-    def _take(self, value: float) -> bool:
-        """Count a reading; returns True if it differs from the one before."""
-        repeats = int(self.numbers["repeats"][0]) if self._learning else 0
-        differs: bool = _TAKE.call(self.numbers, value)
-        if differs and self._learning:
-            self._count_run(repeats)
-        return differs
 
     def _resume(self, runs: dict[int, int], *, learning: bool) -> None:
         self._runs, self._learning = dict(runs), learning
@@ -422,9 +427,9 @@ class StuckCheck(SignalCheck):
         self._watching = False
         self._note_alarms()
         for stuck, readings, step in zip(self._stuck, values, self._resolutions, strict=True):
-            for reading in readings:
-                if isfinite(reading):
-                    stuck.learn(quantise(reading, step) if step else reading)
+            given = np.array(readings)
+            given = given[np.isfinite(given)]
+            stuck.learn_all(np.array([quantise(reading, step) for reading in given.tolist()]) if step else given)
 
     def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
         """See `SignalCheck`."""

@@ -30,7 +30,7 @@ from reactorwatch.spc.charts.shewhart import designed_width
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalState
 from reactorwatch.spc.detection import Detector
 from reactorwatch.spc.joint_chart import JointChart
-from reactorwatch.spc.m_of_n import false_alarm_rate
+from reactorwatch.spc.m_of_n import false_alarm_rates
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.training_errors import TrainingErrors
 from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
@@ -295,7 +295,7 @@ class ChartWatch:
         return list(self._watched) == self._names and self._board.is_at_rest(self._alarms.values())
 
     def load(self, p: np.void) -> None:
-        """Fill the numbers of a plant, see `row_step.row_type`, from the charts and their alarms."""
+        """Fill the numbers of a plant, see `row_frame.row_type`, from the charts and their alarms."""
         for name, watched in self._watched.items():
             assert isinstance(watched.charts, _Banked | _OfAll)
             p[name] = watched.charts.numbers
@@ -456,7 +456,7 @@ class ChartWatch:
         """Relative rate of an alarm that takes several points, from that of single points."""
         count, window, p = self._config.raise_count, self._config.window, baseline.point_probability
         nodes = np.geomspace(0.1 * p, 1.0, 40)  # rates of far rarer points are rounding errors, and nothing
-        of_rule = [max(false_alarm_rate(count, window, float(node)) * baseline.arl0, 1e-9) for node in nodes]
+        of_rule = np.maximum(false_alarm_rates(count, window, nodes) * baseline.arl0, 1e-9)
         return np.asarray(np.exp(np.interp(np.log(np.maximum(rates * p, nodes[0])), np.log(nodes), np.log(of_rule))))
 
     @property

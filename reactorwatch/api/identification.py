@@ -66,7 +66,7 @@ class IdentificationResult(Identification, frozen=True, kw_only=True):
         Raises:
             InputError: the file cannot be written.
         """
-        title = f"{self.model} model of {self.output}: {self.record.name}"
+        title = f"{self.model.upper()} model of {self.output}: {self.record.name}"
         write_page(file, title, view.identification_html(self), self.plot, self.record.name)
 
 

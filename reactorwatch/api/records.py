@@ -214,9 +214,10 @@ def _read_frame(frame: Any, process: Process, columns: dict[str, str], stated: F
     with TemporaryDirectory() as folder:
         file = write_frame(frame, Path(folder) / "frame.parquet")
         try:
-            return replace(read_file(file, None, columns, process, stated), name=FRAME)
+            read = read_file(file, None, columns, process, stated)
         except InputError as error:
             raise InputError(str(error).replace(str(file), FRAME)) from error
+    return replace(read, name=FRAME, read_as=read.read_as.removeprefix("Parquet").removeprefix(", "))
 
 
 def process_of(record: MeasuredRecord, process: ProcessLike | None) -> ProcessLike:

@@ -21,7 +21,7 @@ def report_origin(file: Path, settings: Mapping[str, object]) -> dict[str, str]:
         "software": f"reactorwatch {reactorwatch.__version__}",
         "file": str(file),
         "SHA-256 of the file": file_hash(file) if file.is_file() else "",
-        "settings": chosen or "as they come",
+        "settings": chosen or "default",
     }
     return {name: text for name, text in parts.items() if text}
 

@@ -54,7 +54,7 @@ def list_alarms(
 
     shown = [alarm for alarm in alarms if normal or alarm.state != AlarmState.ALARM_STATE_NORMAL]
     if not shown:
-        print_headline(f"no alarms; {len(alarms)} are watched, and normal", RIGHT)
+        print_headline(f"no alarms: all {len(alarms)} are normal", RIGHT)
         return
     plant_ns = max((alarm.time_ns for alarm in alarms if not _is_recorders(alarm.alarm)), default=0)
     print_rows(alarm_rows(shown, Now(plant_ns, time.time_ns())))

@@ -23,7 +23,7 @@ GAP = 2
 """Blanks between columns."""
 
 
-_NAME = re.compile(r"\s+\S(?:\S| (?! ))*\s{2,}(?=\S)| *[A-Za-z][\w ]{1,20}: ")
+_NAME = re.compile(r"\s+\S(?:\S| (?! ))*\s{2,}(?=\S)| *[A-Za-z][\w ]{1,20}: |- ")
 _COLUMNS = re.compile(r"\S {3,}\S")
 _MEANINGS = (
     (r"^(?:The simulation is right|no alarms|no gaps|nothing was damaged)(?s:.*)$", RIGHT),

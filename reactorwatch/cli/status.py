@@ -197,7 +197,7 @@ def run(
         try:
             bus = connect_now(config)
         except ConnectionError as error:
-            raise InputError(f"no router at {config.endpoint}: {error}; `reactorwatch doctor` says more") from error
+            raise InputError(f"no router at {config.endpoint}; `reactorwatch doctor` checks the connection") from error
         try:
             stopped = threading.Event()
             stop.call_on_set(stopped.set)

@@ -4,7 +4,18 @@ from collections.abc import Sequence
 from typing import Any
 
 from reactorwatch.cli.alarm_rows import Now, advise_acknowledgement, alarm_rows
-from reactorwatch.cli.display import ATTENTION, FAINT, RIGHT, STRONG, WRONG, Cell, Row, format_age, format_rows
+from reactorwatch.cli.display import (
+    ATTENTION,
+    FAINT,
+    RIGHT,
+    STRONG,
+    WRONG,
+    Cell,
+    Row,
+    format_age,
+    format_report,
+    format_rows,
+)
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.contract.promise_text import describe_power
 
@@ -26,7 +37,8 @@ def format_plant(
     parts = [format_rows([_values(plant)], width=width, colour=colour)]
     nodes = [_node(node) for node in plant["nodes"]]
     parts.append(format_rows(nodes or [("no nodes",)], _INDENT, width=width, colour=colour))
-    parts.append(format_rows(_promise(plant), _INDENT, width=width, colour=colour))
+    promise = format_rows(_promise(plant), _INDENT, colour=colour and width is None)
+    parts.append(promise if width is None else format_report(promise.split("\n"), width, colour=colour))
     if alarms:
         parts.append(format_rows(alarm_rows(alarms, now), _INDENT, width=width, colour=colour))
         advice = advise_acknowledgement(alarms, plant["plant"])
@@ -65,7 +77,7 @@ def _promise(plant: dict[str, Any]) -> list[Row]:
 
 def _node(node: dict[str, Any]) -> Row:
     if not node["alive"]:
-        return (node["node"], Cell("not there", WRONG), "", "", "", _age(node))
+        return (node["node"], Cell("not there", WRONG), _age(node))
     phase = node.get("phase", "")
     if "training" in node:
         phase += f" {100 * node['training']:.0f} %"
@@ -75,9 +87,9 @@ def _node(node: dict[str, Any]) -> Row:
     return (
         node["node"],
         Cell(phase, ATTENTION if "training" in node else ""),
+        _age(node),
         *(_count(node, name) for name in ("lost", "refused")),
         lag,
-        _age(node),
     )
 
 

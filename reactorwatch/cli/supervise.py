@@ -13,7 +13,7 @@ import structlog
 
 from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
-from monitor_node.pipeline.pipeline import check_promise
+from monitor_node.pipeline.budget import check_promise
 from plant_node.config import PlantConfig
 from reactorwatch.cli.bus_settings import (
     VIEWER,

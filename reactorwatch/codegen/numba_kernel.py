@@ -98,3 +98,19 @@ call_at = cast(Callable[[int, tuple[int, ...]], int], intrinsic(_call_at))
 The numbers and the address are 64-bit integers; an array is passed by its address (`array.ctypes.data`). The caller
 keeps the code and the arrays alive.
 """
+
+
+def _pointer_at(_typing: Any, address: Any) -> Any:
+    """Numba intrinsic: the type of the conversion, and the function that generates its IR."""
+
+    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
+
+    return types.voidptr(address), generate
+
+
+pointer_at = cast(Callable[[int], Any], intrinsic(_pointer_at))
+"""Pointer to an address, for `numba.carray` in a kernel: an array whose owner the caller keeps alive."""
+
+carray: Any = numba.carray  # type: ignore[attr-defined]
+"""Array at a pointer, of a shape and a type, without a copy."""

@@ -258,6 +258,8 @@ class Process:
                 _convert(signal.unit, model.units[signal.name], f"process {self.name!r}, signal {signal.name!r}")
         try:
             extended = self.model
+        except InputError:  # it names the process
+            raise
         except ValueError as error:
             raise InputError(f"process {self.name!r}: {error}") from error
         assert extended is not None

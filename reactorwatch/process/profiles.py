@@ -84,14 +84,14 @@ def _sine(clock: Clock, p: dict[str, ca.SX]) -> ca.SX:
     return _since(clock, p["onset"], p["size"] * ca.sin(angle))
 
 
-_ONSET = ProfileParameter("onset", "min", 0.0, -inf, inf, "when it sets in", breakpoint=True)
+_ONSET = ProfileParameter("onset", "min", 0.0, -inf, inf, "when it starts", breakpoint=True)
 
-CONSTANT = Profile("constant", (), _constant, "there all the time")
+CONSTANT = Profile("constant", (), _constant, "present from the first row to the last")
 STEP = Profile(
     "step",
-    (ProfileParameter("onset", "min", None, -inf, inf, "when it sets in", breakpoint=True),),
+    (ProfileParameter("onset", "min", None, -inf, inf, "when it starts", breakpoint=True),),
     _step,
-    "sets in at once and stays",
+    "starts at once and stays",
 )
 RAMP = Profile(
     "ramp",

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 from reactorwatch.records.timestamps import guess_pattern
 
 _WORDS = """
-|-|--|?|*|NA|N/A|n/a|na|#N/A|#NV|nan|NaN|NAN|-nan|-NaN|1.#QNAN|-1.#IND|null|NULL|None|none|missing
-|Bad|BAD|bad|Bad Input|Bad Data|No Data|No Result|I/O Timeout|Comm Fail|Calc Failed|Not Connect|Pt Created
+|-|--|---|----|-----|?|*|***|NA|N/A|N.A.|n/a|n.a.|na
+|#N/A|#NV|nan|NaN|NAN|-nan|-NaN|1.#QNAN|-1.#IND|null|NULL|None|none|missing
+|Bad|BAD|bad|Error|ERROR|error|Invalid|INVALID|invalid
+|Bad Input|Bad Data|No Data|No Result|I/O Timeout|Comm Fail|Calc Failed|Not Connect|Pt Created
 |Scan Off|Shutdown|Intf Shut|Under Range|Over Range|Arc Off-line|Out of Serv|Configure
 |#VALUE!|#DIV/0!|#REF!|#NUM!|#WERT!|#BEZUG!|#ZAHL!"""
 MISSING = tuple(word.strip() for word in _WORDS.split("|"))
@@ -25,6 +27,10 @@ _GROUPS_OF = {
     ".": re.compile(r"[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?"),
 }
 """Numbers with thousands in groups, by decimal sign."""
+_GAP = "[ '\u2019\u00a0\u202f]"
+_GAPS = re.compile(rf"[+-]?\d{{1,3}}(?:{_GAP}\d{{3}})+(?:[.,]\d+)?")
+"""Numbers with thousands in groups, by a sign that is no decimal sign."""
+_FORMS = (_POINT, _COMMA, *_GROUPS_OF.values(), _GAPS)
 _UNCERTAIN = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 """A decimal comma, or a thousand."""
 
@@ -34,7 +40,7 @@ def kind_of(cell: str, missing: frozenset[str] = frozenset(MISSING)) -> str:
     text = cell.strip()
     if text in missing:
         return EMPTY
-    if _POINT.fullmatch(text) or _COMMA.fullmatch(text) or any(form.fullmatch(text) for form in _GROUPS_OF.values()):
+    if any(form.fullmatch(text) for form in _FORMS):
         return NUMBER
     return TIME if guess_pattern([text]) is not None else TEXT
 
@@ -44,7 +50,7 @@ def guess_decimal(cells: list[str]) -> str | None:
     texts = [cell.strip() for cell in cells if "," in cell]
     if any(_GROUPS_OF["."].fullmatch(text) and "." in text for text in texts):
         return "."
-    numbers = [text for text in texts if _COMMA.fullmatch(text) or _GROUPS_OF[","].fullmatch(text)]
+    numbers = [text for text in texts if any(form.fullmatch(text) for form in (_COMMA, _GROUPS_OF[","], _GAPS))]
     if not numbers:
         return "."
     if any(not _UNCERTAIN.fullmatch(text) for text in numbers):
@@ -72,7 +78,8 @@ def to_numbers(cells: Any, decimal: str, missing: frozenset[str]) -> tuple[NDArr
     group, sign = (".", ",") if decimal == "," else (",", ".")
     grouped = pc.match_substring_regex(text, f"^{_GROUPS_OF[sign].pattern}$")
     text = pc.if_else(grouped, pc.replace_substring(text, group, ""), text)
-    text = pc.replace_substring_regex(text, "(\\d)[\u00a0\u202f](\\d)", r"\1\2")
+    gaps = pc.match_substring_regex(text, f"^{_GAPS.pattern}$")
+    text = pc.if_else(gaps, pc.replace_substring_regex(text, _GAP, ""), text)
     if decimal == ",":
         text = pc.if_else(pc.match_substring(text, "."), "x", pc.replace_substring(text, ",", "."))
     good = pc.fill_null(pc.match_substring_regex(text, f"^{_POINT.pattern}$"), fill_value=True)

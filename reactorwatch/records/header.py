@@ -101,10 +101,11 @@ class HeaderSearch:
             return []
         row, names = self._table[first - 1]
         rows = [cells for _, cells in self._table[first:] if len(cells) == self._width]
-        if len(names) == self._width + 1 and not names[-1].strip():
-            return [(row, names[:-1])]
-        if len(names) == self._width - 1 and not any(cells[-1].strip() for cells in rows):
-            return [(row, [*names, ""])]
+        surplus = self._width - len(names)
+        if surplus < 0 and not any(name.strip() for name in names[self._width :]):
+            return [(row, names[: self._width])]
+        if surplus > 0 and not any(cell.strip() for cells in rows for cell in cells[len(names) :]):
+            return [(row, [*names, *[""] * surplus])]
         cure = "; if the comma is the decimal sign as well, state --decimal ," if len(names) * 2 == self._width else ""
         raise InputError(
             f"{self._path}, row {self._table[first][0]}: expected {len(names)} cells as in the header, "

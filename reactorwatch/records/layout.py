@@ -9,9 +9,10 @@ from functools import cached_property
 from pathlib import Path
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.cells import EMPTY, kind_of
+from reactorwatch.records.cells import EMPTY, TEXT, kind_of
 
 _SEPARATORS = {",": "comma separated", "\t": "tab separated", " ": "blank separated"}
+_WORD = re.compile(r"[^\W\d_]{2}")
 _BRACKETED = re.compile(r"\s*[\[(]([^\[\]()]+)[\])]\s*$")
 
 
@@ -81,8 +82,28 @@ class Layout:
                 raise InputError(f"{self.path}, row {row}: expected {kind} cells: {error}") from error
             if cells is None:
                 return
-            if len(cells) > 1 or (cells and cells[0].strip()):
+            if len(cells) > 1 or (cells and cells[0].strip() and not (len(self.names) > 1 and is_remark(cells[0]))):
                 yield self.first_row - 1 + reader.line_num, cells
+
+
+def is_remark(line: str) -> bool:
+    """True for a line without separators that is a text, such as the number of rows below them.
+
+    >>> is_remark("240 rows selected"), is_remark("2026-03-01T08:0")
+    (True, False)
+    """
+    return _WORD.search(line) is not None and kind_of(line) == TEXT
+
+
+def blank_repeats(layout: Layout) -> tuple[bytes, int]:
+    """Text with blank lines in place of repeats of the header, as in files put together, and their number."""
+    lines = layout.text.split(b"\n", layout.first_row - 1)
+    head, rest = lines[:-1], b"\n" + lines[-1]
+    header = b"" if layout.header_row is None else head[layout.header_row - 1]
+    repeats = rest.count(b"\n" + header + b"\n") if header.strip() else 0
+    if not repeats:
+        return layout.text, 0
+    return b"\n".join(head) + rest.replace(b"\n" + header + b"\n", b"\n\n"), repeats
 
 
 def blank_comments(text: bytes) -> bytes:

@@ -18,7 +18,7 @@ from reactorwatch.records.sniff import sniff
 from reactorwatch.records.source_text import read_text
 from reactorwatch.records.text_table import TextTable
 from reactorwatch.records.time_column import TimeColumn, choose_time, counts_rows
-from reactorwatch.records.times import Times, find_written_zero_ns, read_times
+from reactorwatch.records.times import Times, find_written_zero_ns, is_newest_first, read_times
 from reactorwatch.records.write_table import RUN
 from reactorwatch.units import UnknownUnitError, conversion
 
@@ -73,8 +73,8 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
     text, notes = read_text(path)
     layout = sniff(path, text, stated)
     notes = [*notes, *layout.notes]
-    _check_names(layout)
     asked = [signal.column or signal.name for signal in signals or ()]
+    _check_names(layout, None if signals is None else asked, stated)
     long = find_long_format(layout, stated, asked)
     if long is not None:
         return _read_long(layout, long, signals, stated, notes)
@@ -94,26 +94,47 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
         ],
         [*stamps, *texts, *([] if run is None else [run])],
     )
+    notes += table.notes
+    if is_newest_first(layout, time):
+        table, notes = table.select(np.arange(table.rows)[::-1]), [*notes, "newest row first"]
     return _make_record(table, time, read_times(table, time, stated), sources, run, notes)
 
 
-def _check_names(layout: Layout) -> None:
-    for name in layout.names:
-        if layout.names.count(name) > 1:
+def _check_names(layout: Layout, asked: Sequence[str] | None, stated: FileFormat) -> None:
+    """Check that names of columns that may be read occur once: those asked for, or all columns of numbers.
+
+    Raises:
+        InputError: one occurs more often.
+    """
+    for name, kind in zip(layout.names, layout.kinds, strict=True):
+        is_read = kind == NUMBER if asked is None else name in (*asked, stated.time)
+        if is_read and layout.names.count(name) > 1:
             raise InputError(
                 f"{layout.path}, row {layout.header_row}: expected each column name once, got {name!r} more than once"
+                "; name it by its number, as in column = 3"
             )
 
 
 def _find_columns(layout: Layout, signals: Sequence[SignalColumn]) -> dict[str, int | None]:
-    """Number of each signal's column; None: there is none."""
+    """Number of each signal's column; None: there is none.
+
+    Raises:
+        InputError: two signals have the same column.
+    """
     found: dict[str, int | None] = {}
     bare = [bare_name(name) for name in layout.names]
     for signal in signals:
         name = signal.column or signal.name
         known = next((names for names in (layout.names, bare) if names.count(name) == 1), None)
         number = int(name) - 1 if signal.column and name.isdecimal() and 1 <= int(name) <= len(bare) else None
-        found[signal.name] = list(known).index(name) if known is not None else number
+        column = list(known).index(name) if known is not None else number
+        other = next((item for item, taken in found.items() if taken == column), None)
+        if column is not None and other is not None:
+            raise InputError(
+                f"{layout.path}: each signal must have a column of its own, got column {column + 1}, "
+                f"{layout.names[column]!r}, for {other} and {signal.name}; leave one out"
+            )
+        found[signal.name] = column
     return found
 
 

@@ -18,11 +18,23 @@ PARQUET_SUFFIXES = (".parquet", ".pq")
 TABLE_SUFFIXES = (*TEXT_SUFFIXES, *WORKBOOK_SUFFIXES, *PARQUET_SUFFIXES)
 """Suffixes of files that hold a record as a table."""
 
+_WIDE = {"utf-16", "utf-16-le", "utf-16-be", "utf-32"}
+"""Encodings of several bytes a letter."""
+
+HEAD_BYTES = 4096
+"""Bytes by which the encoding is guessed."""
+
 LARGEST_TEXT = 2_000_000_000
 """Most bytes of a compressed text: a small file cannot exhaust memory."""
 
 _MAGIC = {b"\x1f\x8b": "gz", b"PK\x03\x04": "xlsx", b"PAR1": "parquet", b"\x89MCAP": "mcap"}
-_BYTE_ORDER_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+_BYTE_ORDER_MARKS = {
+    b"\xef\xbb\xbf": "utf-8-sig",
+    b"\xff\xfe\0\0": "utf-32",
+    b"\0\0\xfe\xff": "utf-32",
+    b"\xff\xfe": "utf-16",
+    b"\xfe\xff": "utf-16",
+}
 
 
 def is_table(path: Path) -> bool:
@@ -65,8 +77,9 @@ def read_text(path: Path) -> tuple[bytes, list[str]]:
         return data, [*notes, f"sheet `{sheet}`"]
     if kind == "parquet":
         return _parquet(path, data), [*notes, "Parquet"]
-    encoding = next((name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark)), "utf-8")
-    if encoding != "utf-16" and b"\0" in data:
+    encoding = next((name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark)), None)
+    encoding = encoding or _guess_encoding(data[:HEAD_BYTES])
+    if encoding not in _WIDE and b"\0" in data:
         raise InputError(f"{path}: expected a CSV file, got binary data")
     if encoding != "utf-8" or not data.isascii():
         data, read_as = _decode(path, data, encoding)
@@ -82,13 +95,23 @@ def _kind(data: bytes) -> str:
     return next((kind for magic, kind in _MAGIC.items() if data.startswith(magic)), "text")
 
 
+def _guess_encoding(head: bytes) -> str:
+    """Encoding of a text without a byte order mark: in UTF-16 nearly every other byte of a table is 0."""
+    zeros = [head[start::2].count(0) for start in (0, 1)]
+    if max(zeros) > len(head) // 4 and min(zeros) < len(head) // 50:
+        return "utf-16-be" if zeros[0] > zeros[1] else "utf-16-le"
+    return "utf-8"
+
+
 def _decode(path: Path, data: bytes, encoding: str) -> tuple[bytes, str]:
     """Text as UTF-8, and the encoding to be named; bytes that are no UTF-8 are taken as Windows-1252."""
     try:
-        return data.decode(encoding).encode(), "UTF-16" if encoding == "utf-16" else ""
+        return data.decode(encoding).encode(), encoding[:6].upper() if encoding in _WIDE else ""
     except UnicodeDecodeError as error:
-        if encoding == "utf-16":
-            raise InputError(f"{path}: expected UTF-16 text, as its first bytes say: {error.reason}") from error
+        if encoding in _WIDE:
+            raise InputError(
+                f"{path}: expected {encoding[:6].upper()} text, as its first bytes say: {error.reason}"
+            ) from error
     return data.decode("cp1252", errors="replace").encode(), "Windows-1252"
 
 

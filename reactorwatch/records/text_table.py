@@ -10,10 +10,24 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.cells import NUMBER, find_sentinels, kind_of, to_numbers
-from reactorwatch.records.layout import Layout, blank_comments, describe_separator
+from reactorwatch.records.layout import Layout, blank_comments, blank_repeats, describe_separator, is_remark
 
 BLOCK_BYTES = 1 << 22
 _MISSING_CURE = "--missing {} reads it as not measured"
+
+
+def _to_numpy(cells: Any) -> NDArray[np.float64]:
+    """Values of a pyarrow array of numbers, NaN where null. Its `to_numpy` would import pandas, which takes long.
+
+    Args:
+        cells: pyarrow array of doubles, shape (rows,).
+    """
+    valid, stored = cells.buffers()
+    rows = slice(cells.offset, cells.offset + len(cells))
+    values = np.frombuffer(stored or b"", np.float64)[rows].copy()
+    if valid is not None:
+        values[np.unpackbits(np.frombuffer(valid, np.uint8), bitorder="little")[rows] == 0] = np.nan
+    return values
 
 
 class TextTable:
@@ -32,18 +46,28 @@ class TextTable:
         import pyarrow as pa
 
         self.layout = layout
+        self._repeats, self._remarks = 0, list[str]()
         self._body = _body(layout)
         if not layout.sample and not bytes(self._body).strip():
             raise InputError(f"{layout.path}: expected rows below the header, got none")
         try:
             self._table = self._parse(dict.fromkeys(map(str, numbers), pa.float64()), texts)
         except pa.ArrowInvalid:  # some cells are no plain numbers, a row is too short, or there are comments
-            self.layout = replace(layout, text=blank_comments(layout.text))
+            text, self._repeats = blank_repeats(layout)
+            self.layout = replace(layout, text=blank_comments(text))
             self._body = _body(self.layout)
             self._table = self._parse({}, [*numbers, *texts])
         self._sentinels = find_sentinels(layout.missing)
         self._known: dict[int, NDArray[np.float64]] = {}
         self._chosen: NDArray[np.intp] | None = None
+
+    @property
+    def notes(self) -> list[str]:
+        """Lines that are no rows and were left out, for people."""
+        notes = [f"repeated headers left out: {self._repeats}"] if self._repeats else []
+        if self._remarks:
+            notes.append(f"lines of text left out: {len(self._remarks)}, such as `{self._remarks[0]}`")
+        return notes
 
     @property
     def rows(self) -> int:
@@ -57,7 +81,8 @@ class TextTable:
         blocks = (text[start : start + BLOCK_BYTES] for start in range(0, text.size, BLOCK_BYTES))
         ends = sum(int(np.count_nonzero(block == ord("\n"))) for block in blocks)
         lines = ends - self.layout.text.endswith(b"\n") + 2 - self.layout.first_row
-        return self.layout.first_row if lines == self.rows and not self.layout.transposed else None
+        is_whole = self._chosen is None and lines == self.rows
+        return self.layout.first_row if is_whole and not self.layout.transposed else None
 
     def select(self, rows: NDArray[np.intp]) -> "TextTable":
         """Some of the rows.
@@ -82,8 +107,7 @@ class TextTable:
         if column not in self._known:
             cells = self._table.column(str(column))
             if str(cells.type) == "double":
-                values = cells.to_numpy()  # several chunks are copied
-                values = values if values.flags.writeable else values.copy()  # users may change it
+                values = _to_numpy(cells.combine_chunks())
             else:
                 text = cells.combine_chunks()
                 values, bad = to_numbers(text, self.layout.decimal, self.layout.missing)
@@ -126,6 +150,7 @@ class TextTable:
         layout = self.layout
         names = [str(column) for column in range(len(layout.names))]
         kept = {str(column): pa.string() for column in texts}
+        self._remarks.clear()
         try:
             return pyarrow.csv.read_csv(
                 pa.BufferReader(self._body),
@@ -137,7 +162,7 @@ class TextTable:
                 parse_options=pyarrow.csv.ParseOptions(
                     delimiter=layout.separator,
                     newlines_in_values=b'"' in layout.text,
-                    invalid_row_handler=lambda row: "error" if row.text.strip() else "skip",
+                    invalid_row_handler=self._skip_remark,
                 ),
                 convert_options=pyarrow.csv.ConvertOptions(
                     column_types={**types, **kept},
@@ -150,6 +175,13 @@ class TextTable:
             if not types:
                 self._refuse_row(error)
             raise
+
+    def _skip_remark(self, row: Any) -> str:
+        """Decide about a row with another number of cells than the header."""
+        if row.text.strip() and not (row.actual_columns == 1 and is_remark(row.text)):
+            return "error"
+        self._remarks += [row.text.strip()] if row.text.strip() else []
+        return "skip"
 
     def _refuse_row(self, error: Exception) -> NoReturn:
         """Find the row that pyarrow cannot split.

@@ -100,13 +100,15 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
     found = [*stamps, *(item for item in named if _increases(layout, item))]
     if not found:
         numbers = [item for item in candidates if layout.kinds[item.columns[0]] == NUMBER and _increases(layout, item)]
-        found = [item for item in numbers if find_epoch(layout, item, _values(layout, item.columns[0])) is not None]
+        found = [
+            item for item in numbers if find_epoch(layout, item, sample_values(layout, item.columns[0])) is not None
+        ]
         found = found or [item for item in numbers if counts_rows(layout, item.columns[0])] or named
     if len(found) > 1:
         names = ", ".join(repr(layout.names[item.columns[0]]) for item in found)
         raise InputError(f"{layout.path}: {len(found)} columns could be the time: {names}; state --time NAME")
     if not found:
-        _refuse_without_time(layout)
+        _refuse_without_time(layout, taken)
     return found[0]
 
 
@@ -149,21 +151,21 @@ def _has_time_name(layout: Layout, item: TimeColumn) -> bool:
 def counts_rows(layout: Layout, column: int) -> bool:
     """True for a first column that counts the rows or their times, under a name that says nothing."""
     name = layout.names[column].lower()
-    values = _values(layout, column)
+    values = sample_values(layout, column)
     steps = np.diff(values)
     if column != 0 or not steps.size or float(np.ptp(steps)) > 1e-6 * max(abs(values[-1]), steps[0]):
         return False
     return steps[0] > 0 and (layout.header_row is None or name == "1" or name in _INDEX_WORDS)
 
 
-def _values(layout: Layout, column: int) -> NDArray[np.float64]:
+def sample_values(layout: Layout, column: int) -> NDArray[np.float64]:
     """Numbers in the sample of a column, without cells that are none."""
     cells = [cell.strip().replace(",", ".") for cell in layout.cells(column)]
     return np.array([float(cell) for cell in cells if PLAIN.fullmatch(cell)])
 
 
 def _increases(layout: Layout, item: TimeColumn) -> bool:
-    steps = np.diff(_values(layout, item.columns[0]))
+    steps = np.diff(sample_values(layout, item.columns[0]))
     is_ordered = bool(np.count_nonzero(steps <= 0) <= MAX_SHARE_BACK * steps.size)
     return is_ordered and layout.kinds[item.columns[0]] == NUMBER
 
@@ -192,9 +194,12 @@ def find_epoch(layout: Layout, item: TimeColumn, values: NDArray[np.float64]) ->
     return None
 
 
-def _refuse_without_time(layout: Layout) -> None:
+def _refuse_without_time(layout: Layout, taken: Collection[int]) -> None:
     expected = " or ".join(map(repr, STANDARD))
     found = ", ".join(map(repr, layout.names))
+    signals = [layout.names[column] for column in sorted(taken) if _has_time_name(layout, TimeColumn((column,)))]
+    if signals:
+        found += f", of which {', '.join(map(repr, signals))} is read as a signal"
     if len(layout.names) == 1:
         found += "; the cells must be separated, such as by commas (--separator)"
     raise InputError(

@@ -12,10 +12,13 @@ from reactorwatch.records.file_format import SECONDS, FileFormat
 from reactorwatch.records.layout import Layout
 from reactorwatch.records.record import MINUTE_NS, to_time_ns
 from reactorwatch.records.text_table import TextTable
-from reactorwatch.records.time_column import PLAIN, TimeColumn, find_epoch
+from reactorwatch.records.time_column import PLAIN, TimeColumn, find_epoch, sample_values
 from reactorwatch.records.timestamps import DAY_NS, Pattern, guess_pattern, parse
 from reactorwatch.records.write_table import CLOCK
 from reactorwatch.records.zones import HOUR_NS, to_utc
+
+MIN_REVERSED = 3
+"""Fewest rows of a file that may have its newest row first."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,24 @@ def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Time
     seconds = SECONDS[unit]  # whole factors, so that decimal times stay exact
     minutes = values * (seconds / 60.0) if seconds > 60.0 else values / units_per_minute(unit)
     return Times(minutes, valid, is_clock=False, notes=notes)
+
+
+def is_newest_first(layout: Layout, column: TimeColumn) -> bool:
+    """True if each of the first rows is before the row above it."""
+    if not column.columns or len(layout.sample) < MIN_REVERSED:
+        return False
+    if column.pattern is None:
+        steps = np.diff(sample_values(layout, column.columns[0]))
+    else:
+        import pyarrow as pa
+
+        cells = [" ".join(row[number] for number in column.columns) for row in layout.sample]
+        try:
+            instants, _ = parse(pa.array(cells), column.pattern)
+        except ValueError:  # day and month are ambiguous, which is said where all times are read
+            return False
+        steps = np.diff(instants.local_ns[instants.valid])
+    return bool(steps.size and (steps < 0).all())
 
 
 def find_written_zero_ns(layout: Layout, column: TimeColumn, taken: Collection[int]) -> int:

@@ -12,6 +12,7 @@ from reactorwatch.errors import InputError
 _NAMES = "jan feb mar apr may jun jul aug sep oct nov dec"
 _MONTHS = {name: number for number, name in enumerate(_NAMES.split(), start=1)}
 _MONTHS |= {"jän": 1, "mär": 3, "mrz": 3, "mai": 5, "okt": 10, "dez": 12}
+_MONTHS |= {"ene": 1, "fév": 2, "mrt": 3, "abr": 4, "avr": 4, "mei": 5, "ago": 8, "aoû": 8, "dic": 12, "déc": 12}
 _ZONE = r"(?P<z>[Zz]|[A-Za-z]{3,4}|[+-]\d{2}:?(?:\d{2})?)"
 _CLOCK = (
     r"(?P<H>\d{1,2}):(?P<M>\d{2})(?::(?P<S>\d{2})(?:[.,](?P<f>\d{1,9}))?)?"
@@ -78,7 +79,12 @@ DATE_TIMES = (
     ),
     Pattern(
         "yyyymmddThhmmss",
-        rf"^(?P<y>\d{{4}})(?P<m>\d\d)(?P<d>\d\d)T(?P<H>\d\d)(?P<M>\d\d)(?P<S>\d\d){_ZONE}?$",
+        r"^\s*(?P<y>(?:19|20)\d\d)(?P<m>0\d|1[0-2])(?P<d>[0-3]\d)[T _-]?(?P<H>[0-2]\d):?(?P<M>[0-5]\d):?(?P<S>[0-5]\d)"
+        rf"{_ZONE}?\s*$",
+    ),
+    Pattern(
+        "Mon dd hh:mm:ss yyyy",
+        rf"^\s*(?:\pL{{2,10}}[.,]?\s+)?{_MONTH_NAME}\s+{_DAY}\s+{_CLOCK}\s+(?P<y>\d{{4}})\s*$",
     ),
 )
 PATTERNS = (*DATE_TIMES, *DATES, CLOCK)

@@ -21,12 +21,16 @@ import numpy as np
 from scipy import linalg, special
 
 from reactorwatch.arrays import Array
-from reactorwatch.spc.m_of_n import false_alarm_rate
+from reactorwatch.spc.m_of_n import false_alarm_rates
 
 POWER = 0.9
 """Share of the cases in which a deviation is seen in time."""
 
-_NODES, _LATE_NODES, _STEPS = 40, 8, 24
+_NODES, _LATE_NODES = 40, 8
+_BLOCK = 64
+"""Rows that are smoothed at once."""
+_STEPS = 11
+"""Bisections of 25 units of the logarithm, before the last interpolation."""
 _LOWEST, _HIGHEST = -4.0, 9.0
 _LEAST_HAZARD, _MOST_HAZARD = 1e-15, 1.0 - 1e-9
 _RARE = 4.0
@@ -81,12 +85,17 @@ def smallest_sizes(paths: Array, detectors: Sequence[Detector], horizons: Sequen
         return np.full(shape, np.inf)
     log_size = np.full(shape, -np.log(largest))
     low, high = log_size - 5.0, log_size + 20.0
+    at_low, at_high = np.full((2, *shape), np.nan)
     for _ in range(_STEPS):
         middle = 0.5 * (low + high)
         log_missed = np.min([_miss_log_probability(chart, path, np.exp(middle)) for chart, path in charts], axis=0)
-        seen = 1.0 - np.exp(log_missed).mean(axis=2) >= POWER
+        missed = np.clip(np.exp(log_missed).mean(axis=2), 1e-300, 1.0 - 1e-16)
+        excess = np.log(np.log(1.0 - POWER) / np.log(missed))  # nearly straight, positive where it is not seen
+        seen = excess <= 0.0
         low, high = np.where(seen, low, middle), np.where(seen, middle, high)
-    return np.where(high >= log_size + 19.9, np.inf, np.exp(high))
+        at_low, at_high = np.where(seen, at_low, excess), np.where(seen, excess, at_high)
+    found = low + (high - low) * at_low / (at_low - at_high)
+    return np.where(high >= log_size + 19.9, np.inf, np.exp(np.where(np.isfinite(found), found, high)))
 
 
 def _chart_path(paths: Array, chart: Detector, horizons: Sequence[float], ramp_rows: float) -> _Path:
@@ -123,11 +132,17 @@ def _chart_path(paths: Array, chart: Detector, horizons: Sequence[float], ramp_r
 
 def _ewma(signals: Array, weight: float) -> Array:
     """EWMA of signals over their rows, the third axis; `scipy.signal` has it, and takes half a second to import."""
-    smoothed = np.zeros_like(signals)
-    last = np.zeros_like(signals[:, :, 0])
-    for row in range(signals.shape[2]):
-        last = last + weight * (signals[:, :, row] - last)
-        smoothed[:, :, row] = last
+    if weight == 1.0:
+        return signals
+    lag = np.subtract.outer(np.arange(_BLOCK), np.arange(_BLOCK))
+    weights = np.where(lag >= 0, weight * (1.0 - weight) ** np.maximum(lag, 0), 0.0)
+    kept = ((1.0 - weight) ** np.arange(1, _BLOCK + 1))[:, None]
+    smoothed, last = np.empty_like(signals), np.zeros_like(signals[:, :, :1])
+    for start in range(0, signals.shape[2], _BLOCK):
+        block = signals[:, :, start : start + _BLOCK]
+        rows = block.shape[2]
+        smoothed[:, :, start : start + rows] = weights[:rows, :rows] @ block + kept[:rows] * last
+        last = smoothed[:, :, start + rows - 1 : start + rows]
     return smoothed
 
 
@@ -142,12 +157,7 @@ def _miss_log_probability(chart: Detector, path: _Path, sizes: Array) -> Array:
     moved = sizes[:, :, None, None] * path.mean[:, None]
     distance = chart.level - np.sqrt(moved**2 + (len(chart.signals) - 1.0))
     grid, log_within = _log_within(chart.weight, *chart.rule)
-    step = grid[1] - grid[0]
-    place = np.clip((distance - grid[0]) / step, 0.0, grid.size - 1.001)
-    index = place.astype(int)
-    share = place - index
-    log_hazard = np.log(-log_within)
-    values = -np.exp(log_hazard[index] * (1.0 - share) + log_hazard[index + 1] * share)
+    values = -np.exp(np.interp(distance, grid, np.log(-log_within)))
     log_missed = np.asarray(np.einsum("dhon,hn->dho", values, path.rows))
     if chart.rule == (1, 1):
         nearest = np.where(path.rows[:, None, :] > 0.0, distance, np.inf).min(axis=3)
@@ -160,7 +170,7 @@ def _log_within(weight: float, count: int, window: int) -> tuple[Array, Array]:
     """Grid of distances u from the limit, and the logarithm of the probability to stay within it for one row."""
     grid = np.linspace(_LOWEST, _HIGHEST, 53)
     if count > 1:
-        rates = [false_alarm_rate(count, window, float(p)) for p in np.clip(special.ndtr(-grid), 1e-12, 1.0)]
+        rates = false_alarm_rates(count, window, np.clip(special.ndtr(-grid), 1e-12, 1.0))
         return grid, np.log1p(-np.clip(rates, _LEAST_HAZARD, _MOST_HAZARD))
     kept, spread = 1.0 - weight, sqrt(weight * (2.0 - weight))
     nodes, weights = np.polynomial.legendre.leggauss(200)

@@ -21,6 +21,7 @@ not.
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 from math import ceil, comb, exp, floor, log, log10, sqrt
 
 from scipy import special
@@ -78,6 +79,7 @@ def share_arl0(per_30_days: float, alarms: int, period_min: float) -> float:
     return min(max(DAYS_MIN / period_min * alarms / per_30_days, 10 * SHORTEST), LONGEST_DESIGN)
 
 
+@lru_cache(maxsize=64)
 def point_probability(arl0: float, raise_count: int, window: int) -> float:
     """Allowed probability of a single point out if an alarm takes `raise_count` of them among `window`.
 

@@ -24,7 +24,7 @@ from recorder.panels.base import (
 _ROLES = ("output", "setpoint", "input", "mode", "label")
 """Roles in the order of their plots."""
 BESIDE = SEVERAL[3]
-"""Colour of predictions that do not judge."""
+"""Colour of predictions that are not those of the reference."""
 _COLOURS = {"setpoint": SETPOINT, "input": INPUT, "mode": QUIET, "label": QUIET}
 
 
@@ -87,10 +87,12 @@ def _plot(run: RunColumns, name: str, role: str, setpoints: Sequence[str]) -> Ti
             Series("upper limit", estimated.time_ns, estimated.upper_limit, LIMIT, width=1.0, legend="limits"),
             Series("lower limit", estimated.time_ns, estimated.lower_limit, LIMIT, width=1.0, legend="limits"),
             *series,
-            Series("predicted", estimated.time_ns, estimated.prediction, PREDICTED, width=1.0, legend=_judge(run)),
+            Series(
+                "predicted", estimated.time_ns, estimated.prediction, PREDICTED, width=1.0, legend=_reference_label(run)
+            ),
         ]
     if (beside := run.estimates_beside.get(name)) is not None:
-        label = "predicted by arx, which does not judge"
+        label = "arx, for comparison"
         series.append(Series("predicted beside", beside.time_ns, beside.prediction, BESIDE, width=0.8, legend=label))
     if rebuilt is not None:
         series.append(Series("reconstructed", rebuilt.time_ns, rebuilt.value, RESIDUAL, width=1.5))
@@ -98,9 +100,9 @@ def _plot(run: RunColumns, name: str, role: str, setpoints: Sequence[str]) -> Ti
     return TimePlot(signal_title(name, unit, run.process), unit, tuple(series))
 
 
-def _judge(run: RunColumns) -> str:
-    """Legend of the predictions by which rows are judged."""
-    return f"predicted by {run.reference}, which judges" if run.reference else "predicted"
+def _reference_label(run: RunColumns) -> str:
+    """Legend of the predictions of the reference."""
+    return f"predicted by {run.reference}" if run.reference else "predicted"
 
 
 PANEL = Panel("Overview", draw, arranged="beside")

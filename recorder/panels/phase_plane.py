@@ -133,7 +133,7 @@ def _events(run: RunColumns, time_ns: Times, x: Values, y: Values) -> tuple[Plan
     if not run.context.alarm_states:
         raised = next((change.time_ns for change in run.alarms if change.state in _ACTIVE), None)
     marks = []
-    for name, event_ns, colour in (("fault sets in", onset, FAULT), ("first alarm", raised, ALARM)):
+    for name, event_ns, colour in (("onset of the fault", onset, FAULT), ("first alarm", raised, ALARM)):
         if event_ns is not None and time_ns[0] <= event_ns <= time_ns[-1]:
             row = int(np.searchsorted(time_ns, event_ns))
             if np.isfinite(x[row]):

@@ -16,8 +16,8 @@ def draw(run: RunColumns) -> tuple[View, ...]:
         np.array([getattr(item, name) for item in run.promises], np.float64) for name in ("found", "expected")
     )
     plot = TimePlot(
-        "Alarms that chance can raise, since the training",
-        "alarms",
+        "Alarms since the training: found and promised",
+        "",
         (
             Series("promised", time_ns, promised, LIMIT),
             Series("found", time_ns, found, ALARM, held=True),

@@ -1,5 +1,6 @@
 """README, CONTRIBUTING and docs are true: every command, Python block and settings block works, in order."""
 
+import ast
 import contextlib
 import re
 import subprocess
@@ -160,6 +161,16 @@ def test_every_command_within_a_sentence_or_table_has_arguments_that_are_taken()
             assert known is not None, command
         if arguments:  # a bare name is that of the command, and no line to type
             known.make_context(name, arguments, parent=context)
+
+
+def test_from_a_frame_to_a_named_cause_takes_five_lines_and_one_import() -> None:
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    first = next(block for block in blocks(page) if block.kind == "python")
+    lines = ast.parse(first.text).body
+    assert len(lines) <= 5
+    imports = [ast.unparse(line) for line in lines if isinstance(line, ast.Import | ast.ImportFrom)]
+    assert [line for line in imports if "reactorwatch" in line] == ["import reactorwatch as rw"]
+    assert "causes[0]" in ast.unparse(lines[-1])
 
 
 def test_every_page_is_in_the_navigation_of_the_site() -> None:

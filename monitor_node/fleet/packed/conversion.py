@@ -18,7 +18,7 @@ from monitor_node.alarms.incidents import Incident
 from monitor_node.alarms.kpis import KpiState
 from monitor_node.baseline.promise import NUMBERS, PromiseState
 from monitor_node.baseline.references import ProcessReferenceState
-from monitor_node.baseline.training import TrainingState
+from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.packed.pending import (
@@ -174,7 +174,7 @@ class Conversion:
         p = record[0]
         for name, number in asdict(monitor.stats).items():
             p[name] = number
-        p["receipts"] = pipeline.signals.silence.of_plant.receipts[0]
+        p["receipts"] = pipeline.evaluation.signals.silence.of_plant.receipts[0]
         write_runs(p, state.runs)
         p["received"], p["published"] = state.received, state.published
         p["first_ns"], p["watching_since_ns"] = state.first_ns, state.watching_since_ns
@@ -192,7 +192,7 @@ class Conversion:
             None if self._never_came_up(board) else monitor.alarms,
             state.refused or None,
             state.failures or None,
-            msgspec.msgpack.encode(pipeline.signals.trainings),
+            msgspec.msgpack.encode(pipeline.evaluation.signals.trainings),
             tuple(state.units[signal] for signal in self._signals),
             tuple(watched.checks),
             state.watch.refusals,

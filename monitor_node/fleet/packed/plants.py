@@ -19,6 +19,7 @@ from monitor_node.health.message import NODE, Processed, health_message
 from monitor_node.ingest.alignment import Counts, Row
 from monitor_node.ingest.receive_stats import STALL_NS, ReceiveStats
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE, USABLE
+from monitor_node.pipeline.row_frame import words_of
 from monitor_node.state.monitor_state import learning_settings, seal_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
@@ -234,10 +235,8 @@ class PackedPlants:
         slots, step = self._slots, self._form.step
         step_rows(
             slots.plants,
-            slots.numbers,
-            step.scratch,
-            step.work,
-            step.settings,
+            words_of(slots.numbers),
+            step.frame,
             *slots.kalman,
             step.parameters,
             step.after,

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from monitor_node.fleet.packed.record import LEVELS, Array, Bytes, Ints, Places, Records
 from monitor_node.fleet.packed.ring import VALUE_BYTES, ZERO
+from monitor_node.pipeline.row_frame import LAST_NS, Words
 from monitor_node.pipeline.row_step import EVENT, step
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.records.record import MINUTE_NS
@@ -65,10 +66,8 @@ def _fits(p: Any, spacing_ns: int, bits: NDArray[np.int64], is_kept: bool) -> bo
 @jit
 def step_rows(
     plants: Records,
-    numbers: Records,
-    scratch: Records,
-    works: Records,
-    settings: Records,
+    numbers: Words,
+    frame: Words,
     beliefs: Array,
     variances: Array,
     parameters: Array,
@@ -87,10 +86,8 @@ def step_rows(
 
     Args:
         plants: records.
-        numbers: numbers of the stages, see `row_step.row_type`.
-        scratch: numbers of one plant, to work in.
-        works: see `row_step.work_type`.
-        settings: see `row_step.settings_type`.
+        numbers: numbers of the stages, see `row_frame.words_of`.
+        frame: see `row_frame.frame_of`.
         beliefs: beliefs of the filters, see `FilterNumbers`.
         variances: variances of the filters, see `FilterNumbers`.
         parameters: see `row_step.step`.
@@ -110,15 +107,13 @@ def step_rows(
     for k in range(row_slots.size):
         slot, time_ns = row_slots[k], row_time_ns[k]
         p = plants[slot]
-        spacing_ns = time_ns - numbers[slot].last_ns
+        spacing_ns = time_ns - numbers[slot, LAST_NS]
         is_odd = p.odd or not _fits(p, spacing_ns, row_bits[k], is_kept)
         if not is_odd:
             is_odd = (
                 step(
                     numbers,
-                    scratch,
-                    works,
-                    settings,
+                    frame,
                     beliefs,
                     variances,
                     parameters,

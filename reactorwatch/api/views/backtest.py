@@ -1,5 +1,6 @@
 """Back-tests in a notebook."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from reactorwatch.api.views.record import signal_panels, time_title
@@ -32,9 +33,9 @@ def backtest_html(result: "BacktestResult") -> str:
             "" if row["cleared_min"] is None else f"{row['cleared_min']:g}",
             row["alarm"],
             row["priority"],
-            str(alarm.suspect[0]) if alarm.suspect else "",
+            cause,
         )
-        for row, alarm in zip(rows, result.alarms, strict=True)
+        for row, cause in zip(rows, _new_causes(result.alarms), strict=True)
     ]
     trained = result.trained_until_min
     parts = [
@@ -88,6 +89,12 @@ def merge_spans(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
         else:
             merged.append((start, end))
     return merged
+
+
+def _new_causes(alarms: Sequence[Any]) -> list[str]:
+    """The likeliest cause of each alarm; empty where it is that of the alarm before."""
+    causes = [str(alarm.suspect[0]) if alarm.suspect else "" for alarm in alarms]
+    return [cause if i == 0 or cause != causes[i - 1] else "" for i, cause in enumerate(causes)]
 
 
 def _row(alarm: Any) -> dict[str, Any]:

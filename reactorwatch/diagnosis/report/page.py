@@ -18,6 +18,7 @@ from reactorwatch.diagnosis.report.words import (
     describe_location,
     describe_parameter,
     describe_place,
+    describe_significance,
     describe_size,
     describe_timing,
     describe_verdict,
@@ -93,16 +94,22 @@ def as_page(
     catalogue = {effect.name: effect for effect in effects}
     causing = [catalogue[cause.cause] for cause in diagnosis.causes]
     meant = meanings(causing)
+    rivals = _alternatives(diagnosis, effects) if diagnosis.verdict == AMBIGUOUS else []
     return _PAGES.get_template("page.html.j2").render(
         diagnosis=diagnosis,
         file=file,
-        verdict=describe_verdict(diagnosis),
+        verdict=(
+            f"The simulation is wrong, and the record cannot tell which of {len(rivals)} explanations is right. "
+            f"{describe_significance(diagnosis)}"
+            if rivals
+            else describe_verdict(diagnosis)
+        ),
         place=describe_location(diagnosis) if diagnosis.verdict != NOMINAL else "",
         causes=[
             _describe_cause(diagnosis, effects, cause, item.symbol)
             for cause, item in zip(diagnosis.causes, meant, strict=True)
         ],
-        alternatives=_alternatives(diagnosis, effects) if diagnosis.verdict == AMBIGUOUS else [],
+        alternatives=rivals,
         parameters=[(name, describe_parameter(item)) for name, item in diagnosis.parameters.items()],
         meanings=meant,
         equations=balances(model, causing),

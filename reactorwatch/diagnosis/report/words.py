@@ -33,10 +33,10 @@ def describe_verdict(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == NOMINAL and off:
         return (
             f"The simulation is right within what was stated of its parameters: {' and '.join(off)} "
-            f"{'is' if len(off) == 1 else 'are'} a little off, and what the record shows beyond that is noise."
+            f"{'is' if len(off) == 1 else 'are'} a little off, and the rest of the record is noise."
         )
     if diagnosis.verdict == NOMINAL:
-        return "The simulation is right: what the record shows beyond it is noise."
+        return "The simulation is right: the rest of the record is noise."
     matters = describe_significance(diagnosis)
     if diagnosis.verdict == AMBIGUOUS:
         explanations = [diagnosis.causes, *(item.explanation for item in diagnosis.alternatives)]

@@ -48,6 +48,7 @@ The simulation is wrong: coolant leak, since 149.99 ± 0.03 min. It matters in p
   cause       coolant leak (coolant_flow, step)
   differs     T: the simulation errs by 7.32 K, less than 1 % of it noise; most from 149.9 to 179.9 min (12)
   suspect: 15 % of the coolant lost (94 %; coolant_flow, step at 150.0 min), unknown (6 %)
+- Alarm raised: `shewhart/T` at 150.3 min, 0.3 min after the fault
 
 family  order  delay  one step  free run     criterion
 arx     1      1      99.7      91.2 percent 1234.5
@@ -60,11 +61,12 @@ def test_a_report_is_wrapped_at_words_and_values_stay_in_their_column(width: int
     text = format_report(REPORT, width, colour=False)
     lines = text.split("\n")
     assert max(len(line) for line in lines if "a-name" not in line) <= width
-    assert " ".join(text.split()).startswith(" ".join(" ".join(REPORT[:5]).split()))
+    assert " ".join(text.split()).startswith(" ".join(" ".join(REPORT[:6]).split()))
     first = next(number for number, line in enumerate(lines) if line.startswith("  differs     T: "))
     assert lines[first + 1].startswith(" " * 14)
     first = next(number for number, line in enumerate(lines) if line.startswith("  suspect: "))
     assert lines[first + 1].startswith(" " * 11)
+    assert all(line.startswith(("- ", "  ")) for line in lines[lines.index("") - 1 : lines.index("")])
 
 
 def test_the_rows_of_a_table_stay_one_line_each() -> None:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -35,3 +36,11 @@ def test_a_node_starts_without_the_slow_parts_of_scipy_and_without_a_viewer(node
     question = f"import sys, {node}.__main__; sys.exit(' '.join({slow!r} & sys.modules.keys()))"
     ended = subprocess.run([sys.executable, "-c", question], capture_output=True, text=True, check=False)
     assert not ended.stderr.strip()
+
+
+def test_a_record_is_read_without_pandas_which_takes_long_to_import(tmp_path: Path) -> None:
+    (tmp_path / "record.csv").write_text(
+        "time_min,qc,C,T\n0,100,0.1,440\n0.1,,0.1,440\n0.2,100,0.1,440\n", encoding="utf-8"
+    )
+    question = "import sys, reactorwatch as rw; rw.read_record('record.csv'); sys.exit('pandas' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", question], cwd=tmp_path, check=False).returncode == 0

@@ -137,7 +137,7 @@ def test_it_shows_values_training_the_age_of_alarms_their_cause_and_the_command_
     board.on_message(said("a/alarm/ewma/T", leak))
     values, node, header, row, advice = board.text(START_NS + 5 * S).splitlines()
     assert "T 438.54 K" in values
-    assert " ".join(node.split()) == "monitor training 43 % lost 0 refused 0 lag 0.0 ms 5 s ago"
+    assert " ".join(node.split()) == "monitor training 43 % 5 s ago lost 0 refused 0 lag 0.0 ms"
     assert header.split()[:2] == ["priority", "incident"]
     assert row.split("  ")[1] == "high"
     assert row.endswith("12 min  15 % of the coolant lost (93 %)")

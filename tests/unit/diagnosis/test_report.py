@@ -68,14 +68,14 @@ def test_what_stands_in_the_page_from_outside_is_escaped(case: str) -> None:
 @pytest.mark.parametrize(
     ("case", "parts"),
     [
-        ("nominal", ["The simulation is right", "How well it simulates", "They stay as they are"]),
+        ("nominal", ["The simulation is right", "Errors of the simulation", "Unchanged."]),
         (
             "named",
             [
                 "coolant leak",
                 "4.996 % of the coolant lost (± 0.017 %)",
                 "m = -0.04996 ± 0.00017",
-                "What it gains",
+                "Improvement",
                 "A closer look",
                 "209,025.5",
                 'class="added"',
@@ -106,15 +106,16 @@ def test_an_ambiguous_verdict_shows_all_rivals_with_their_sizes_and_the_experime
         "Wider steps of qc tell both apart.",
     ):
         assert part in top
+    assert "cannot tell which of 2 explanations" in top
     assert "<th>cause</th>" not in top
     assert "<th>cause</th>" in page("named").partition("<h2>")[0]
-    assert "which is not sure" in page("ambiguous")
-    assert "which is not sure" not in page("named")
+    assert "which is not certain" in page("ambiguous")
+    assert "which is not certain" not in page("named")
 
 
 def test_an_ambiguous_verdict_without_an_experiment_says_so() -> None:
     text = as_page(replace(CASES["ambiguous"], experiment=None), cstr(), EFFECTS, "a.csv", "extended.json")
-    assert "No experiment within the limits would decide." in text.partition("<h2>")[0]
+    assert "No experiment within the limits separates them." in text.partition("<h2>")[0]
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -128,12 +129,12 @@ def test_what_is_said_of_colours_holds_on_a_dark_ground_too_and_plots_are_as_wid
 def test_something_unknown_is_drawn_over_time_as_what_would_do_the_same() -> None:
     curves = CASES["unknown"].curves
     assert curves is not None
-    assert "What acts there" not in page("unknown")
+    assert "Size of the unknown effect" not in page("unknown")
     told = replace(
         curves, unknown=UnknownInputCurve("heat loss", "1/min", np.linspace(0.0, 0.01, curves.time_min.size))
     )
     text = as_page(replace(CASES["unknown"], curves=told), cstr(), EFFECTS, "a.csv", "extended.json")
-    assert "What acts there, over time" in text
+    assert "Size of the unknown effect" in text
     assert "Estimated as the size of: heat loss, 1/min" in text
 
 

@@ -19,7 +19,7 @@ from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
 @pytest.mark.parametrize(
     ("case", "expected"),
     [
-        ("nominal", "The simulation is right: what the record shows beyond it is noise."),
+        ("nominal", "The simulation is right: the rest of the record is noise."),
         ("named", "The simulation is wrong: coolant leak, since 150.33 ± 0.02 min. It matters in practice."),
         (
             "pair",
@@ -167,7 +167,7 @@ def test_the_object_holds_what_was_found() -> None:
 def test_what_was_stated_to_be_uncertain_is_told_as_it_is_known_now() -> None:
     assert describe_verdict(ADJUSTED) == (
         "The simulation is right within what was stated of its parameters: K3 is a little off, "
-        "and what the record shows beyond that is noise."
+        "and the rest of the record is noise."
     )
     assert "parameter   K3 711 ± 3 l/min; stated: 700 ± 30 l/min  (95 %)" in as_text(ADJUSTED, "run.csv", EFFECTS)
     said = as_object(ADJUSTED, "run.csv", 1.0)["parameters"]

@@ -7,8 +7,8 @@ from typing import Any
 
 from monitor_node.__main__ import MonitorNode
 from monitor_node.baseline.references import ProcessReference
-from monitor_node.baseline.training import TrainingState
 from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, read_equations
+from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.diagnosis_worker import DiagnosisWorker, PlantFinding
 from reactorwatch.contract.codec import Publication
 from reactorwatch.diagnosis.result import NAMED
@@ -93,6 +93,6 @@ def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_
     assert change == changes(warm.published)[0]
     assert warm.finding.verdict == NAMED
     assert not node._worker.is_busy
-    reference = node.pipeline._reference
+    reference = node.pipeline.evaluation.reference
     assert isinstance(reference, ProcessReference)
     assert reference.model is node.equations is read_equations(change.model)  # the one that was prepared

@@ -12,7 +12,8 @@ from monitor_node.baseline.references import ProcessReference, input_reach
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.ingest.sampling import missing_rows
-from monitor_node.isolation.isolation import UNKNOWN, Isolation
+from monitor_node.isolation.isolation import Isolation
+from monitor_node.isolation.suspect import UNKNOWN
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.kalman.ekf import Filter

@@ -206,7 +206,7 @@ def test_equations_with_two_inputs_judge_a_plant_in_closed_loop(missing: float) 
     plant.values[np.random.default_rng(1).random(plant.values.shape) < missing] = np.nan
     config, messages, model = plant.config(diagnose_training=False), plant.messages(), three_tanks()
     monitor, staged = (Monitor(config, START_NS, model=model) for _ in range(2))
-    staged.pipeline._find_normal = lambda time_ns: False  # type: ignore[method-assign]
+    staged.pipeline.evaluation.find_normal = lambda *_: False  # type: ignore[method-assign]
     published = [live(monitor, [message]) for message in messages]
     assert monitor.reference == "equations"
     assert [live(staged, [message]) for message in messages] == published

@@ -67,7 +67,7 @@ def test_it_learns_nothing_while_an_alarm_is_active_and_what_it_learned_last_is_
     for k, values in enumerate(zip(flow.tolist(), stepped.tolist(), strict=True)):
         take(monitor, k, values)
         if k >= 1000:
-            state = monitor.pipeline._predictors[0].state
+            state = monitor.pipeline.models.predictors[0].state
             history[k] = (state.rls.memory, monitor.alarms.has_unexplained)
     first = next(k for k, (_, is_active) in history.items() if is_active)
     assert onset < first < onset + 20
@@ -86,6 +86,6 @@ def test_an_outlier_teaches_it_nothing(plant: tuple[Array, Array]) -> None:
     monitor = Monitor(config_of("arx"), 0, points=False)
     for k, values in enumerate(zip(flow[:1100].tolist(), measured[:1100].tolist(), strict=True)):
         take(monitor, k, values)
-    before = monitor.pipeline._predictors[0].state.rls
+    before = monitor.pipeline.models.predictors[0].state.rls
     take(monitor, 1100, (float(flow[1100]), float(measured[1100]) + 50.0))
-    assert monitor.pipeline._predictors[0].state.rls == before
+    assert monitor.pipeline.models.predictors[0].state.rls == before

@@ -51,7 +51,7 @@ def watched(
     """
     run = Watched(Monitor(config or MonitorConfig(isolation=False), 0))
     if not compiled:
-        run.monitor.pipeline._find_normal = lambda time_ns: False  # type: ignore[method-assign]
+        run.monitor.pipeline.evaluation.find_normal = lambda *_: False  # type: ignore[method-assign]
     for message in samples(time_min, columns):
         run.said += run.monitor.on_message(message, 0)
     run.said += run.monitor.finish()

@@ -119,7 +119,7 @@ def test_the_plane_marks_the_fault_and_the_first_alarm(run: RunColumns) -> None:
     plane, _ = both(run)
     assert (plane.x_label, plane.y_label) == ("C, mol/l", "T, K")
     places = {mark.name: (mark.x, mark.y) for mark in plane.events}
-    for name, minutes in (("fault sets in", golden.ONSET_MIN), ("first alarm", golden.RAISED_MIN)):
+    for name, minutes in (("onset of the fault", golden.ONSET_MIN), ("first alarm", golden.RAISED_MIN)):
         row = round(minutes / golden.STEP_MIN)
         assert places[name] == (golden.value("C", row), golden.value("T", row))
 

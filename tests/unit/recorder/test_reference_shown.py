@@ -45,8 +45,8 @@ def run() -> RunColumns:
 def test_both_predictions_are_drawn_and_the_one_that_judges_is_named(run: RunColumns) -> None:
     (plot,) = [item for item in overview.draw(run) if isinstance(item, TimePlot)]
     legends = {series.name: series.legend for series in plot.series}
-    assert legends["predicted"] == "predicted by black-box, which judges"
-    assert legends["predicted beside"] == "predicted by arx, which does not judge"
+    assert legends["predicted"] == "predicted by black-box"
+    assert legends["predicted beside"] == "arx, for comparison"
     beside = next(series for series in plot.series if series.name == "predicted beside")
     np.testing.assert_array_equal(beside.value, 400.0 + np.arange(1, ROWS + 1))
     assert [item.title for item in charts.draw(run)] == ["Residual of T"]

@@ -123,7 +123,7 @@ def test_a_signal_that_is_not_required_may_be_absent(tmp_path: Path) -> None:
         (PLAIN.replace("101,0.2", "101,0,2"), "row 3: expected 4 cells as in the header, got 5"),
         (PLAIN + '0.6,"1,2,3\n', "row 5: expected comma separated cells"),
         (b"time_min,qc,C,T\n0,1,2,\xb0\n", "row 2, column 'T': expected a finite number or nothing, got '\xb0'"),
-        (PLAIN.encode("utf-16-le"), "expected a CSV file, got binary data"),
+        (PLAIN.encode() + b"\0\1", "expected a CSV file, got binary data"),
         (b"\x89MCAP0\r\n" + bytes(100), "expected a CSV file, got an MCAP recording"),
     ],
 )

@@ -115,6 +115,9 @@ GUESSES = {
     "rows and columns exchanged": "rows and columns exchanged",
     "German Excel": "Windows-1252, ; separated, decimal comma, header in row 4, "
     "time `Zeit` dd.mm.yyyy hh:mm:ss in Europe/Berlin",
+    "newest row first": "newest row first",
+    "a line of text at the end": "lines of text left out: 1, such as `(240 rows affected)`",
+    "a header that is repeated": "repeated headers left out: 1",
     "long": "time `timestamp` yyyy-mm-dd hh:mm:ss, a row for each value of `value` by `tag`",
 }
 
@@ -266,6 +269,31 @@ def test_the_option_that_is_named_settles_it(tmp_path: Path, name: str, stated: 
 def test_a_statement_that_means_nothing_is_refused(stated: dict[str, str], line: str) -> None:
     with pytest.raises(InputError, match=line):
         FileFormat(**stated)  # type: ignore[arg-type]
+
+
+def test_the_time_column_that_is_read_as_a_signal_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "record.csv"
+    path.write_text(table(MINUTES, cells()))
+    with pytest.raises(InputError, match="'T', of which 'time_min' is read as a signal; state --time NAME"):
+        read_table(path, [SignalColumn("C"), SignalColumn("T", column="time_min")])
+
+
+def test_two_signals_of_one_column_are_refused(tmp_path: Path) -> None:
+    """By its name and by its number."""
+    path = tmp_path / "record.csv"
+    path.write_text(table(MINUTES, cells()))
+    line = "each signal must have a column of its own, got column 3, 'C', for C and T; leave one out"
+    with pytest.raises(InputError, match=line):
+        read_table(path, [SignalColumn("C"), SignalColumn("T", column="3")])
+
+
+def test_a_name_that_occurs_twice_is_refused_where_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "record.csv"
+    path.write_text("time_min,p,T,T\n0,1,2,3\n1,2,3,4\n")
+    for signals in (None, [SignalColumn("T")]):
+        with pytest.raises(InputError, match="once, got 'T' more than once; name it by its number, as in column = 3"):
+            read_table(path, signals)
+    assert read_table(path, [SignalColumn("p"), SignalColumn("T", column="4")]).columns["T"].tolist() == [3.0, 4.0]
 
 
 def test_modes_and_labels_may_be_words(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def leak() -> list[Encoded]:
 
 
 def reference_of(monitor: Monitor) -> BlackBoxReference:
-    reference = monitor.pipeline._reference
+    reference = monitor.pipeline.evaluation.reference
     assert isinstance(reference, BlackBoxReference)
     return reference
 

@@ -60,7 +60,7 @@ def with_value(message: Encoded, value: float) -> Encoded:
 
 
 def filter_state(monitor: Monitor) -> Any:
-    reference = monitor.pipeline._reference
+    reference = monitor.pipeline.evaluation.reference
     assert isinstance(reference, ProcessReference)
     return reference.state
 
@@ -115,7 +115,7 @@ def test_a_plant_that_is_not_the_process_is_watched_whatever_its_values(run: lis
     monitor = Monitor(CONFIG, 0, points=False)
     alarms = fed(monitor, celsius)
     assert monitor.phase == "watching"
-    assert isinstance(monitor.pipeline._reference, BlackBoxReference)
+    assert isinstance(monitor.pipeline.evaluation.reference, BlackBoxReference)
     assert not [item.alarm for item in alarms if item.alarm.startswith("range/")]
 
 

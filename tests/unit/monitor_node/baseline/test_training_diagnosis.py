@@ -5,18 +5,21 @@ from dataclasses import replace
 import msgspec
 import pytest
 
+from monitor_node.baseline.references import ProcessReference
 from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, equations_text, read_equations
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.replay import backtest
 from monitor_node.replay.verification import verify
 from monitor_node.state.monitor_state import SEAL
-from reactorwatch.contract.codec import Encoded, Publication, encode
-from reactorwatch.contract.messages_pb2 import Baseline, Sample
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
+from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, Sample
 from reactorwatch.diagnosis.result import NAMED, NOMINAL
 from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import ExtendedModel
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import pack_times, unpack_times
@@ -239,3 +242,26 @@ def test_a_recorded_change_whose_model_cannot_be_read_is_one_line(warm: Run) -> 
     ]
     with pytest.raises(InputError, match=r"^the model of the baseline is not JSON: "):
         verify(lambda: log, CONFIG)
+
+
+def test_a_restored_baseline_judges_by_its_own_equations_and_traces_alarms_to_causes(warm: Run) -> None:
+    monitor = Monitor(CONFIG, 0)
+    monitor.from_bytes(warm.changed)
+    monitor.on_history_end()
+    assert monitor.equations is not None
+    extended = fingerprint(monitor.equations)
+    assert extended != fingerprint(cstr())
+    for what, first in (("relearn", LATE + 60), ("restore", LATE + 90)):
+        command = BaselineCommand(what=what, by="Anna", why="a new feed, which was none")
+        question = Encoded(keys.key(CONFIG.plant, keys.COMMAND, "baseline"), *encode_message(command))
+        assert monitor.on_command(question, 0)[0].accepted
+        publish(monitor, warm.messages[first : first + 30])
+    reference = monitor.pipeline.evaluation.reference
+    assert isinstance(reference, ProcessReference)
+    assert fingerprint(reference.equations) == extended
+    assert monitor.failures.by_stage == {}
+    resumed = Monitor(CONFIG, 0)
+    resumed.from_bytes(monitor.to_bytes())
+    resumed.on_history_end()
+    rest = warm.messages[LATE + 120 :]
+    assert publish(resumed, rest) == publish(monitor, rest)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from monitor_node.isolation.causes import causes_of
-from monitor_node.isolation.isolation import PROCESS, SENSOR, UNKNOWN, Isolation, Suspect
+from monitor_node.isolation.isolation import Isolation
+from monitor_node.isolation.suspect import PROCESS, SENSOR, UNKNOWN, Suspect
 from monitor_node.isolation.window import Row
 from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.effect import Effect

@@ -11,8 +11,9 @@ from monitor_node.alarms.annunciator import STOPPED
 from monitor_node.baseline.signal_range import signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, UNKNOWN, Isolation
+from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
 from monitor_node.isolation.reconstruction import START_STEPS, START_STEPS_A_ROW, Reconstruction
+from monitor_node.isolation.suspect import UNKNOWN
 from monitor_node.isolation.window import Row
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample

@@ -98,6 +98,7 @@ def test_late_looks_name_what_early_ones_cannot_and_a_resumed_search_says_the_sa
     feed(first, leak[:ALARM])
     board.has_unexplained = True
     feed(first, leak[ALARM : ALARM + 150])
+    early = len(board.causes)
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(first.state), type=stage.SuspicionState)
     assert state.way is not None
     second, other = suspicion()
@@ -108,10 +109,24 @@ def test_late_looks_name_what_early_ones_cannot_and_a_resumed_search_says_the_sa
     feed(first, rest)
     feed(second, rest)
     assert not any(board.stopped)
-    assert other.causes == board.causes[3:]
+    assert other.causes == board.causes[early:]
     assert second.state == first.state
     assert [causes[0].cause for causes in board.causes[-1:]] == ["coolant_flow"]
     assert board.causes[-1][0].probability > 0.9
+
+
+def test_a_look_is_taken_early_if_the_rows_contradict_the_last_one() -> None:
+    """A leak that grows ends between the looks at 100 and at 300 rows; no filter of the bank follows it beyond."""
+    rows = rows_of("coolant_flow:ramp:-0.05@60.03min,end=75min", seed=12, after_min=24.0)
+    search, board = suspicion()
+    feed(search, rows[:ALARM])
+    board.has_unexplained = True
+    feed(search, rows[ALARM : ALARM + 140])
+    assert search.state.named_rows == 100
+    feed(search, rows[ALARM + 140 : ALARM + 220])
+    assert 140 < search.state.named_rows < 220
+    assert (board.causes[-1][0].cause, board.causes[-1][0].profile) == ("coolant_flow", "ramp")
+    assert board.causes[-1][0].probability > 0.5
 
 
 def test_rows_far_apart_have_no_look_that_could_not_use_all_rows_since_the_alarm(monkeypatch: Any) -> None:
