@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from reactorwatch.spc.charts.base import Array, ChartState, Judgement, positive, vector
-from reactorwatch.spc.charts.residual_space import BLOCKS, adjustment, fill_missing
+from reactorwatch.spc.charts.residual_space import BLOCKS, adjustment, average_rows, fill_missing
 from reactorwatch.spc.false_alarm_budget import degrees_of_freedom
 from reactorwatch.spc.prewhitening import Prewhitening, learn
 from reactorwatch.spc.run_length.design import ewma_limit
@@ -69,12 +69,21 @@ class Averages(NamedTuple):
         row_sds: standard deviation of a row's cube root.
         sds: standard deviation of the average, errors of the mean included.
         freedom: degrees of freedom of the least known one.
+        largest: largest average of the held-out rows, in standard deviations.
     """
 
     means: Array
     row_sds: Array
     sds: Array
     freedom: float
+    largest: float
+
+    @classmethod
+    def of(cls, roots: Array, weight: float, sds: Array, freedom: float) -> Self:
+        """Averages of cube roots with these standard deviations; rows with NaN are left out."""
+        known = roots[np.isfinite(roots).all(axis=1)]
+        means = known.mean(axis=0)
+        return cls(means, known.std(axis=0), sds, freedom, float(np.max(average_rows(known - means, weight) / sds)))
 
 
 class StatisticsChart(ValueChart):
@@ -104,7 +113,7 @@ class StatisticsChart(ValueChart):
     def __init__(self, names: Sequence[str], model: Mapping[str, Array], weight: float, limit: float) -> None:
         self.names, self.weight, self.limit = tuple(names), float(weight), positive("limit", limit)
         self.model: Model = {name: np.ascontiguousarray(item, np.float64) for name, item in model.items()}
-        if any(self.model[name].shape != (len(self.labels),) for name in ("means", "row_sds", "sds")):
+        if any(self.model[name].shape != (len(self.labels),) for name in ("root_means", "root_sds", "average_sds")):
             raise ValueError(f"a chart of {', '.join(self.labels)} must have a mean and deviations of each")
         self._averages, self._parts = np.zeros(len(self.labels)), np.zeros((len(self.labels), len(self.names)))
         self._before: Array = np.empty((0, len(self.names)))
@@ -146,7 +155,7 @@ class StatisticsChart(ValueChart):
         """See `ValueChart`."""
         model, averages = cls.fit(baseline.values, baseline), cls.averages(baseline)
         centre, matrix = adjustment(baseline.values / (scale := baseline.values.std(axis=0, ddof=1)))
-        model |= {"means": averages.means, "row_sds": averages.row_sds, "sds": averages.sds}
+        model |= {"root_means": averages.means, "root_sds": averages.row_sds, "average_sds": averages.sds}
         model["usual_parts"] = cls._usual_parts(model, baseline.values)
         model |= {"centre_of_missing": centre * scale, "matrix_of_missing": matrix / scale}
         return cls(baseline.names, model, baseline.settings[cls.weight_key], cls.limit_of(baseline, averages))
@@ -159,13 +168,17 @@ class StatisticsChart(ValueChart):
     @classmethod
     def averages(cls, baseline: ValueBaseline) -> Averages:
         """Averages of the training's statistics, each row judged by the model of the other blocks."""
-        roots, weight = cls.held_out_roots(baseline), baseline.settings[cls.weight_key]
+        return cls.spread(cls.held_out_roots(baseline), baseline)
+
+    @classmethod
+    def spread(cls, roots: Array, baseline: ValueBaseline) -> Averages:
+        """Averages of cube roots, shape (rows, statistics), in which missing ones are NaN."""
+        weight = baseline.settings[cls.weight_key]
         learned = [learn(column, 1e-12) for column in roots.T]
         variances = [(item.sd / item.shift_gain) ** 2 / item.rows for item in learned]
         sds = [sqrt(average_variance(item, weight) + v) for item, v in zip(learned, variances, strict=True)]
-        rows = np.nanstd(roots, axis=0)
         freedom = min(degrees_of_freedom(item, weight) for item in learned)
-        return Averages(np.nanmean(roots, axis=0), rows, np.array(sds), freedom)
+        return Averages.of(roots, weight, np.array(sds), freedom)
 
     @classmethod
     def held_out_roots(cls, baseline: ValueBaseline) -> Array:
@@ -188,8 +201,12 @@ class StatisticsChart(ValueChart):
 
     @classmethod
     def limit_of(cls, baseline: ValueBaseline, averages: Averages) -> float:
-        """Limit of the averages for the false alarms of the chart, in standard deviations."""
-        return -float(special.stdtrit(averages.freedom, float(special.ndtr(-cls._known_limit(baseline)))))
+        """Limit of the averages for the false alarms of the chart, in standard deviations.
+
+        Where less than one false alarm is promised in the training, it is not below the largest average there.
+        """
+        limit = -float(special.stdtrit(averages.freedom, float(special.ndtr(-cls._known_limit(baseline)))))
+        return max(limit, averages.largest) if baseline.values.size < baseline.arl0 else limit
 
     @classmethod
     def _known_limit(cls, baseline: ValueBaseline) -> float:
@@ -234,8 +251,8 @@ class StatisticsChart(ValueChart):
         window = np.concatenate([self._before, self._newest[None]])
         self._before = window[max(len(window) - self.rows_before, 0) :]
         if len(window) > self.rows_before:
-            off = np.cbrt(self.statistics(self.model, window)) - self.model["means"]
-            off = np.minimum(off, OUTLIER * self.model["row_sds"]) / self.model["sds"]
+            off = np.cbrt(self.statistics(self.model, window)) - self.model["root_means"]
+            off = np.minimum(off, OUTLIER * self.model["root_sds"]) / self.model["average_sds"]
             averages = (1.0 - self.weight) * self._averages + self.weight * off
             self._averages = np.minimum(averages, RELEASE * self.limit)
             if self._averages.max() > SUSPICIOUS * self.limit:

@@ -8,6 +8,8 @@ from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.cva_residual import CvaResidual
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma
+from reactorwatch.spc.charts.multiple_pca import MultiplePca
+from reactorwatch.spc.charts.multiway_pca import MultiwayPca
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.charts.pca import PcaSpe, PcaT2
 from reactorwatch.spc.charts.pls import Pls
@@ -26,6 +28,8 @@ CHARTS: tuple[type[Chart], ...] = (
     ResidualSpace,
     CvaResidual,
     Pls,
+    MultiplePca,
+    MultiwayPca,
     ParameterT2,
 )
 

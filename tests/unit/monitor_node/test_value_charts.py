@@ -13,6 +13,8 @@ from .test_many_signals import NAMES, TRAINING, plant, raised, settings
 CHARTS: dict[str, dict[str, Any]] = {
     "cva_residual": {},
     "pls": {"pls_quality": ("y9",)},
+    "multiple_pca": {},
+    "multiway_pca": {"multiway_pca_progress": ("y0",)},
 }
 """Charts of values, with the settings that they need."""
 
@@ -21,8 +23,10 @@ CHARTS: dict[str, dict[str, Any]] = {
 def test_a_chart_of_values_raises_its_alarm_and_resumes_bit_for_bit(name: str) -> None:
     """Stored in the middle of the watch; a signal is missing at times."""
     values = plant(TRAINING + 200, TRAINING + 50, 3)
-    values[3, TRAINING + 50 :] += 2.0 * values[3, :TRAINING].std()
+    values[3, TRAINING + 50 :] += 5.0 * values[3, :TRAINING].std()
     values[5, TRAINING + 3 :: 7] = np.nan
+    if name == "multiway_pca":
+        values[0] = np.arange(values.shape[1]) % 12
     config = settings(charts=(name,), **CHARTS[name])
     whole, first, second = (Monitor(config, 0) for _ in range(3))
     said = watch(whole, values)

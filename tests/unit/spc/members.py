@@ -13,6 +13,8 @@ from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.cva_residual import CvaResidual
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma
+from reactorwatch.spc.charts.multiple_pca import MultiplePca
+from reactorwatch.spc.charts.multiway_pca import STAGES, MultiwayPca
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.charts.pca import PcaModel, PcaSpe, PcaT2
 from reactorwatch.spc.charts.pls import Pls
@@ -66,11 +68,14 @@ def related(rng: np.random.Generator, rows: int) -> Array:
 
 MODEL = PcaModel.fit(related(np.random.default_rng(1), 20_000), components=2, false_alarm=0.05)
 
+SIZES, AXES = np.linalg.eigh(COVARIANCE)
+"""Variances and directions of the principal components of `vector`."""
+
 
 def known(statistics: int) -> dict[str, Array]:
     """Averages of cube roots that are shown as they are, of three signals."""
     one = np.ones(statistics)
-    return {"means": 0.0 * one, "row_sds": one, "sds": one, "usual_parts": np.zeros((statistics, 3))}
+    return {"root_means": 0.0 * one, "root_sds": one, "average_sds": one, "usual_parts": np.zeros((statistics, 3))}
 
 
 NEWEST = np.hstack([np.zeros((3, 6)), np.linalg.inv(ROOT)])
@@ -123,6 +128,48 @@ MEMBERS: dict[type, Member] = {
             limit=float(np.cbrt(10.0 / 3.0)),
         ),
         vector,
+        run_length.t2(SHIFT, 3, 10.0),
+    ),
+    MultiplePca: Member(  # of one regime
+        lambda: MultiplePca(
+            ["C", "T", "qc"],
+            {
+                "centre": MEANS,
+                "scale": np.ones(3),
+                "plane": np.eye(3),
+                "shares": np.ones(1),
+                "means": np.zeros((1, 3)),
+                "roots": np.eye(3)[None],
+                "centres": np.zeros((1, 3)),
+                "loadings": AXES[None],
+                "variances": SIZES[None],
+                "rests": np.array([1e3]),
+                **known(2),
+            },
+            weight=1.0,
+            limit=float(np.cbrt(10.0 / 3.0)),
+        ),
+        vector,
+        run_length.t2(SHIFT, 3, 10.0),
+    ),
+    MultiwayPca: Member(  # whose course is level
+        lambda: MultiwayPca(
+            ["time", "C", "T", "qc"],
+            {
+                "is_progress": np.array([1.0, 0.0, 0.0, 0.0]),
+                "nodes": np.linspace(0.0, 1.0, STAGES + 1),
+                "courses": np.tile(MEANS, (STAGES + 1, 1)),
+                "course_sds": np.ones((STAGES + 1, 3)),
+                "loadings": AXES,
+                "variances": SIZES,
+                "rest": np.array([1e3]),
+                **known(2),
+                "usual_parts": np.zeros((2, 4)),
+            },
+            weight=1.0,
+            limit=float(np.cbrt(10.0 / 3.0)),
+        ),
+        lambda rng, rows: np.column_stack([rng.random(rows), vector(rng, rows)]),
         run_length.t2(SHIFT, 3, 10.0),
     ),
     ResidualSpace: Member(  # of one signal, whose average it is
