@@ -72,6 +72,19 @@ def conversion(unit: str, wanted: str, name: str) -> tuple[float, float]:
     return one - offset, offset
 
 
+def is_unit(text: str) -> bool:
+    """True if a text is a unit.
+
+    >>> is_unit("l/min"), is_unit("pipe")
+    (True, False)
+    """
+    try:
+        _parse(text)
+    except (ValueError, AttributeError, TypeError, AssertionError, ArithmeticError, SyntaxError, TokenError):
+        return False
+    return True
+
+
 def _parse(unit: str) -> Any:
     """Unit in the registry; powers may be written without a sign for them."""
     text = _SPELLINGS.get(unit.strip(), _POWER.sub(r"^\1", _NORMAL_VOLUME.sub("m", unit.strip())))

@@ -8,7 +8,7 @@ from pathlib import Path
 from reactorwatch.errors import InputError
 from reactorwatch.records.cells import EMPTY, NUMBER, TEXT, TIME, guess_decimal, kind_of
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.layout import Layout, bracketed_unit, describe_separator, split_line
+from reactorwatch.records.layout import Layout, describe_separator, split_line, unit_of_name
 
 
 class HeaderSearch:
@@ -129,7 +129,7 @@ class HeaderSearch:
         units = (
             [cell.strip().strip("[]()") for cell in units_row[1]]
             if units_row
-            else [bracketed_unit(name) for name in names]
+            else [unit_of_name(name) for name in names]
         )
         sample = [cells for _, cells in self._table[first:] if len(cells) == self._width]
         notes = []

@@ -10,10 +10,13 @@ from pathlib import Path
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.cells import EMPTY, TEXT, kind_of
+from reactorwatch.units import is_unit
 
 _SEPARATORS = {",": "comma separated", "\t": "tab separated", " ": "blank separated"}
 _WORD = re.compile(r"[^\W\d_]{2}")
 _BRACKETED = re.compile(r"\s*[\[(]([^\[\]()]+)[\])]\s*$")
+_LABELLED = re.compile(r"\s+(?:/|in)\s+([^\s\[\]]+)\s*$")
+"""A unit after a name, as ISO 80000-1 writes it in tables (`T / K`), and in words."""
 
 
 COMMENT = re.compile(rb"^[ \t]*(?:#(?!N/A|NV\b|DIV/0!|[A-Z]+[!?])|%|//)[^\n]*", re.MULTILINE)
@@ -112,18 +115,28 @@ def blank_comments(text: bytes) -> bytes:
 
 
 def bare_name(name: str) -> str:
-    """Name without a unit in brackets.
+    """Name without the unit at its end.
 
-    >>> bare_name("T [K]")
-    'T'
+    >>> [bare_name(name) for name in ("T [K]", "T / K", "T in degC", "Flow in pipe")]
+    ['T', 'T', 'T', 'Flow in pipe']
     """
-    return _BRACKETED.sub("", name).strip() or name
+    match = _unit_in(name)
+    return name if match is None else name[: match.start()].strip() or name
 
 
-def bracketed_unit(name: str) -> str:
-    """Unit in brackets at the end of a name; empty if there is none."""
-    match = _BRACKETED.search(name)
+def unit_of_name(name: str) -> str:
+    """Unit at the end of a name, in brackets or after `/` or `in`; empty if there is none."""
+    match = _unit_in(name)
     return match[1].strip() if match else ""
+
+
+def _unit_in(name: str) -> "re.Match[str] | None":
+    match = _BRACKETED.search(name)
+    if match is None:
+        match = _LABELLED.search(name)
+        if match is not None and not is_unit(match[1]):
+            return None
+    return match
 
 
 def describe_separator(separator: str) -> str:

@@ -11,7 +11,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.cells import EMPTY, NUMBER, TEXT
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.historian import LongFormat, find_long_format, read_tags
-from reactorwatch.records.layout import Layout, bare_name, bracketed_unit
+from reactorwatch.records.layout import Layout, bare_name, unit_of_name
 from reactorwatch.records.record import Record
 from reactorwatch.records.row_checks import check_times, check_values, filled_rows, find_runs, numbered_runs
 from reactorwatch.records.sniff import sniff
@@ -281,7 +281,7 @@ def _read_long(
         strays += series[tag].times.size - own.size
         values = np.full(times.size, np.nan)
         values[np.searchsorted(times, own)] = series[tag].values[first]
-        source = _Source(signal, long.value, bracketed_unit(tag))
+        source = _Source(signal, long.value, unit_of_name(tag))
         columns[signal.name], units[signal.name] = _convert(layout, source, values, notes)
     minutes, zero_ns = Times(times, np.full(times.size, fill_value=True), is_clock, []).since_first()
     known = {name: unit for name, unit in units.items() if unit}

@@ -202,6 +202,8 @@ def _variants() -> dict[str, Variant]:
         "a hint at the separator": _text("sep=;\n" + semicolon),
         "a description below the names": _text(table(SECONDS, cells(), ("Time", "qc", "C", "T"), ";", below=["Timestamp;coolant flow;concentration;temperature", "s;l/min;mol/l;K"])),
         "time since the start": _text(table([f"{row // 60:02d}:{row % 60:02d}:00" for row in range(ROWS)], cells(), ("elapsed", "qc", "C", "T"))),
+        "units after a stroke": _text(table(SECONDS, cells(), ("Time / s", "qc / l/min", "C / mol/l", "T / K"), ";")),
+        "units in words": _text(table(MINUTES, cells(), ("time in min", "qc in l/min", "C in mol/l", "T in K"))),
         "units in the header": _text(table(MINUTES, cells(), ("time [min]", "qc [l/min]", "C [mol/l]", "T [K]"))),
         "units that differ": _text(table(MINUTES, celsius, ("time_min", "qc (l/min)", "C (mol/l)", "T (degC)"))),
         "units in a row": _text(table(MINUTES, cells(), ("time", "qc", "C", "T"), ";", below=["min;l/min;mol/l;K"])),
