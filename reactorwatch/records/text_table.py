@@ -17,16 +17,19 @@ _MISSING_CURE = "--missing {} reads it as not measured"
 
 
 def _to_numpy(cells: Any) -> NDArray[np.float64]:
-    """Values of a pyarrow array of numbers, NaN where null. Its `to_numpy` would import pandas, which takes long.
+    """Values of a pyarrow column of numbers, NaN where null. Its `to_numpy` would import pandas, which takes long.
 
     Args:
-        cells: pyarrow array of doubles, shape (rows,).
+        cells: pyarrow chunks of doubles, shape (rows,) together.
     """
-    valid, stored = cells.buffers()
-    rows = slice(cells.offset, cells.offset + len(cells))
-    values = np.frombuffer(stored or b"", np.float64)[rows].copy()
-    if valid is not None:
-        values[np.unpackbits(np.frombuffer(valid, np.uint8), bitorder="little")[rows] == 0] = np.nan
+    values, begin = np.empty(len(cells)), 0
+    for chunk in cells.chunks:
+        valid, stored = chunk.buffers()
+        rows, part = slice(chunk.offset, chunk.offset + len(chunk)), values[begin : begin + len(chunk)]
+        part[:] = np.frombuffer(stored or b"", np.float64)[rows]
+        if valid is not None:
+            part[np.unpackbits(np.frombuffer(valid, np.uint8), bitorder="little")[rows] == 0] = np.nan
+        begin += len(chunk)
     return values
 
 
@@ -107,7 +110,7 @@ class TextTable:
         if column not in self._known:
             cells = self._table.column(str(column))
             if str(cells.type) == "double":
-                values = _to_numpy(cells.combine_chunks())
+                values = _to_numpy(cells)
             else:
                 text = cells.combine_chunks()
                 values, bad = to_numbers(text, self.layout.decimal, self.layout.missing)
