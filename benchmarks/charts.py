@@ -19,6 +19,7 @@ from monitor_node.ingest.alignment import MeasuredRow
 from monitor_node.ingest.sampling import Interval
 from monitor_node.stages.charts import ChartWatch
 from reactorwatch.spc import run_length
+from reactorwatch.spc.charts.base import SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.ewma import Ewma
@@ -77,7 +78,11 @@ def of_a_plant() -> None:
     rows = [MeasuredRow(time_ns, (0.0,), e, ["", ""], interval, True, []) for time_ns, e in enumerate(residuals)]
     kinds: tuple[tuple[ChartName, ...], ...] = (
         MonitorConfig().charts,
-        tuple(kind.name for kind in CHARTS if kind.name != "parameters"),
+        tuple(
+            kind.name
+            for kind in CHARTS
+            if kind.name != "parameters" and not any(isinstance(item, SignalSetting) for item in kind.settings)
+        ),
     )
     for charts in kinds:
         config = MonitorConfig(charts=charts)

@@ -187,7 +187,7 @@ class Training(TrainingRows):
         ]
         e = np.column_stack([_prewhiten(column, item) for column, item in zip(z.T, learned, strict=True)])
         after_moves = AfterMoves()
-        if not isinstance(reference, ProcessReference):
+        if any(evaluated) and not isinstance(reference, ProcessReference):
             columns = [
                 np.where(screenings[i].single, np.inf, _prewhiten(all_z[:, i], learned[i]))
                 for i in np.flatnonzero(evaluated)
