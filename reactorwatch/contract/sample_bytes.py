@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from reactorwatch.codegen.numba_kernel import jit
 
 _TIME, _SEQUENCE, _VALUE, _UNIT, _QUALITY = 0x09, 0x10, 0x19, 0x22, 0x28  # field and wire type of each
-_TIME_TAG, _SEQUENCE_TAG = bytes([_TIME]), bytes([_SEQUENCE])
 MAX_VARINT = 10
 """Bytes of protobuf's longest number."""
 
@@ -44,15 +43,19 @@ class SampleColumns(NamedTuple):
 
 def read_sequence(payload: bytes) -> int:
     """Read the sequence number of one sample without parsing the rest; 0 for bytes in another form."""
-    at = 9 if payload[:1] == _TIME_TAG else 0  # the time takes eight bytes, or none if it is zero
-    if payload[at : at + 1] != _SEQUENCE_TAG:
+    try:
+        at = 9 if payload[0] == _TIME else 0  # the time takes eight bytes, or none if it is zero
+        if payload[at] != _SEQUENCE:
+            return 0
+        byte = payload[at + 1]
+        number, shift = byte & 0x7F, 7
+        while byte >= 0x80 and shift < 7 * MAX_VARINT:
+            byte = payload[at + 1 + shift // 7]
+            number |= (byte & 0x7F) << shift
+            shift += 7
+    except IndexError:
         return 0
-    number = 0
-    for position, byte in enumerate(payload[at + 1 : at + 1 + MAX_VARINT]):
-        number |= (byte & 0x7F) << 7 * position
-        if byte < 0x80:
-            return number
-    return 0
+    return number if byte < 0x80 else 0
 
 
 def parse_samples(payloads: Sequence[bytes]) -> SampleColumns:

@@ -27,10 +27,11 @@ class _Run:
 
     def add(self, time_ns: int) -> None:
         self.samples += 1
-        self.first_ns = min(self.first_ns, time_ns)
         if time_ns > self.last_ns:
             self.period_ns = time_ns - self.last_ns
             self.last_ns = time_ns
+        elif time_ns < self.first_ns:
+            self.first_ns = time_ns
 
     def covers(self, time_ns: int) -> bool:
         """True if a time is within the run or one sampling period after it."""
@@ -43,11 +44,12 @@ class RunSplitter:
     Attributes:
         counters: sequence counters by signal.
         current: index of the current run, from 1; 0 before the first sample.
+        strays: number of stray samples, which belong to no run.
     """
 
     def __init__(self) -> None:
         self.counters: dict[str, SequenceCounter] = {}
-        self.current = 0
+        self.current = self.strays = 0
         self._runs: list[_Run] = []
         self._last: dict[str, list[tuple[int, int]]] = {}  # run and time of the newest two samples, by signal
 
@@ -55,11 +57,6 @@ class RunSplitter:
     def runs(self) -> list[RunSpan]:
         """Runs with samples, in the order of their starts."""
         return [RunSpan(run.first_ns, run.last_ns) for run in self._runs if run.samples]
-
-    @property
-    def strays(self) -> int:
-        """Number of stray samples, which belong to no run."""
-        return sum(counter.out_of_place for counter in self.counters.values())
 
     def update(self, signal: str, sequence: int, time_ns: int) -> int:
         """Index of the run of a sample, from 1; a run of strays alone has an index too."""
@@ -71,8 +68,11 @@ class RunSplitter:
             last = self._last[signal]
             number = last[-1][0]
         transition = counter.update(sequence, time_ns)
-        if transition is RunTransition.AFTER_STRAY:
+        if transition is RunTransition.SAME_RUN and number == self.current:  # as nearly always
+            pass
+        elif transition is RunTransition.AFTER_STRAY:
             number = self._drop_stray(last)
+            self.strays += 1
         elif transition is RunTransition.NEW_RUN:
             number = self.current if number < self.current else len(self._runs) + 1
         elif number < self.current and not self._runs[number - 1].covers(time_ns):
@@ -82,7 +82,8 @@ class RunSplitter:
         self.current = max(self.current, number)
         self._runs[number - 1].add(time_ns)
         last.append((number, time_ns))
-        del last[:-2]
+        if len(last) > 2:
+            del last[0]
         return number
 
     def span(self, number: int) -> RunSpan:

@@ -49,12 +49,21 @@ class _PublisherRun(GapTracker):
         assert self.expected is not None
         return self.expected
 
+    def accept_next(self, number: int, time_ns: int) -> bool:
+        """See `GapTracker`."""
+        return GapTracker.accept_next(self, number, time_ns) and self._add_point(number, time_ns)
+
     def advance(self, number: int, time_ns: int = 0) -> int:
         """Add the newest sample; returns how many were skipped."""
-        self.points.append((number, time_ns))
-        if len(self.points) > MAX_POINTS:
-            del self.points[1 : MAX_POINTS // 2 : 2]
+        self._add_point(number, time_ns)
         return GapTracker.advance(self, number, time_ns)
+
+    def _add_point(self, number: int, time_ns: int) -> bool:
+        points = self.points
+        points.append((number, time_ns))
+        if len(points) > MAX_POINTS:
+            del points[1 : MAX_POINTS // 2 : 2]
+        return True
 
     def is_consistent(self, sequence: int, time_ns: int) -> bool:
         """True if an older number can have this time in this run."""

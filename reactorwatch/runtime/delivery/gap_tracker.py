@@ -45,7 +45,7 @@ class GapTracker:
         """Move to the expected number, at a later time than the newest; False: it is not that one. The usual case."""
         if number != self.expected or time_ns <= self.newest_ns:
             return False
-        self.advance(number, time_ns)
+        self.expected, self.newest_ns = number + 1, time_ns
         return True
 
     def is_past(self, number: int, time_ns: int) -> bool:
