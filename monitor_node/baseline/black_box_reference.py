@@ -27,6 +27,9 @@ SETTLING_ROWS = 50
 COPY_ROWS = 250
 """Rows between two copies of the parameters."""
 
+UNCERTAIN = 0.2
+"""Standard deviation of a coefficient of the dynamics above which the training did not determine them."""
+
 
 class BlackBoxReferenceState(StoredState, frozen=True, tag="black-box"):
     """State of a `BlackBoxReference`.
@@ -206,14 +209,9 @@ class BlackBoxReference:
         return z
 
     @property
-    def is_trusted(self) -> bool:
-        """True if it simulates, or its dynamics are determined; if not, it is an ARX model with products."""
-        return self.model.is_determined or self.model.gain == 0.0
-
-    @property
     def weakness(self) -> str:
         """Reason why the promise may not hold at set points that the training has not seen; empty if it does."""
-        if self.model.is_determined:
+        if self.model.dynamics_sd <= UNCERTAIN:
             return ""
         return (
             "the training moved the plant too little to determine its dynamics: at new set points false alarms may be "
@@ -248,7 +246,7 @@ class BlackBoxReference:
         if predicted.judged:
             return RowPrediction(prediction, sd)
         self.unjudged += 1
-        return RowPrediction([nan] * self._count, sd, (prediction, sd) if self._filter.is_determined else None)
+        return RowPrediction([nan] * self._count, sd, (prediction, sd))
 
     def step_responses(self, rows: int) -> Array:
         """Response of each output's normalised residual to a lasting step of one unit, shape (outputs, rows).

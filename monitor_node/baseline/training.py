@@ -276,8 +276,8 @@ class Training(TrainingRows):
         if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven and is_long):
             black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
         if black_box is not None:
-            residuals, is_trusted = black_box[1] * np.array(black_box[0].typical_sd), black_box[0].is_trusted
-            if self._config.reference == "black-box" or (is_trusted and _predicts_as_well(residuals, identified)):
+            residuals, is_sure = black_box[1] * np.array(black_box[0].typical_sd), not black_box[0].weakness
+            if self._config.reference == "black-box" or (is_sure and _predicts_as_well(residuals, identified)):
                 return black_box
         return self._arx_reference(given_inputs), identified, screenings
 

@@ -286,6 +286,24 @@ class StatisticsChart(ValueChart):
         self._before = np.empty((0, len(self.names)))
 
 
+def skewed_sds(found: Averages, roots: Array, weight: float, limit: float) -> Array:
+    """Standard deviations of averages, such that a normal distribution of them has the right share beyond a limit.
+
+    Averages of a plant that stays away for long are skewed: the first term of Cornish & Fisher (1938, Moments and
+    cumulants in the specification of distributions, Rev. Int. Statist. Inst. 5) widens the limit.
+
+    Args:
+        found: averages without this correction.
+        roots: cube roots, shape (rows, statistics).
+        weight: lambda, of the newest row.
+        limit: limit in standard deviations.
+    """
+    averages = average_rows(roots - found.means, weight)
+    squares = np.mean(averages**2, axis=0)
+    skewness = np.maximum(np.mean(averages**3, axis=0) / squares**1.5, 0.0)
+    return np.asarray(np.sqrt(np.maximum(found.sds**2, squares)) * (1.0 + skewness * (limit - 1.0 / limit) / 6.0))
+
+
 def average_variance(learned: Prewhitening, weight: float) -> float:
     """Variance of the exponentially weighted average of an autoregressive signal.
 

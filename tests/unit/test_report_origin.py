@@ -26,5 +26,5 @@ def test_it_has_time_version_file_hash_and_the_settings_that_were_chosen(tmp_pat
 def test_the_page_shows_it_as_text_and_without_it_says_nothing() -> None:
     arguments = (CASES["named"], cstr(), EFFECTS, "a.csv", "extended.json")
     page = as_page(*arguments, origin={"file": "<a>.csv"})
-    assert "<tr><th>file</th><td>&lt;a&gt;.csv</td></tr>" in page
+    assert '<tr><th>file</th><td class="any">&lt;a&gt;.csv</td></tr>' in page
     assert "This report" not in as_page(*arguments)

@@ -10,11 +10,6 @@ A row whose standard deviation is above `UNSEEN` times that of the training is a
 unfamiliar value it is not judged, until `SETTLED` rows in succession are none. With familiar inputs the plant should
 not be there: such a row is judged with that limit as its standard deviation, and teaches nothing.
 
-Variances are right to first order in the errors of state and parameters. While the dynamics are not determined, that
-is too little after an unfamiliar value, or a move by more than `LARGEST_MOVE`: then no row is judged until
-`SETTLED_FIRST` rows in succession are no extrapolations. They teach, and where a residual is beyond `CONSISTENT` the
-covariance grows, or a filter that is certain and wrong would stay so (fading memory: Sorenson & Sacks 1971).
-
 While learning is off the uncertainty of the parameters stays in the variances (a consider filter: Schmidt 1966), and
 they are not corrected. Their covariance grows by 1 / `MEMORY` a row, but not beyond that of the training on average: so
 rows are forgotten, and the uncertainty stays bounded without excitation.
@@ -34,7 +29,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
-from reactorwatch.identification.black_box.model import UNCERTAIN, UNCERTAIN_AT_FIRST, BlackBoxModel
+from reactorwatch.identification.black_box.model import BlackBoxModel
 from reactorwatch.identification.black_box.state_map import evaluate, predict_outputs
 from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
 
@@ -44,18 +39,8 @@ UNSEEN = 1.3
 SETTLED = 25
 """Rows in succession that are no extrapolation after which the values of the inputs are familiar."""
 
-SETTLED_FIRST = 100
-"""The same while the dynamics are not determined: no row of a transient is judged then."""
-
-CONSISTENT, MOST_GROWTH = 3.5, 4.0
-"""Standard deviations beyond which a residual in these rows shows that the covariance is too small, and the largest
-factor by which it grows then."""
-
 BINS, BIN_WIDTH = 64, 0.25
 """Intervals of the values of an input that are familiar or not, and their width in its standard deviations."""
-
-LARGEST_MOVE = 4.0
-"""Largest usual move of an input, in its standard deviations: a uniform one moves by 3.5 at most."""
 
 FLAGS = 3
 """Numbers at the start of a belief: learning flag, flag of unfamiliar inputs, rows since they settled."""
@@ -63,9 +48,8 @@ FLAGS = 3
 MEMORY = 10_000
 """Rows after which a row is forgotten."""
 
-HEAD = 8
-"""Numbers before the arrays in the constants: outputs, inputs, lags, delay, terms, degree, rate of forgetting, and the
-variance of a coefficient of the dynamics above which they are not determined."""
+HEAD = 7
+"""Numbers before the arrays in the constants: outputs, inputs, lags, delay, terms, degree, rate of forgetting."""
 
 FAILED, UNJUDGED, JUDGED = -1.0, 0.0, 1.0
 
@@ -115,15 +99,9 @@ def filter_row(
     inputs, x = after[at : at + past], after[at + past : at + past + n_x]
     theta = after[at + past + n_x : at + past + size].reshape((p, terms))
     P = after[at + past + size :].reshape((size, size))
-    is_determined = True
-    for j in range(p):
-        for i in range(n_x + j * terms + 1, n_x + j * terms + 1 + n_x):
-            is_determined = is_determined and P[i, i] <= constants[7]
     for i in range(n_u):
         if after[FLAGS + (i % m) * BINS + bin_of(inputs[past - n_u + i])] == 0.0:
-            if is_determined or after[1] == 0.0:
-                after[2] = 0.0
-            after[1] = 1.0
+            after[1], after[2] = 1.0, 0.0
     signals, values, slopes = np.empty(n_x + n_u), np.empty(terms), np.empty((terms, n_x))
     predicted, jacobian, moved = np.empty(p), np.empty((p, n_x)), np.zeros((p, size))
     signals[:n_x] = x
@@ -185,21 +163,10 @@ def filter_row(
         results[3 * p + j] = results[p + j] / results[2 * p + j]
     verdict = JUDGED
     if after[1] != 0.0:
-        if not (is_determined and is_within):
+        if not is_within:
             verdict = UNJUDGED
-        if not is_determined:
-            worst = 0.0
-            for j in range(p):
-                if abs(results[3 * p + j]) < inf:  # not missing
-                    worst = max(worst, abs(results[3 * p + j]))
-            if learns and worst > CONSISTENT:
-                is_within = False
-                growth = min((worst / CONSISTENT) ** 2, MOST_GROWTH)
-                for a in range(size):
-                    for b in range(size):
-                        P[a, b] *= growth
         after[2] = after[2] + 1.0 if is_within else 0.0
-        if after[2] >= (SETTLED if is_determined else SETTLED_FIRST):
+        if after[2] >= SETTLED:
             after[1] = 0.0
             if learns:
                 for i in range(n_u):
@@ -231,9 +198,7 @@ def filter_row(
     for i in range(past - 1, m - 1, -1):
         inputs[i] = inputs[i - m]
     for i in range(m):
-        before, inputs[i] = inputs[i], (given[m + i] - centres[p + i]) / spreads[p + i]
-        if not is_determined and abs(inputs[i] - before) > LARGEST_MOVE:
-            after[1], after[2] = 1.0, 0.0
+        inputs[i] = (given[m + i] - centres[p + i]) / spreads[p + i]
     results[5 * p] = verdict
     return verdict
 
@@ -299,13 +264,6 @@ class BlackBoxFilter:
     @learning.setter
     def learning(self, learning: bool) -> None:
         self.belief[0] = float(learning)
-
-    @property
-    def is_determined(self) -> bool:
-        """True if the dynamics are determined, by the training and the rows since."""
-        shape, n_x = self._shape, self._shape.states
-        variances = np.diag(self._P)[n_x:].reshape(shape.outputs, shape.terms)[:, 1 : 1 + n_x]
-        return bool(np.all(variances <= self.constants[7]))
 
     @property
     def state(self) -> BlackBoxState:
@@ -445,7 +403,6 @@ def constants_of(model: BlackBoxModel) -> Array:
     """Constants of `filter_row`: sizes, scaling, variances, limits (infinite), products, the parameters' variances."""
     shape = model.shape
     head = [shape.outputs, shape.inputs, shape.lags, shape.delay, shape.terms, shape.degree, 1.0 / MEMORY]
-    head.append((UNCERTAIN if model.is_determined else UNCERTAIN_AT_FIRST) ** 2)
     limits, products, variances = np.full(shape.outputs, inf), shape.products().ravel(), np.diag(model.covariance)
     numbers = (head, model.centres, model.spreads, model.r, model.q, limits, products, variances)
     return np.concatenate([np.asarray(item, dtype=np.float64) for item in numbers])

@@ -9,12 +9,6 @@ from reactorwatch.arrays import Array
 from reactorwatch.identification.black_box.state_map import Shape
 from reactorwatch.stored_state import pack_numbers, unpack_numbers
 
-UNCERTAIN = 0.2
-"""Standard deviation of a coefficient of the dynamics above which the fit did not determine them."""
-
-UNCERTAIN_AT_FIRST = 0.1
-"""The same for the rows after a fit that did not determine them: these few moves have seldom shown all of the plant."""
-
 
 class BlackBoxModel(msgspec.Struct, frozen=True):
     """Fitted state map. Everything but centres and spreads is of scaled signals.
@@ -112,11 +106,6 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
         """Largest standard deviation of a coefficient by which an output depends on a state, of scaled signals."""
         deviations = np.sqrt(np.diag(self.covariance)).reshape(self.outputs, -1)
         return float(np.max(deviations[:, 1 : 1 + self.shape.states]))
-
-    @property
-    def is_determined(self) -> bool:
-        """True if the fit determined the dynamics."""
-        return self.dynamics_sd <= UNCERTAIN
 
     @property
     def _numbers(self) -> Array:

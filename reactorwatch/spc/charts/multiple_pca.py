@@ -20,7 +20,7 @@ from scipy import special
 
 from reactorwatch.spc.charts.base import Array, Setting
 from reactorwatch.spc.principal_components import Components, components_of, parts_of
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart
+from reactorwatch.spc.statistics_chart import Averages, Model, StatisticsChart, skewed_sds
 from reactorwatch.spc.value_chart import ValueBaseline
 
 DIMENSION = 3
@@ -132,6 +132,13 @@ class MultiplePca(StatisticsChart):
     reason = "in its regime is unlike the training"
     fewest_signals = 3
     pieces = 4
+
+    @classmethod
+    def spread(cls, roots: Array, baseline: ValueBaseline) -> Averages:
+        """See `StatisticsChart`; a plant stays away from the middle of its regimes for long after a move."""
+        found, weight = super().spread(roots, baseline), baseline.settings[cls.weight_key]
+        sds = skewed_sds(found, roots, weight, cls._known_limit(baseline))
+        return Averages.of(roots, weight, sds, found.freedom)
 
     @classmethod
     def fit(cls, values: Array, baseline: ValueBaseline) -> Model:

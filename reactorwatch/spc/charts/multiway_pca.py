@@ -14,9 +14,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from reactorwatch.spc.charts.base import Array, Setting, SignalSetting
-from reactorwatch.spc.charts.residual_space import BLOCKS, average_rows
+from reactorwatch.spc.charts.residual_space import BLOCKS
 from reactorwatch.spc.principal_components import components_of, parts_of
-from reactorwatch.spc.statistics_chart import Averages, Model, StatisticsChart
+from reactorwatch.spc.statistics_chart import Averages, Model, StatisticsChart, skewed_sds
 from reactorwatch.spc.value_chart import ValueBaseline
 
 STAGES = 20
@@ -59,18 +59,10 @@ class MultiwayPca(StatisticsChart):
 
     @classmethod
     def spread(cls, roots: Array, baseline: ValueBaseline) -> Averages:
-        """See `StatisticsChart`; a batch is unlike others as a whole, so the batches are what is independent.
-
-        Averages over a batch are skewed, as each batch has one deviation: the first term of Cornish & Fisher (1938,
-        Moments and cumulants in the specification of distributions, Rev. Int. Statist. Inst. 5) widens the limit.
-        """
+        """See `StatisticsChart`; a batch is unlike others as a whole, so the batches are what is independent."""
         found, weight = super().spread(roots, baseline), baseline.settings[cls.weight_key]
         progress = baseline.values[:, baseline.names.index(baseline.signals["multiway_pca_progress"][0])]
-        averages = average_rows(roots - found.means, weight)
-        squares = np.mean(averages**2, axis=0)
-        skewness = np.maximum(np.mean(averages**3, axis=0) / squares**1.5, 0.0)
-        limit = cls._known_limit(baseline)
-        sds = np.sqrt(np.maximum(found.sds**2, squares)) * (1.0 + skewness * (limit - 1.0 / limit) / 6.0)
+        sds = skewed_sds(found, roots, weight, cls._known_limit(baseline))
         return Averages.of(roots, weight, sds, min(found.freedom, len(batch_starts(progress)) - 1.0))
 
     @classmethod
