@@ -104,7 +104,8 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
     @property
     def dynamics_sd(self) -> float:
         """Largest standard deviation of a coefficient by which an output depends on a state, of scaled signals."""
-        deviations = np.sqrt(np.diag(self.covariance)).reshape(self.outputs, -1)
+        variances = np.diag(self.covariance)  # rounding may make those of what is not determined negative
+        deviations = np.sqrt(np.where(variances >= 0.0, variances, np.inf)).reshape(self.outputs, -1)
         return float(np.max(deviations[:, 1 : 1 + self.shape.states]))
 
     @property

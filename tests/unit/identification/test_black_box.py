@@ -257,3 +257,14 @@ def test_a_filter_that_is_not_finite_fails_and_changes_nothing() -> None:
     black_box.belief[FLAGS + BINS + model.shape.past] = inf
     after, results = np.empty_like(black_box.belief), np.empty(11)
     assert filter_row(black_box.belief, np.zeros(9), constants, after, results) < 0.0
+
+
+def test_a_coefficient_whose_variance_rounding_made_negative_is_not_determined() -> None:
+    model = trained()[0]
+    covariance = model.covariance.copy()
+    covariance[1, 1] = -1e-12
+    scaling, variances = (np.array(model.centres), np.array(model.spreads)), (np.array(model.r), np.array(model.q))
+    damaged = BlackBoxModel.of(
+        model.shape, model.rows, model.effective, model.gain, scaling, variances, model.theta, covariance
+    )
+    assert damaged.dynamics_sd == inf
