@@ -86,6 +86,7 @@ class TrainingResult(NamedTuple):
         outliers: number of single values of each output that were left out.
         after_moves: size of the residuals after moves of the inputs, those that were left out too; as usual for
             equations, whose limits allow for what is not known of the response to a move.
+        weakness: reason why the training did not determine how the plant follows the inputs; empty if it did.
     """
 
     reference: Reference
@@ -100,6 +101,7 @@ class TrainingResult(NamedTuple):
     responses: Array | None
     outliers: list[int]
     after_moves: AfterMoves
+    weakness: str
 
     def excess_rate(self, arl0: float) -> float:
         """Times as many false alarms as promised, by what the training shows of moves of the inputs.
@@ -110,8 +112,7 @@ class TrainingResult(NamedTuple):
         Args:
             arl0: in-control run length of each alarm, in rows.
         """
-        is_weak = isinstance(self.reference, BlackBoxReference) and bool(self.reference.weakness)
-        return max(self.after_moves.excess_rate(arl0), arl0 / len(self.z) if is_weak else 0.0)
+        return max(self.after_moves.excess_rate(arl0), arl0 / len(self.z) if self.weakness else 0.0)
 
 
 MOST_OUT_OF_RANGE = 1.0 / 3.0
@@ -130,7 +131,7 @@ class Training(TrainingRows):
     def __init__(self, config: MonitorConfig, model: ProcessModel | None, predictors: list[ArxPredictor]) -> None:
         super().__init__(len(config.inputs), len(config.outputs))
         self._config, self._model, self._predictors = config, model, predictors
-        self._without_black_box = ""
+        self._without_black_box = self._weakness = ""
         of_one_input = replace(structure := arx_structure(config), inputs=min(structure.inputs, 1))
         of_identified = max(fewest_rows(of_one_input), FEWEST_ROWS)
         self.fewest_rows = FEWEST_ROWS if model is not None else of_identified
@@ -198,8 +199,8 @@ class Training(TrainingRows):
                 name="training", result=refused or _screening_summary(outputs, time_min, screenings, evaluated) or "ok"
             )
         ]
-        if isinstance(reference, BlackBoxReference) and reference.weakness:
-            checks.append(Check(name=reference.kind, result=reference.weakness))
+        if self._weakness:
+            checks.append(Check(name=BlackBoxReference.kind, result=self._weakness))
         if self._without_black_box and self._config.reference == "black-box":
             checks.append(Check(name=BlackBoxReference.kind, result=f"the ARX models judge: {self._without_black_box}"))
         if isinstance(reference, ArxReference):
@@ -222,6 +223,7 @@ class Training(TrainingRows):
             responses,
             outliers,
             after_moves,
+            self._weakness,
         )
 
     def _step_responses(self, reference: Reference) -> Array | None:
@@ -254,6 +256,7 @@ class Training(TrainingRows):
         self, time_min: Array, inputs: Array, measured: Array, smallest: list[float], steps: list[float]
     ) -> tuple[Reference, Array, list[Screening]]:
         """Choose the reference; returns it with its normalised residuals and their screening."""
+        self._weakness = ""
         minor = [max(MINOR * sd, step) for sd, step in zip(smallest, steps, strict=True)]
         has_values = np.count_nonzero(np.isfinite(inputs), axis=0) >= FEWEST_ROWS
         given_inputs = np.where(has_values, inputs, 0.0)
@@ -276,8 +279,11 @@ class Training(TrainingRows):
         if self._config.reference == "black-box" or (self._config.reference == "auto" and is_driven and is_long):
             black_box = self._black_box(time_min, given_inputs, measured, smallest, steps)
         if black_box is not None:
-            residuals, is_sure = black_box[1] * np.array(black_box[0].typical_sd), not black_box[0].weakness
-            if self._config.reference == "black-box" or (is_sure and _predicts_as_well(residuals, identified)):
+            self._weakness = black_box[0].weakness  # ARX models know no better how the plant follows the inputs
+            residuals = black_box[1] * np.array(black_box[0].typical_sd)
+            if self._config.reference == "black-box" or (
+                not self._weakness and _predicts_as_well(residuals, identified)
+            ):
                 return black_box
         return self._arx_reference(given_inputs), identified, screenings
 
