@@ -47,6 +47,8 @@ class MemoryBus:
 
     def __init__(self, exchange: Exchange) -> None:
         self._exchange = exchange
+        self.held: list[Encoded] = []
+        """Messages that wait for missing ones."""
 
     def publish(self, message: Encoded) -> None:
         """See `Bus`; returns when every handler has returned, and holds no lock while they run."""
@@ -88,6 +90,12 @@ class MemoryBus:
             history_s=history_s,
             on_history_end=on_history_end,
         )
+
+    def release_held(self) -> None:
+        """See `Bus`."""
+        for message in self.held:
+            self.publish(message)
+        self.held.clear()
 
     @property
     def has_router(self) -> bool:

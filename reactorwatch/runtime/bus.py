@@ -67,6 +67,9 @@ class Bus(Protocol):
     ) -> None:
         """`subscribe` with a handler that takes all messages that have arrived, up to about `MAX_BATCH` at a time."""
 
+    def release_held(self) -> None:
+        """Hand over all messages that wait for missing ones before them, with gaps between them."""
+
     @property
     def has_router(self) -> bool:
         """True if a router is connected; without one, a client reaches no other process and sees no token."""

@@ -293,6 +293,8 @@ class EventLoop:
             self._inbox.admit()
         self._inbox.close()
         self._drain()
+        self._bus.release_held()
+        self._handle_rest()
         self._publish(self._node.on_stop(self._clock.now_ns()))
 
     def _run_once(self) -> None:
@@ -322,6 +324,10 @@ class EventLoop:
                 return
             if item is not None:
                 self._handle(item)
+        self._handle_rest()
+
+    def _handle_rest(self) -> None:
+        """Handle what is in the inbox."""
         for _ in range(len(self._inbox)):
             item = self._inbox.get(0.0)
             if item is not None:

@@ -314,6 +314,11 @@ class ZenohBus:
         # In a thread of its own: the handler may wait for the caller.
         threading.Thread(target=delivery.start, args=(on_history_end,), daemon=True).start()
 
+    def release_held(self) -> None:
+        """See `Bus`."""
+        for delivery in self._deliveries:
+            delivery.release_held()
+
     @property
     def has_router(self) -> bool:
         """See `Bus`."""

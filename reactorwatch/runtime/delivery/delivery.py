@@ -114,8 +114,13 @@ class Delivery:
             self._closed = True
             self._changed.notify()
         self._thread.join()
-        while (due_ns := self._buffer.due_ns()) is not None:
-            self._deliver(self._buffer.release_overdue(due_ns))
+        self.release_held()
+
+    def release_held(self) -> None:
+        """Deliver all held messages, with gaps between them."""
+        with self._changed:
+            while (due_ns := self._buffer.due_ns()) is not None:
+                self._deliver(self._buffer.release_overdue(due_ns))
 
     def _deliver(self, items: Iterable[Encoded | Gap]) -> None:
         batch: list[Encoded] = []

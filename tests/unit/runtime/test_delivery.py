@@ -114,6 +114,19 @@ def test_what_waits_is_handed_on_when_the_bus_is_closed() -> None:
     assert taken(heard) == ["0", "3"]
 
 
+def test_what_waits_is_handed_on_when_it_is_asked_for_and_delivery_goes_on() -> None:
+    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    delivery = Delivery(each(heard), heard.put)
+    delivery.start()
+    for number in (0, 3):
+        delivery.receive([message(number)])
+    delivery.release_held()
+    assert taken(heard) == ["0", "3"]
+    delivery.receive([message(4)])
+    delivery.close()
+    assert taken(heard) == ["4"]
+
+
 def test_nothing_goes_on_before_it_is_known_what_was_before() -> None:
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     delivery = Delivery(each(heard), heard.put)

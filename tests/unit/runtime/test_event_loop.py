@@ -134,6 +134,19 @@ def test_what_arrived_before_the_stop_is_still_handled() -> None:
     assert len(node.heard) == 1000
 
 
+def test_what_waits_for_a_missing_message_is_handled_before_the_node_ends() -> None:
+    """A recorder that ends while an alarm before others is missing records the others."""
+    exchange, stop, node = Exchange(), StopSignal(), Echo()
+    bus = MemoryBus(exchange)
+    loop = EventLoop(node, bus, stop)
+    loop.subscribe("in/**")
+    bus.held += [Encoded(f"in/{number}", b"", "") for number in range(3)]
+    stop.set()
+    loop.run()
+    assert [message.key for message in node.heard] == ["in/0", "in/1", "in/2"]
+    assert node.stopped
+
+
 def test_a_function_is_called_when_all_messages_that_arrived_before_are_handled_and_its_result_is_published() -> None:
     exchange, stop, node, published = Exchange(), StopSignal(), Echo(), list[str]()
     loop, speaker = EventLoop(node, MemoryBus(exchange), stop), MemoryBus(exchange)
