@@ -21,7 +21,7 @@ PAGE = Path("docs/getting-started.md")
 
 @pytest.fixture(scope="module")
 def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What is committed, and the compiled kernels of this tree in place of those that `make setup` compiles."""
+    """Clone of the last commit, with the compiled kernels of this tree in place of those that `make setup` compiles."""
     if not (ROOT / ".git").exists() or shutil.which("git") is None:
         pytest.skip("needs git and the repository")
     folder = tmp_path_factory.mktemp("clean") / "clone"

@@ -242,7 +242,7 @@ def test_there_are_as_many_regimes_as_the_rows_have(count: int) -> None:
 
 
 def test_t2_and_spe_of_a_regime_are_those_of_pca_of_its_rows() -> None:
-    """Of regimes that are far apart, so that each row belongs to one; by scikit-learn on the rows of one regime."""
+    """The regimes are far apart, so each row belongs to one: scikit-learn on the rows of one regime gives the same."""
     pytest.importorskip("sklearn", reason="scikit-learn is not installed")
     from sklearn.decomposition import PCA  # type: ignore[import-untyped]
 
