@@ -91,7 +91,7 @@ class MemoryBus:
             on_history_end=on_history_end,
         )
 
-    def release_held(self) -> None:
+    def flush_deliveries(self) -> None:
         """See `Bus`."""
         for message in self.held:
             self.publish(message)

@@ -67,7 +67,7 @@ class Bus(Protocol):
     ) -> None:
         """`subscribe` with a handler that takes all messages that have arrived, up to about `MAX_BATCH` at a time."""
 
-    def release_held(self) -> None:
+    def flush_deliveries(self) -> None:
         """Hand over all messages that wait for missing ones before them, with gaps between them."""
 
     @property

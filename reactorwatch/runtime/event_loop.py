@@ -293,7 +293,7 @@ class EventLoop:
             self._inbox.admit()
         self._inbox.close()
         self._drain()
-        self._bus.release_held()
+        self._bus.flush_deliveries()
         self._handle_rest()
         self._publish(self._node.on_stop(self._clock.now_ns()))
 

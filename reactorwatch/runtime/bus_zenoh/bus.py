@@ -314,10 +314,10 @@ class ZenohBus:
         # In a thread of its own: the handler may wait for the caller.
         threading.Thread(target=delivery.start, args=(on_history_end,), daemon=True).start()
 
-    def release_held(self) -> None:
+    def flush_deliveries(self) -> None:
         """See `Bus`."""
         for delivery in self._deliveries:
-            delivery.release_held()
+            delivery.flush_deliveries()
 
     @property
     def has_router(self) -> bool:

@@ -114,9 +114,9 @@ class Delivery:
             self._closed = True
             self._changed.notify()
         self._thread.join()
-        self.release_held()
+        self.flush_deliveries()
 
-    def release_held(self) -> None:
+    def flush_deliveries(self) -> None:
         """Deliver all held messages, with gaps between them."""
         with self._changed:
             while (due_ns := self._buffer.due_ns()) is not None:

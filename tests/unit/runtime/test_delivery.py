@@ -120,7 +120,7 @@ def test_what_waits_is_handed_on_when_it_is_asked_for_and_delivery_goes_on() -> 
     delivery.start()
     for number in (0, 3):
         delivery.receive([message(number)])
-    delivery.release_held()
+    delivery.flush_deliveries()
     assert taken(heard) == ["0", "3"]
     delivery.receive([message(4)])
     delivery.close()
