@@ -1,6 +1,6 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench faults study kills cuts fuzz soak promise outside pictures docs examples protobuf lock dist clean
+.PHONY: help setup demo test slow lint bench faults study kills cuts fuzz soak promise outside pictures docs examples protobuf lock dist clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -9,6 +9,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # each has a target of its own
 LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py false_alarms.py)
 READY := .venv/.ready
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 DOCS_READY := .venv/.docs-ready
 DIST_READY := .venv/.dist-ready
 
@@ -32,8 +33,11 @@ $(READY): pyproject.toml
 demo: $(READY) ## run a reactor with a fault, watch, record and draw it
 	@$(BIN)/reactorwatch demo
 
-test: $(READY) ## all tests
-	@$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
+test: $(READY) ## the tests, but for the slow ones: ten minutes
+	@$(PYTEST) -m "not slow"
+
+slow: $(READY) ## the slow tests: pages with many commands, whole fleets, studies in small; five minutes
+	@$(PYTEST) -m slow
 
 lint: $(READY) ## style, types, and layers of imports
 	@$(BIN)/ruff format --check .

@@ -63,6 +63,7 @@ MALFORMED = (
 )
 
 
+@pytest.mark.slow
 def test_a_diagnosis_is_the_same_in_one_process_in_two_and_on_a_cluster(
     folder: Path, called: Command, command: Command, cluster: str
 ) -> None:
@@ -110,6 +111,7 @@ def test_options_that_cannot_be_meant_are_told_once_and_not_for_each_file(folder
         assert not (folder / "nothing").exists()
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_meanwhile_costs_no_result(folder: Path, tmp_path: Path) -> None:
     for number in range(MORE_FILES):  # more than is done before we look
         shutil.copy(folder / "run-0.csv", tmp_path / f"run-{number:02}.csv")
@@ -155,6 +157,7 @@ def workers_of(number: int) -> list[int]:
     return [child for child in children if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()]
 
 
+@pytest.mark.slow
 def test_a_back_test_by_two_processes_says_what_that_of_the_file_alone_says_and_the_terminal_shows_progress(
     folder: Path, called: Command
 ) -> None:

@@ -44,6 +44,7 @@ def first_rows(daisy_csv: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return path
 
 
+@pytest.mark.slow
 def test_replayed_it_is_watched_recorded_and_drawn(
     first_rows: Path,
     tmp_path: Path,

@@ -36,6 +36,7 @@ def bus_of(file: Path) -> BusConfig:
     return section(BusConfig, "bus", read_settings(file), {})
 
 
+@pytest.mark.slow
 def test_a_demonstration_runs_on_a_secured_router_and_each_node_has_its_own_certificate(
     site: Path, tmp_path: Path, command: Command
 ) -> None:

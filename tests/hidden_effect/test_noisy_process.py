@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
@@ -39,6 +40,7 @@ def off_in_sd(hidden_effect: HiddenEffect, seed: int) -> float:
     return float((fit.parameters[0][0] - truth) / np.sqrt(hypothesis.covariance(run, fit)[0, 0]))
 
 
+@pytest.mark.slow
 def test_sizes_scatter_about_the_truth_as_their_standard_deviations_say() -> None:
     """Also where the concentration is disturbed and noise levels say, as here mostly, that it is not."""
     smooth = [item for item in named() if not next(one for one in EFFECTS if one.name == item.name).is_discontinuous]

@@ -6,6 +6,8 @@
 from dataclasses import replace
 from functools import cache
 
+import pytest
+
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.result import UNKNOWN
 from reactorwatch.process.library.cstr.model import cstr
@@ -14,6 +16,8 @@ from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES
 from tests.hidden_effect.judge import Judged, judge
 from tests.hidden_effect.test_found import at_least
+
+pytestmark = pytest.mark.slow
 
 SPAN_MIN = 150.0
 SEED = 4100

@@ -111,6 +111,7 @@ def test_it_is_read_for_a_diagnosis_with_no_option(rig: Path) -> None:
     assert np.nanmax(case.measured.columns["h1"]) < 62.0  # cm
 
 
+@pytest.mark.slow
 def test_it_is_played_again_as_a_table_through_the_same_nodes(
     rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -27,6 +27,7 @@ def identity(service: dict[str, Any]) -> str:
     return str(source).removeprefix("./site/")
 
 
+@pytest.mark.slow
 def test_every_service_s_command_and_health_check_work(services: Services, tmp_path: Path) -> None:
     recordings = tmp_path / "recordings"
     recordings.mkdir()

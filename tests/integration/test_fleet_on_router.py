@@ -270,6 +270,7 @@ KILLED_AT = (120, 280, 330)
 """Rows: in training, watching, and while the alarms of the leak stand."""
 
 
+@pytest.mark.slow
 def test_kills_of_monitors_that_share_a_folder_neither_lose_an_alarm_nor_tell_one_twice(
     bus_config: BusConfig, tmp_path: Path
 ) -> None:

@@ -27,6 +27,7 @@ GROWTH_MB = 150.0
 EWMA, SHEWHART = "ewma/T", "shewhart/T"
 
 
+@pytest.mark.slow
 def test_in_a_minute_of_kills_cuts_and_garbage_no_sample_is_unaccounted_for_and_each_fault_alarmed_once(
     tmp_path: Path,
 ) -> None:

@@ -47,6 +47,7 @@ def test_a_live_training_is_diagnosed_and_the_change_of_the_model_is_recorded_an
     assert {"kind": "baseline", "recorded": 1, "equal": 1} in report["kinds"]
 
 
+@pytest.mark.slow
 def test_a_monitor_that_was_stopped_before_the_diagnosis_was_done_makes_it_after_its_restart(tmp_path: Path) -> None:
     changes: list[Encoded] = []
     with WarmRun(tmp_path, ENDLESS_MIN, 600.0, state_file=str(tmp_path / "monitor.state"), **DIAGNOSED) as live:

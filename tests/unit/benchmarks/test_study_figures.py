@@ -70,6 +70,7 @@ def test_the_page_in_the_docs_has_every_entry_once_and_no_other() -> None:
     assert {path.name for path in (DOCS / "study").iterdir()} == {figure.file_name for figure in entries}
 
 
+@pytest.mark.slow
 def test_a_fault_is_added_to_a_measured_record_and_both_watch_it(
     tmp_path: Path, daisy_csv: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,6 +125,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_gives_others(tmp_path: P
     assert (runs[0] / "study.md").read_bytes() == (runs[1] / "study.md").read_bytes()
 
 
+@pytest.mark.slow
 def test_figures_drawn_at_the_same_time_are_those_drawn_one_after_the_other(tmp_path: Path) -> None:
     for folder, processes in (("one", 1), ("two", 2)):
         reproduce(tmp_path / folder, 3, "3,8,21-27", processes=processes)

@@ -44,6 +44,7 @@ print([kernel.__name__ for kernel in kernels if kernel.stats.cache_misses])
 """
 
 
+@pytest.mark.slow
 def test_another_record_finds_every_kernel_compiled() -> None:
     command = [sys.executable, "-m", "reactorwatch", "compile"]
     subprocess.run(command, check=True, capture_output=True)

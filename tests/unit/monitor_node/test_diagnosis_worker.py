@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
+import pytest
+
 from monitor_node.__main__ import MonitorNode
 from monitor_node.baseline.references import ProcessReference
 from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, read_equations
@@ -66,6 +68,7 @@ def test_where_no_process_can_be_started_each_diagnosis_has_failed_and_the_next_
     worker.close()
 
 
+@pytest.mark.slow
 def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_model_at_the_next_row(
     warm: Run,
 ) -> None:
