@@ -5,7 +5,11 @@ A new run starts where the publisher was restarted or its clock was set back, ac
 belongs to the new run.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from reactorwatch.contract.messages_pb2 import Sample
 from recorder.columns.sequence_counter import RunTransition, SequenceCounter
@@ -85,6 +89,33 @@ class RunSplitter:
         if len(last) > 2:
             del last[0]
         return number
+
+    def continue_run(
+        self, stamps: Mapping[str, tuple[NDArray[np.int64], NDArray[np.int64]]], times_ns: NDArray[np.int64]
+    ) -> bool:
+        """Process samples that all continue the current run, as `update` would; False: some do not, nothing changes.
+
+        Args:
+            stamps: sequence numbers and times of the samples of each signal; at least one of each.
+            times_ns: times of all samples, in the order of receipt.
+        """
+        for signal, (numbers, own_times) in stamps.items():
+            counter = self.counters.get(signal)
+            if counter is None or self._last[signal][-1][0] != self.current:
+                return False
+            if not counter.continues(numbers, own_times):
+                return False
+        for signal, (numbers, own_times) in stamps.items():
+            counter = self.counters[signal]
+            for number, time_ns in zip(numbers.tolist(), own_times.tolist(), strict=True):
+                counter.update(number, time_ns)
+            last = self._last[signal]
+            last += ((self.current, time_ns) for time_ns in own_times[-2:].tolist())
+            del last[:-2]
+        run = self._runs[self.current - 1]
+        for time_ns in times_ns.tolist():
+            run.add(time_ns)
+        return True
 
     def span(self, number: int) -> RunSpan:
         """Time span of a run."""

@@ -11,6 +11,9 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from enum import Enum
 
+import numpy as np
+from numpy.typing import NDArray
+
 from reactorwatch.runtime.delivery.gap_tracker import GapTracker
 
 MAX_GAPS = 256  # stored gaps of a signal; a late sample of an older gap is counted as a duplicate
@@ -57,6 +60,11 @@ class _PublisherRun(GapTracker):
         """Add the newest sample; returns how many were skipped."""
         self._add_point(number, time_ns)
         return GapTracker.advance(self, number, time_ns)
+
+    def continues(self, numbers: NDArray[np.int64], times_ns: NDArray[np.int64]) -> bool:
+        """True if `accept_next` would accept each of these samples; at least one."""
+        is_next = numbers[0] == self.expected and times_ns[0] > self.newest_ns
+        return bool(is_next and (np.diff(numbers) == 1).all() and (np.diff(times_ns) > 0).all())
 
     def _add_point(self, number: int, time_ns: int) -> bool:
         points = self.points
@@ -137,6 +145,11 @@ class SequenceCounter:
             self.update(sequence, time_ns)
             return RunTransition.AFTER_STRAY
         return self._classify(run, sequence, time_ns)
+
+    def continues(self, numbers: NDArray[np.int64], times_ns: NDArray[np.int64]) -> bool:
+        """True if each of these samples is the next one of the run, as nearly always; at least one."""
+        run = self._run
+        return run is not None and len(run.points) > 1 and run.continues(numbers, times_ns)
 
     def _continues(self, run: _PublisherRun, sequence: int, time_ns: int) -> bool:
         """True if a sample fits the run, unless the run consists of a single sample after another run."""

@@ -36,6 +36,9 @@ FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of the
 RECORD = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the payload
 
+TABLE_CURE = "the name of a table must end in .csv, .xlsx, .parquet or another ending of a table"
+"""Cure for a table that is taken for a recording by its name."""
+
 LATCHED = "reactorwatch.repeated"
 """Key in the metadata of a channel of latched messages, see `RecordedMessage.latched`."""
 
@@ -67,7 +70,7 @@ def read_summary(path: Path) -> Summary:
         if not magic:
             raise InputError(f"{path}: expected an MCAP recording, got an empty file")
         if magic != MCAP0_MAGIC[: len(magic)]:
-            raise InputError(f"{path}: expected an MCAP recording, got another kind of file")
+            raise InputError(f"{path}: expected an MCAP recording, got another kind of file; {TABLE_CURE}")
         tail = FOOTER.size + len(MCAP0_MAGIC)
         if size < len(MCAP0_MAGIC) + tail:
             raise damage_error(path, "is cut off")

@@ -24,7 +24,16 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import wrap_read_errors
 from recorder.message import RecordedMessage
 from recorder.storage.chunk_data import chunk_data
-from recorder.storage.mcap_chunks import DAMAGE, FOOTER, LATCHED, MESSAGE, RECORD, keyed_channel, read_summary
+from recorder.storage.mcap_chunks import (
+    DAMAGE,
+    FOOTER,
+    LATCHED,
+    MESSAGE,
+    RECORD,
+    TABLE_CURE,
+    keyed_channel,
+    read_summary,
+)
 
 LATEST_NS = 2**64 - 1
 
@@ -117,7 +126,7 @@ class Scan:
         if self._bytes[: self._start] != MCAP0_MAGIC:
             chunk = self._next_chunk(0)
             if chunk is None and not MCAP0_MAGIC.startswith(self._bytes[: self._start]):
-                raise InputError(f"{path}: expected an MCAP recording, got another kind of file")
+                raise InputError(f"{path}: expected an MCAP recording, got another kind of file; {TABLE_CURE}")
             self.damages.append(Damage(0, "the beginning cannot be read"))
             self._start = self._size if chunk is None else chunk
 

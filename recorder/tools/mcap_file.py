@@ -20,20 +20,17 @@ from array import array
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from reactorwatch.contract import keys
-from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import DecodeError, decode, encoding_of
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import list_files
 from reactorwatch.records.record import MINUTE_NS, Record, join_runs
-from recorder.columns.measurement import measured_value
 from recorder.columns.process_annotations import signal_roles
-from recorder.columns.run_splitter import RunSplitter
+from recorder.columns.sample_series import BATCH, SAMPLE, SampleSeries
 from recorder.message import RecordedMessage
 from recorder.storage.mcap_chunks import (
     is_in_order,
@@ -52,8 +49,6 @@ __all__ = ["RecordingWriter", "plants_in", "read_messages", "read_metadata", "re
 
 ZERO_NS = "zero_ns"
 CLOCK, NO_CLOCK = "clock", "none"
-
-_SAMPLE = encoding_of(messages.Sample)
 
 
 def read_messages(
@@ -184,49 +179,35 @@ def read_record(path: Path, plant: str | None = None, process: Process | None = 
     plant = one_plant_in(path, plant)
     wanted = None if process is None else {signal.name for signal in process.signals}
     names: dict[str, str | None] = {}
-    runs: list[dict[str, tuple[array[int], array[float]]]] = []
-    newest: dict[str, tuple[array[int], array[float]]] = {}  # columns of the newest sample, by signal
-    units: dict[str, str] = {}
-    splitter = RunSplitter()
+    series = SampleSeries()
+    signals: list[str] = []
+    payloads: list[bytes] = []
     for entry in read_messages(path, {keys.SAMPLE}, plant):
         if entry.key not in names:
             name = entry.key.split("/", 3)[3]
             names[entry.key] = name if wanted is None or name in wanted else None
         signal = names[entry.key]
-        if signal is None or entry.encoding != _SAMPLE:
+        if signal is None or entry.encoding != SAMPLE:
             continue
-        try:
-            sample: Any = decode(entry.payload, entry.encoding)
-        except DecodeError:
-            continue  # the recorder has counted it as refused
-        value = measured_value(sample)
-        if value is not None:
-            strays = splitter.strays
-            number = splitter.update(signal, sample.sequence, sample.time_ns)
-            if splitter.strays > strays:
-                for column in newest[signal]:
-                    column.pop()
-            if number > len(runs):
-                runs.append({})
-            if sample.unit:
-                units.setdefault(signal, sample.unit)
-            series = runs[number - 1].get(signal)
-            if series is None:
-                series = runs[number - 1][signal] = (array("q"), array("d"))
-            newest[signal] = times, values = series
-            times.append(sample.time_ns)
-            values.append(value)
+        signals.append(signal)
+        payloads.append(entry.payload)
+        if len(signals) == BATCH:
+            series.add(signals, payloads)
+            signals, payloads = [], []
+    series.add(signals, payloads)
+    runs, splitter, units = series.runs, series.splitter, series.units
     if not runs:
         sought = "that can be used" if process is None else f"of {', '.join(item.name for item in process.signals)}"
         raise InputError(f"{path}: holds no samples {sought} of plant {plant!r}")
     metadata = read_metadata(path)
     zero_ns = zero_from(metadata, splitter.runs[0].first_ns)
-    present = {name: units.get(name, "") for series in runs for name in series}
+    present = {name: units.get(name, "") for of_run in runs for name in of_run}
     needed = () if process is None else (*process.inputs, *process.outputs)
     if process is None and (process := recorded_process(path, plant)) is not None:
         needed = tuple(signal.name for signal in process.signals)
     columns = signal_roles({**dict.fromkeys(needed, ""), **present}, process)
-    rows = [_rows(series, columns, zero_ns, path.name) for series in runs if any(times for times, _ in series.values())]
+    full = [of_run for of_run in runs if any(times for times, _ in of_run.values())]
+    rows = [_rows(of_run, columns, zero_ns, path.name) for of_run in full]
     clock_ns = zero_ns if has_clock(metadata) else 0
     return replace(join_runs(rows), zero_ns=clock_ns, strays=splitter.strays, units=units)
 

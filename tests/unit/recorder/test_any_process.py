@@ -16,6 +16,7 @@ from reactorwatch.cli.recording_reports import info_object, info_text
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import find_process
 from reactorwatch.description.process import ROLES, Process, Signal
+from reactorwatch.description.read import read_process_table
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write_table import write_table
@@ -149,6 +150,11 @@ def test_a_table_that_is_no_record_of_the_reactor_is_refused_with_the_cure(tanks
     with pytest.raises(InputError, match=rf"tanks.csv, row 1: expected a column 'qc' in the header, got .*{cure}"):
         import_csv(tanks.with_suffix(".csv"), tmp_path / "x.mcap")
     assert not (tmp_path / "x.mcap").exists()
+
+
+def test_a_command_that_needs_equations_refuses_it_without_the_options_that_it_lacks(tanks: Path) -> None:
+    with pytest.raises(InputError, match=r"no record of the reactor, name its process with --process$"):
+        read_process_table(tanks.with_suffix(".csv"), find_process())
 
 
 def test_without_a_description_columns_are_named_as_inputs_and_outputs(tanks: Path, tmp_path: Path) -> None:

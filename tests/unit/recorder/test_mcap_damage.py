@@ -7,6 +7,7 @@ import pytest
 
 from reactorwatch.errors import InputError
 from recorder.message import RecordedMessage
+from recorder.storage.mcap_chunks import TABLE_CURE
 from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
 from tests.unit.recorder import golden
 
@@ -78,8 +79,8 @@ def test_a_chunk_of_zeros_names_its_place_and_keeps_what_came_before(tmp_path: P
     ("content", "said"),
     [
         (b"", "expected an MCAP recording, got an empty file"),
-        (b"time_min,qc,C,T\n", "expected an MCAP recording, got another kind of file"),
-        (b"PK\x03\x04", "expected an MCAP recording, got another kind of file"),
+        (b"time_min,qc,C,T\n", f"expected an MCAP recording, got another kind of file; {TABLE_CURE}"),
+        (b"PK\x03\x04", f"expected an MCAP recording, got another kind of file; {TABLE_CURE}"),
     ],
 )
 def test_what_is_no_recording_is_told_as_such_and_offers_no_rescue(tmp_path: Path, content: bytes, said: str) -> None:
