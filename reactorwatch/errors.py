@@ -20,9 +20,18 @@ def describe_unknown(what: str, name: str, valid: Iterable[str]) -> str:
     "unknown input 'flwo'; did you mean 'flow'? (valid: flow)"
     """
     names = list(valid)
-    close = difflib.get_close_matches(name, names, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    return f"unknown {what} {name!r}{hint} (valid: {', '.join(names) or 'none'})"
+    return f"unknown {what} {name!r}{hint_at_closest(name, names)} (valid: {', '.join(names) or 'none'})"
+
+
+def hint_at_closest(name: str, valid: Iterable[str]) -> str:
+    """Hint at the closest valid name, in any case of its letters; empty if none is close.
+
+    >>> hint_at_closest("ti-310", ("FIC-7", "TI-301"))
+    "; did you mean 'TI-301'?"
+    """
+    names = {item.casefold(): item for item in valid}
+    close = difflib.get_close_matches(name.casefold(), names, n=1)
+    return f"; did you mean {names[close[0]]!r}?" if close else ""
 
 
 @contextmanager

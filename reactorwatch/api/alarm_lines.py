@@ -4,18 +4,19 @@ from collections.abc import Sequence
 
 from reactorwatch.contract.alarm_text import describe_suspects, priority_word, suspects_text
 from reactorwatch.contract.messages_pb2 import Alarm
-from reactorwatch.records.record import to_minutes
+from reactorwatch.records.record import format_utc, to_minutes
 
 Raised = tuple[Alarm, int | None]
 """An alarm that was raised, and when it was cleared; None: it is active at the end."""
 
 
-def alarm_headline(raised: Sequence[Raised], zero_ns: int) -> str:
+def alarm_headline(raised: Sequence[Raised], zero_ns: int, clock_zero_ns: int | None = None) -> str:
     """First alarm, number of alarms and incidents, and the likeliest causes; empty without an alarm.
 
     Args:
         raised: alarms in the order in which they were raised.
         zero_ns: time from which minutes are counted.
+        clock_zero_ns: clock time of that time; None: unknown.
     """
     if not raised:
         return ""
@@ -24,7 +25,8 @@ def alarm_headline(raised: Sequence[Raised], zero_ns: int) -> str:
     count = f"{_count(len(raised), 'alarm')} in {_count(incidents, 'incident')}"
     cause = _cause([alarm for alarm, _ in raised if alarm.incident == first.incident])
     named = f"; likely cause: {cause}" if cause else ""
-    return f"Detected at {to_minutes(first.raised_ns, zero_ns):g} min by {first.alarm}: {count}{named}"
+    clock = "" if clock_zero_ns is None else f" ({format_utc(first.raised_ns - zero_ns + clock_zero_ns)})"
+    return f"Detected at {to_minutes(first.raised_ns, zero_ns):g} min{clock} by {first.alarm}: {count}{named}"
 
 
 def alarm_lines(raised: Sequence[Raised], zero_ns: int) -> list[str]:

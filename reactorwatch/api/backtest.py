@@ -146,5 +146,5 @@ def backtest(record: Record, process: ProcessLike | None = None, **settings: Any
     if not result.rows:
         raise InputError(f"{record.name}: holds no sample that can be used")
     found = backtest_object(result, zero_ns, record.zero)
-    text = backtest_text(result, zero_ns, Path(record.name))
+    text = backtest_text(result, zero_ns, Path(record.name), record.zero_ns or None)
     return msgspec.convert(found | {"text": text, "record": record}, BacktestResult)

@@ -11,7 +11,7 @@ from reactorwatch.api.alarm_lines import alarm_headline, alarm_lines
 from reactorwatch.contract.alarm_text import priority_word
 from reactorwatch.contract.messages_pb2 import Promise
 from reactorwatch.contract.promise_text import describe_power, promise_fields
-from reactorwatch.records.record import to_minutes
+from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.terminal import printable_lines
 
 REFERENCES = {"arx": "identified models (ARX)", "black-box": "a black box learned from the training"}
@@ -89,11 +89,22 @@ def _baseline(result: Backtest, minutes: Callable[[int], float | None]) -> dict[
     return {"what": change.what, "from_min": minutes(change.time_ns), "why": change.why, "extended_model": model}
 
 
-def backtest_text(result: Backtest, zero_ns: int, file: Path, *, is_trained: bool = False) -> str:
-    """Format the result of `backtest` for people; arguments as for `backtest_object`."""
+def backtest_text(
+    result: Backtest, zero_ns: int, file: Path, clock_zero_ns: int | None = None, *, is_trained: bool = False
+) -> str:
+    """Format the result of `backtest` for people; arguments as for `backtest_object`.
+
+    Args:
+        result: see there.
+        zero_ns: see there.
+        file: the record.
+        clock_zero_ns: clock time of `zero_ns`; None: unknown.
+        is_trained: see there.
+    """
     report = backtest_object(result, zero_ns, is_trained=is_trained)
-    lines = [f"{file}: {report['samples']} rows over {report['span_min']:g} min"]
-    lines += filter(None, [alarm_headline(result.raised_alarms, zero_ns)])
+    since = "" if clock_zero_ns is None else f", minutes since {format_utc(clock_zero_ns)}"
+    lines = [f"{file}: {report['samples']} rows over {report['span_min']:g} min{since}"]
+    lines += filter(None, [alarm_headline(result.raised_alarms, zero_ns, clock_zero_ns)])
     lines += [f"  {name} is not watched: {why}" for name, why in result.left_out.items()]
     if result.runs > 1:
         lines.append(
@@ -116,7 +127,8 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path, *, is_trained: boo
             seen = describe_power(report["power"])
             lines.append(f"sensitivity: in nine of ten cases these steps are seen within an hour: {seen}")
     lines += alarm_lines(result.raised_alarms, zero_ns)
-    lines += [f"  note: {note}" for note in result.notes]
+    is_stated = result.promise is not None  # above, as of the end
+    lines += [f"  note: {note}" for note in result.notes if not (is_stated and note.startswith("promise: "))]
     if not result.raised_alarms and report["trained_until_min"] is not None:
         lines.append("no alarms")
     if result.refused:

@@ -179,11 +179,12 @@ def run_job(job: Job) -> JobResult:
     result.left_out = opened.still | result.left_out
     _check_watched(job.at, result)
     zero_ns = result.first_ns if source.zero_ns is None else source.zero_ns
-    found = backtest_object(result, zero_ns, source.zero(result.first_ns), is_trained=job.trained is not None)
+    zero = source.zero(result.first_ns)
+    found = backtest_object(result, zero_ns, zero, is_trained=job.trained is not None)
     if job.asked.as_json:
         text = msgspec.json.encode({"file": str(job.file), **found} if job.among else found).decode()
     else:
-        text = backtest_text(result, zero_ns, job.file, is_trained=job.trained is not None)
+        text = backtest_text(result, zero_ns, job.file, zero_ns if zero else None, is_trained=job.trained is not None)
     remarks = [f"read as: {source.read_as}"] if source.read_as else []
     if opened.process is None or model is not None:
         remarks += filter(None, [first.unit_remark(model or DEFAULT.require_model())])

@@ -23,7 +23,7 @@ baselines = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
-    app.add_typer(baselines, name=COMMAND, help="Accept, relearn or restore what a plant is judged by.")
+    app.add_typer(baselines, name=COMMAND, help="Accept, relearn or restore the baseline of a plant.")
 
 
 def _register(what: str, description: str) -> None:

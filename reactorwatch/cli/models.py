@@ -140,7 +140,7 @@ def linearise(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """The linear models at all steady states of constant inputs."""
+    """Print the linear models at all steady states of constant inputs."""
     from reactorwatch.cli.linear_models import describe
     from reactorwatch.description.choice import ProcessChoice
 

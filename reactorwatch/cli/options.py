@@ -76,7 +76,7 @@ TrainingRows = Annotated[
 ]
 Reference = Annotated[
     str | None,
-    typer.Option(help="Model that judges: auto, equations, black-box or arx [auto].", show_default=False),
+    typer.Option(help="Model that predicts each row: auto, equations, black-box or arx [auto].", show_default=False),
 ]
 Force = Annotated[
     bool, typer.Option("--force", help="Replace a file that is there and is of another kind than its name says.")

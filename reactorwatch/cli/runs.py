@@ -125,7 +125,7 @@ def demo(
     seed: Annotated[int, typer.Option(help="Of the input and the noise.")] = 1,
     site: Site = None,
 ) -> None:
-    """Run it all with a fault in it, draw it, say what happened."""
+    """Simulate, watch, record, draw and diagnose a plant with a fault."""
     from reactorwatch.cli.demonstration import Demonstration, run
 
     speed_value = parse_pace(speed, "--speed")

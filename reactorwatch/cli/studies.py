@@ -97,7 +97,7 @@ def backtest(
     plant: Plant = None,
     train: Annotated[
         Path | None,
-        typer.Option(help="A record to learn from, all of it; FILES are then judged from their first row."),
+        typer.Option(help="A record to learn from, all of it; FILES are then watched from their first row."),
     ] = None,
     training: TrainingMin = None,
     training_rows: TrainingRows = None,
@@ -214,7 +214,7 @@ def diagnose(
     as_json: Json = False,
     stated: FileFormat = GUESS,
 ) -> None:
-    """Say what the simulation gets wrong, and why."""
+    """Find where a simulation differs from the record, and name the cause."""
     from reactorwatch.cli.batch import expand_files, run_jobs
     from reactorwatch.cli.diagnosis import DiagnosisOptions
     from reactorwatch.cli.diagnosis_jobs import DIAGNOSIS, check_out, make_jobs

@@ -138,7 +138,12 @@ class CompiledFunction:
 
         The code takes the number of rows and the addresses of arguments and results, in the order of `fill`.
         """
-        return int(ctypes.cast(cast(Any, self._scalar_call), ctypes.c_void_p).value or 0)
+        return _address(self._scalar_call)
+
+    @cached_property
+    def lanes_address(self) -> int:
+        """As `address`, for `LANES` independent rows or more: the code takes so many at a time."""
+        return _address(self._vector_call)
 
     @cached_property
     def _scalar_call(self) -> _Call:
@@ -160,6 +165,10 @@ class CompiledFunction:
     def _engines(self) -> list[llvm.ExecutionEngine]:
         """The engines that own the code."""
         return []
+
+
+def _address(call: _Call) -> int:
+    return int(ctypes.cast(cast(Any, call), ctypes.c_void_p).value or 0)
 
 
 def _check_array(array: Array, least: int) -> None:

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.find import DEFAULT_PROCESS
 from reactorwatch.description.process import Process
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.read_table import MissingColumnError, SignalColumn, read_table
 from reactorwatch.records.record import Record
@@ -43,8 +44,8 @@ def read_process_table(
     known = [signal.name for signal in process.signals]
     for name in names:
         if name not in known:
-            valid = ", ".join((*STANDARD, *known))
-            raise InputError(f"{path}: unknown column {name!r} asked for (valid: {valid})")
+            valid = (*STANDARD, *known)
+            raise InputError(f"{path}: --column SIGNAL=NAME: {describe_unknown('signal', name, valid)}")
     signals = [
         SignalColumn(
             signal.name,
@@ -55,7 +56,16 @@ def read_process_table(
         )
         for signal in process.signals
     ]
-    return _to_model_units(_drop_impossible(read_table(path, signals, stated), process), process)
+    try:
+        measured = read_table(path, signals, stated)
+    except MissingColumnError as error:
+        if process.name != DEFAULT_PROCESS:
+            raise
+        cure = "name its process with --process"
+        if process.model is None:
+            cure += ", or its columns with --input and --output"
+        raise InputError(f"{error}; if it is no record of the reactor, {cure}") from error
+    return _to_model_units(_drop_impossible(measured, process), process)
 
 
 def read_signals(
@@ -70,16 +80,9 @@ def read_signals(
         stated: see `read_process_table`.
 
     Raises:
-        InputError: as `read_process_table`; where no process is chosen and the reactor's columns are missing, with the
-            cure.
+        InputError: as `read_process_table`.
     """
-    try:
-        return read_process_table(path, choice.load().without_equations(), columns, stated)
-    except MissingColumnError as error:
-        if not choice.is_default:
-            raise
-        cure = "name its process with --process, or its columns with --input and --output"
-        raise InputError(f"{error}; if it is no record of the reactor, {cure}") from error
+    return read_process_table(path, choice.load().without_equations(), columns, stated)
 
 
 def convert_to_process(record: Record, process: Process) -> Record:

@@ -15,8 +15,9 @@ keep no covariance: standard deviations are infinite. LMS is stable for a gain b
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.information import LARGEST_VALUE
 
@@ -27,8 +28,6 @@ BIAS = 1e-3
 """Keeps the step of NLMS finite where the regressor is near zero."""
 
 START_COVARIANCE = 1e4
-
-Array = NDArray[np.float64]
 
 
 class AdaptiveRegression:

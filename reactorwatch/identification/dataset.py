@@ -5,13 +5,12 @@ from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.identification.structure import as_columns
 from reactorwatch.records.record import Record
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

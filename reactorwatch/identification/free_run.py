@@ -8,13 +8,12 @@ least squares. A model that is not linear starts from the last rows of these.
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reactorwatch.arrays import Array
 from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.linear_model import RunPlan, plan_run, simulate
 from reactorwatch.identification.structure import Structure
-
-Array = NDArray[np.float64]
 
 
 class FreeRunning(Protocol):

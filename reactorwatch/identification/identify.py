@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
-from numpy.typing import NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification import report_scheme
 from reactorwatch.identification.adaptation import GAINS, AdaptiveRegression
@@ -27,8 +27,6 @@ from reactorwatch.identification.regressor import consecutive_rows, rows_of
 from reactorwatch.identification.residual_tests import DEFAULT_LAGS, independence, whiteness
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
-
-Array = NDArray[np.float64]
 
 FittedModel = LinearModel | PredictionErrorModel | PolynomialModel
 

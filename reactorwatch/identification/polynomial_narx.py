@@ -18,14 +18,13 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import check_not_constant, check_row_count, least_squares
 from reactorwatch.identification.linear_model import plan_run, standard_deviations
 from reactorwatch.identification.regressor import rows_of
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
-
-Array = NDArray[np.float64]
 
 DEGREE = 2
 LARGEST_SIZE = 30

@@ -15,6 +15,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import check_not_constant, check_row_count, least_squares
@@ -30,8 +31,6 @@ from reactorwatch.identification.polynomial_narx import (
 )
 from reactorwatch.identification.regressor import rows_of
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
-
-Array = NDArray[np.float64]
 
 DEGREES = (3, 2)
 """Degree of the polynomials, and the one for so many signals that there would be more candidates than rows."""

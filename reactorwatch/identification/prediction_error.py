@@ -27,6 +27,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import check_not_constant, check_row_count, least_squares
@@ -41,8 +42,6 @@ from reactorwatch.identification.output_error import (
 )
 from reactorwatch.identification.regressor import rows_of
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
-
-Array = NDArray[np.float64]
 
 Kind = Literal["armax", "bj"]
 

@@ -21,8 +21,9 @@ rows (`restart`).
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import model_of
 from reactorwatch.identification.linear_model import LinearModel
@@ -36,8 +37,6 @@ FORGETTING_RISE = 0.99
 COVARIANCE_LIMIT = 1e4
 """See `RecursiveLeastSquares`; also how far from zero the parameters may be."""
 _HALVINGS = 40
-
-Array = NDArray[np.float64]
 
 
 class RecursivePredictionError:

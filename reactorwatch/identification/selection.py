@@ -16,14 +16,13 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.identification.families import LINEAR_FAMILIES, Family, Model
 from reactorwatch.identification.linear_model import fit_percent
 from reactorwatch.identification.structure import Structure, as_columns
-
-Array = NDArray[np.float64]
 
 EQUAL_PERCENT = 0.5
 

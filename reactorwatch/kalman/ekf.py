@@ -116,6 +116,7 @@ class Filter:
         budget: filter steps that it may take; None: unlimited.
         stops_at_restart: if true, a run of a record ends where the filter has diverged and would start again; the
             results of the remaining rows are NaN.
+        most_divergences: number of divergences after which a run of a record ends in the same way.
     """
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, changes: Mapping[str, float] | None = None) -> None:
@@ -137,6 +138,7 @@ class Filter:
         self.noise = noise
         self.budget: StepBudget | None = None
         self.stops_at_restart, self._started = False, False
+        self.most_divergences = inf
         self.set_parameters(changes or {})
 
     def clone(self) -> "Filter":
@@ -144,6 +146,7 @@ class Filter:
         other = Filter(self.model, self._noise, self._changes)
         other._initial_state = self._initial_state  # costs more to make than to use
         other.budget, other.stops_at_restart = self.budget, self.stops_at_restart
+        other.most_divergences = self.most_divergences
         return other
 
     @property
@@ -304,7 +307,7 @@ class Filter:
         count, n, n_x = len(rows), self._n_y, self._n_x
         outputs, beliefs = np.empty((count, 5 * n + 1)), np.empty((count, self._belief.size))
         ends = [*np.flatnonzero(~near).tolist(), count]
-        row = 0
+        row = divergences = 0
         while row < count:
             done = 0
             if self._time_min is not None and near[row]:
@@ -313,11 +316,14 @@ class Filter:
                 done = yield RowBatch(
                     self.code, self._belief, rows[part], self._constants, beliefs[part], outputs[part]
                 )
+                divergences += not done
             if done:
                 self._belief[:] = beliefs[row + done - 1]
                 row += done
                 self._set_row(float(record.time_min[row - 1]), record.inputs[row - 1].tolist())
-            elif self.stops_at_restart and self._started and self._time_min is None:
+            elif divergences > self.most_divergences or (
+                self.stops_at_restart and self._started and self._time_min is None
+            ):
                 outputs[row:], beliefs[row:] = nan, nan
                 break
             else:

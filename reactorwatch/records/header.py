@@ -178,7 +178,7 @@ class HeaderSearch:
         if found is None:
             cell = next(cell for cells in layout.sample for cell in cells if "," in cell)
             raise InputError(
-                f"{self._path}, row {layout.first_row}: {cell!r} may be a decimal comma or a thousand; "
-                "state --decimal , or --decimal ."
+                f"{self._path}, row {layout.first_row}: {cell!r} may have a decimal comma (--decimal ,) or "
+                "group its thousands (--decimal .); state one of them"
             )
         return found

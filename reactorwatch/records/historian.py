@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, hint_at_closest
 from reactorwatch.records.cells import NUMBER, TEXT
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.layout import Layout, bare_name
@@ -115,8 +115,12 @@ def read_tags(
             part.refuse(int(np.flatnonzero(~found.valid)[0]), long.time.columns[0], "expected a time")
         series[tag] = TagSeries(found.values, values)
     if not series:
-        known = ", ".join(repr(cell.strip()) for cell in tags.dictionary.to_pylist()[:20])
-        raise InputError(f"{layout.path}: expected rows of the tags {', '.join(map(repr, wanted or ()))}, got {known}")
+        known = [cell.strip() for cell in tags.dictionary.to_pylist()]
+        hints = dict.fromkeys(hint_at_closest(name, known) for name in wanted or ())
+        raise InputError(
+            f"{layout.path}: expected rows of the tags {', '.join(map(repr, wanted or ()))}, "
+            f"got {', '.join(map(repr, known[:20]))}{''.join(hints)}"
+        )
     names = [layout.names[column] for column in (long.tag, long.value)]
     return series, is_clock, [*notes, f"a row for each value of `{names[1]}` by `{names[0]}`"]
 

@@ -1,5 +1,6 @@
 """Read a record from a table of any common form: what is not stated is guessed, and the guesses are noted."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, hint_at_closest
 from reactorwatch.records.cells import EMPTY, NUMBER, TEXT
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.historian import LongFormat, find_long_format, read_tags
@@ -141,12 +142,13 @@ def _find_columns(layout: Layout, signals: Sequence[SignalColumn]) -> dict[str, 
 def _check_required(layout: Layout, signals: Sequence[SignalColumn], mapped: dict[str, int | None]) -> None:
     for signal in signals:
         if signal.required and mapped[signal.name] is None:
-            asked = repr(signal.column or signal.name)
-            named = f" (for {signal.name})" if signal.column and signal.column != signal.name else ""
-            found = ", ".join(map(repr, layout.names))
+            asked = signal.column or signal.name
+            named = f" (for {signal.name})" if asked != signal.name else ""
+            found = ", ".join(map(repr, layout.names)) + hint_at_closest(asked, map(bare_name, layout.names))
+            cure = shlex.quote(f"{signal.name}=NAME")
             raise MissingColumnError(
-                f"{layout.path}, row {layout.header_row or layout.first_row}: expected a column {asked} in the header"
-                f"{named}, got {found}; --column {signal.name}=NAME names another"
+                f"{layout.path}, row {layout.header_row or layout.first_row}: expected a column {asked!r} in the header"
+                f"{named}, got {found}; --column {cure} names another"
             )
 
 
@@ -273,9 +275,9 @@ def _read_long(
         if tag is None:
             if signal.required:
                 found = ", ".join(map(repr, series))
-                raise MissingColumnError(
-                    f"{layout.path}: expected rows of the tag {signal.column or signal.name!r}, got {found}"
-                )
+                asked = signal.column or signal.name
+                found += hint_at_closest(asked, series)
+                raise MissingColumnError(f"{layout.path}: expected rows of the tag {asked!r}, got {found}")
             continue
         own, first = np.unique(series[tag].times, return_index=True)
         strays += series[tag].times.size - own.size

@@ -80,7 +80,7 @@ def read_text(path: Path) -> tuple[bytes, list[str]]:
     encoding = next((name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark)), None)
     encoding = encoding or _guess_encoding(data[:HEAD_BYTES])
     if encoding not in _WIDE and b"\0" in data:
-        raise InputError(f"{path}: expected a CSV file, got binary data")
+        raise InputError(f"{path}: expected a CSV file, got binary data; export the table as .csv")
     if encoding != "utf-8" or not data.isascii():
         data, read_as = _decode(path, data, encoding)
         notes += [read_as] if read_as else []

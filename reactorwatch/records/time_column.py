@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, hint_at_closest
 from reactorwatch.records.cells import NUMBER
 from reactorwatch.records.file_format import SECONDS, FileFormat
 from reactorwatch.records.layout import Layout, bare_name
@@ -123,7 +123,7 @@ def find_column(layout: Layout, name: str, option: str) -> int:
             return names.index(name)
     if name.isdigit() and 1 <= int(name) <= len(layout.names):
         return int(name) - 1
-    found = ", ".join(map(repr, layout.names))
+    found = ", ".join(map(repr, layout.names)) + hint_at_closest(name, map(bare_name, layout.names))
     raise InputError(f"{layout.path}, row {layout.header_row or 1}: expected a column {name!r} ({option}), got {found}")
 
 
@@ -195,6 +195,8 @@ def find_epoch(layout: Layout, item: TimeColumn, values: NDArray[np.float64]) ->
 
 
 def _refuse_without_time(layout: Layout, taken: Collection[int]) -> None:
+    if len(layout.names) > 1 and layout.header_row is not None and not layout.sample:
+        raise InputError(f"{layout.path}: expected rows below the header, got none")
     expected = " or ".join(map(repr, STANDARD))
     found = ", ".join(map(repr, layout.names))
     signals = [layout.names[column] for column in sorted(taken) if _has_time_name(layout, TimeColumn((column,)))]

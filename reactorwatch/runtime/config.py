@@ -188,14 +188,25 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
         settings = msgspec.convert(values, kind)
         check_spans(settings)
     except msgspec.ValidationError as error:
-        words = (
-            valid_choices(kind, str(error).rpartition("`")[0].rpartition("`")[2]) if _NO_CHOICE in str(error) else ()
-        )
-        valid = f" (valid: {', '.join(words)})" if words else ""
-        raise InputError(f"settings [{name}]: {error}{valid}") from error
+        raise InputError(f"settings [{name}]: {_describe_refusal(kind, str(error))}") from error
     except (ValueError, OverflowError) as error:
         raise InputError(f"settings [{name}]: {error}") from error
     return settings
+
+
+def _describe_refusal(kind: object, text: str) -> str:
+    """Describe an invalid word by the setting and the valid words; any other message of msgspec is returned as given.
+
+    Args:
+        kind: class of the settings.
+        text: message of msgspec, such as "Invalid enum value 'fast' - at `$.start`".
+    """
+    rule, _, path = text.partition(" - at ")
+    words = valid_choices(kind, path.strip("`")) if rule.startswith(_NO_CHOICE) else ()
+    if not words:
+        return text
+    setting, word = path.strip("`").removeprefix("$."), rule.removeprefix(_NO_CHOICE).strip(" '")
+    return f"{setting}: {describe_unknown('word', word, words)}"
 
 
 def _rename_older(kind: type[Section], name: str, values: dict[str, Any]) -> dict[str, Any]:

@@ -5,11 +5,9 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.spc.prewhitening import Prewhitening
-
-Array = NDArray[np.float64]
 
 
 class Baseline(NamedTuple):

@@ -18,10 +18,9 @@ too wide for many signals, and does not exist where nu_i < p.
 from math import inf, log, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-Array = NDArray[np.float64]
+from reactorwatch.arrays import Array
 
 GRID = 2**13
 """Number of grid points; the step is then about a thousandth of the quantile."""

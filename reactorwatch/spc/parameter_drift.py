@@ -79,7 +79,7 @@ def learn(
 
     Raises:
         InputError: an argument out of its range or of a wrong shape, a value that is not finite, or a training too
-            short or without any excitation.
+            short, without any excitation, or with all excitation of a parameter in a few rows.
     """
     phi, e = np.asarray(regressors, dtype=np.float64), np.asarray(residuals, dtype=np.float64)
     if phi.ndim != 2 or phi.shape[1] != len(names) or e.shape != phi.shape[:1]:
@@ -110,6 +110,11 @@ def learn(
     memory = forgetting**reference_rows
     share = (1.0 + memory) / (1.0 - memory)
     # In coordinates that make the regressors white, V is Omega.
+    values = np.linalg.eigvalsh(omega)
+    if values[0] <= rows * np.finfo(np.float64).eps * values[-1]:
+        raise InputError(
+            "training must have moves of the inputs in more rows, parameters depend on a few rows of it only"
+        )
     root = np.linalg.inv(np.linalg.cholesky(omega)) @ (z.T @ phi) / rows
     limit = parameter_limit(arl0, m, weight, vectors, share)
     inputs = np.zeros((0, len(names)))

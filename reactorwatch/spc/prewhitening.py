@@ -23,10 +23,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.stored_state import StoredState
-
-Array = NDArray[np.float64]
 
 LARGEST_ORDER = 6
 ROWS_A_COEFFICIENT = 10

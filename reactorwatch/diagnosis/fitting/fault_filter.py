@@ -39,6 +39,10 @@ HUBER = 4.0
 DIVERGED_RESIDUAL = 100.0
 """Standard deviations charged for a value where the filter has diverged."""
 
+MOST_DIVERGENCES, ROWS_PER_DIVERGENCE = 30, 250
+"""Divergences after which the filter of an effect is given up, and rows of a longer record that allow one more: each
+restart costs as much as a hundred rows."""
+
 _DIVERGED_SD = 1e6
 """Ratio of predicted standard deviation to sensor noise beyond which the filter has diverged."""
 
@@ -253,6 +257,8 @@ class FaultFilter:
             if prefix is not None and same:
                 x, P = prefix.innovations.x[same - 1].tolist(), prefix.innovations.P[same - 1].ravel().tolist()
                 start = FilterState(float(time_min[last]), tuple(inputs[last].tolist()), tuple(x), tuple(P))
+            if self.effects:  # the nominal model, with which all effects are compared, always runs to the end
+                filtering.most_divergences = max(MOST_DIVERGENCES, index.size // ROWS_PER_DIVERGENCE)
             later = None if uncertainty is None else uncertainty.select(remaining)
             record = FilterRecord.of(time_min[remaining], inputs[remaining], measured[remaining], uncertainty=later)
             runs.append(filtering.run_batched(record, start))

@@ -39,6 +39,10 @@ UNSEEN = 1.3
 SETTLED = 25
 """Rows in succession that are no extrapolation after which the values of the inputs are familiar."""
 
+LARGEST_PREDICTION = 1e12
+"""Size of the scaled predictions, and of their standard deviations, where the model diverges, so that the charts can
+use them until it starts again."""
+
 BINS, BIN_WIDTH = 64, 0.25
 """Intervals of the values of an input that are familiar or not, and their width in its standard deviations."""
 
@@ -152,12 +156,12 @@ def filter_row(
         if not (P[j, j] > 0.0 and variance < inf and abs(x[j]) < inf):
             results[5 * p] = FAILED
             return FAILED
-        sd = np.sqrt(variance)
+        sd = min(np.sqrt(variance), LARGEST_PREDICTION)
         if sd > limit_sd[j]:
             is_within = False
             if after[1] == 0.0:
                 sd = limit_sd[j]
-        results[j] = centres[j] + spreads[j] * x[j]
+        results[j] = centres[j] + spreads[j] * min(max(x[j], -LARGEST_PREDICTION), LARGEST_PREDICTION)
         results[p + j] = measured[j] - results[j]
         results[2 * p + j] = results[4 * p + j] = spreads[j] * sd
         results[3 * p + j] = results[p + j] / results[2 * p + j]

@@ -44,6 +44,9 @@ NOISE_MARGIN = 5.0
 """The same for noise of the process."""
 
 _ITERATIONS, _LAST_ITERATIONS = 5, 20
+LEAST_RELATIVE_SD = 1e-6
+"""Standard deviation of the measurements, relative to the output's own, below which it is rounding."""
+
 _CONVERGED = 1e-4  # relative decrease of the cost
 _LEAST_VARIANCE = 1e-8  # of the process, relative to that of the measurements
 
@@ -109,7 +112,7 @@ def fit_black_box(
     centres, spreads = _scaling(outputs, inputs)
     count = outputs.shape[1]
     y, u = (outputs - centres[:count]) / spreads[:count], (inputs - centres[count:]) / spreads[count:]
-    smallest = np.square(smallest_sd / spreads[:count])
+    smallest = np.square(np.maximum(smallest_sd / spreads[:count], LEAST_RELATIVE_SD))
     complete = int(np.isfinite(outputs).all(axis=1).sum())
 
     def fit(shape: Shape) -> tuple[float, float, BlackBoxModel] | None:
@@ -247,10 +250,20 @@ def _gauss_newton(shape: Shape, rows: Rows, theta: Array, gain: float, iteration
         if before - after <= _CONVERGED * before:
             break
     run(theta, 1.0 / variances, gram)
-    covariance = np.linalg.inv(gram + np.diag(precision))
+    covariance = _inverse(gram + np.diag(precision))
     counts = np.count_nonzero(np.isfinite(errors), axis=0)
     likelihood = -0.5 * float(np.sum(counts * np.log(variances)))
-    return _Fit(gain, theta, 0.5 * (covariance + covariance.T), variances, likelihood)
+    return _Fit(gain, theta, covariance, variances, likelihood)
+
+
+def _inverse(information: Array) -> Array:
+    """Inverse of a symmetric positive definite matrix, positive definite in spite of rounding."""
+    scale = 1.0 / np.sqrt(np.diag(information))
+    values, directions = np.linalg.eigh(scale[:, None] * information * scale)
+    root = (
+        scale[:, None] * directions / np.sqrt(np.maximum(values, len(values) * np.finfo(np.float64).eps * values[-1]))
+    )
+    return np.asarray(root @ root.T)
 
 
 def _variances(errors: Array, smallest: Array) -> Array:

@@ -1,5 +1,6 @@
 """`backtest` says what judged the rows and by which noise levels."""
 
+import dataclasses
 from pathlib import Path
 from typing import Literal
 
@@ -47,6 +48,16 @@ def test_a_record_that_was_not_judged_names_nothing() -> None:
     assert "reference: " not in backtest_text(result, 0, Path("run.csv"))
 
 
+def test_a_note_on_the_promise_is_left_out_where_the_promise_is_stated() -> None:
+    result = judged("arx")
+    note = "promise: it does not hold"
+    with_note = dataclasses.replace(result, notes=[note, "another"])
+    assert result.promise is not None
+    assert "another" in backtest_text(with_note, 0, Path("run.csv"))
+    assert note not in backtest_text(with_note, 0, Path("run.csv"))
+    assert note in backtest_text(dataclasses.replace(with_note, promise=None), 0, Path("run.csv"))
+
+
 def raised(alarm: str, minute: float, cleared_min: float | None, incident: int, text: str = "") -> Raised:
     suspects = [Suspect(cause="coolant_flow", probability=0.94, text=text)] if text else []
     message = Alarm(alarm=alarm, priority=3, raised_ns=to_time_ns(minute), incident=incident, suspects=suspects)  # type: ignore[arg-type]
@@ -59,6 +70,14 @@ def test_the_headline_names_the_first_alarm_the_incidents_and_the_cause() -> Non
         "Detected at 150.3 min by ewma/T: 2 alarms in 1 incident; likely cause: 15 % of the coolant lost (94 %)"
     )
     assert alarm_headline([], 0) == ""
+
+
+def test_the_headline_of_a_record_with_clock_time_states_it() -> None:
+    """For minutes from the epoch, as in Python, and from the clock time itself, as in the command."""
+    day = to_time_ns(1_000_000.0)
+    for zero, at in ((0, 150.5), (day, 1_000_150.5)):
+        headline = alarm_headline([raised("ewma/T", at, None, 1)], zero, day)
+        assert headline.startswith("Detected at 150.5 min (1971-11-26T13:10:30Z) by ewma/T")
 
 
 def test_an_alarm_that_comes_and_goes_within_an_incident_is_one_line() -> None:

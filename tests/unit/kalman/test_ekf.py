@@ -354,6 +354,24 @@ def test_a_run_may_end_where_the_filter_diverges_instead_of_restarting() -> None
     assert np.all(np.isfinite(restarted.x[end]))
 
 
+def test_a_run_that_diverges_often_ends_after_the_divergences_that_it_may_have() -> None:
+    model = linear_model(bound=50.0)
+    time_min, inputs, measured = linear_record(rows=60)
+    inputs[30:] = 1e6  # leads out of the bounds
+    record = FilterRecord.of(time_min, inputs, measured)
+    results = []
+    for most in (3, np.inf):
+        kalman = Filter(model, NOISE)
+        kalman.most_divergences = most
+        results.append(kalman.clone().run_record(record))
+    stopped, restarted = results
+    started = np.isnan(restarted.prediction[:, 0]) & np.isfinite(restarted.x[:, 0])
+    end = int(np.flatnonzero(started)[4])  # after the first row and three divergences
+    assert np.all(np.isnan(stopped.x[end:]))
+    for one, other in zip(restarted, stopped, strict=True):
+        np.testing.assert_array_equal(one[:end], other[:end])
+
+
 def test_a_correction_is_cut_off_at_the_bounds() -> None:
     kalman = Filter(cstr(), SENSORS)
     kalman.state = FilterState(0.0, (OPERATING_COOLANT_FLOW,), OPERATING_STATE, (0.1, 0.0, 0.0, 1e-9))

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.read_table import SignalColumn, read_table
 from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN, Record
 from reactorwatch.records.write_table import write_table
@@ -147,8 +148,32 @@ def test_a_name_that_is_asked_for_must_be_there_and_be_known(tmp_path: Path) -> 
     path = written(tmp_path, PLAIN)
     with pytest.raises(InputError, match="expected a column 'temp' in the header"):
         read_csv(path, {"T": "temp"})
-    with pytest.raises(InputError, match=r"unknown column 'Q' asked for \(valid: time_min, time_s, qc, C, T\)"):
+    with pytest.raises(InputError, match=r"unknown signal 'Q'.* \(valid: time_min, time_s, qc, C, T\)"):
         read_csv(path, {"Q": "qc"})
+
+
+@pytest.mark.parametrize("misspelt", ["TI-310 Inlet", "ti-301 inlet", "TI 301 Inlet"])
+@pytest.mark.parametrize("form", ["wide", "long", "time"])
+def test_a_misspelt_column_or_tag_gets_the_closest_name(tmp_path: Path, misspelt: str, form: str) -> None:
+    rows = "".join(f"{row},{row},4\n" for row in range(5))
+    signals = [SignalColumn("T", column=misspelt)]
+    if form == "long":
+        text = "time,tag,value\n" + "".join(f"2026-03-02T08:00:0{row}Z,TI-301 Inlet,{row}\n" for row in range(5))
+    else:
+        text = f"time_s,TI-301 Inlet [degC],FC-7\n{rows}"
+    with pytest.raises(InputError) as error:
+        read_table(written(tmp_path, text), signals, FileFormat(time=misspelt) if form == "time" else FileFormat())
+    assert "did you mean 'TI-301 Inlet'?" in str(error.value)
+
+
+def test_the_cure_for_a_missing_column_is_quoted_for_the_shell(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--column 'my T=NAME' names another"):
+        read_table(written(tmp_path, PLAIN), [SignalColumn("my T")])
+
+
+def test_a_header_without_rows_is_no_missing_time(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected rows below the header, got none"):
+        read_table(written(tmp_path, "Datum;TI-301;FC-7\n"))
 
 
 def test_reading_row_by_row_gives_what_reading_at_once_gives(tmp_path: Path) -> None:

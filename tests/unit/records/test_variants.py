@@ -149,7 +149,7 @@ REFUSED = {
     "a comma that may be a thousand": (
         table(MINUTES, [["1,034", "2,100", "4,385"]] * ROWS, separator=";"),
         FileFormat(),
-        "row 2: '1,034' may be a decimal comma or a thousand; state --decimal , or --decimal .",
+        "row 2: '1,034' may have a decimal comma (--decimal ,) or group its thousands (--decimal .); state one of them",
     ),
     "the comma twice": (
         table([f"{item},0" for item in MINUTES], [[cell.replace(".", ",") for cell in row] for row in cells()]),

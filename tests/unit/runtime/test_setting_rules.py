@@ -65,7 +65,7 @@ def test_any_value_of_any_setting_is_valid_or_one_line(key: tuple[str, str], val
     if refused:
         assert refused.startswith(f"settings [{table}]: ")
         assert "\n" not in refused
-        assert "Invalid enum value" not in refused or "(valid: " in refused
+        assert "Invalid enum value" not in refused
         return
     if isinstance(found, RecorderConfig):
         build_black_box(found)
@@ -99,7 +99,9 @@ def test_no_duration_is_longer_than_146_years(table: str, name: str) -> None:
 def test_an_error_on_a_choice_lists_the_valid_words(table: str, name: str, path: str, word: str) -> None:
     assert word in valid_choices(TABLES[table], path)
     value: Any = {"charts": ["foo"], "priorities": {"T": "foo"}}.get(name, "foo")
-    with pytest.raises(InputError, match=rf"settings \[{table}\]: .*\(valid: .*\b{word}\b.*\)"):
+    with pytest.raises(
+        InputError, match=rf"settings \[{table}\]: {name}.*: unknown word 'foo'.* \(valid: .*\b{word}\b.*\)"
+    ):
         section(TABLES[table], table, {table: {name: value}}, {})
 
 

@@ -194,6 +194,19 @@ def test_a_record_without_noise_makes_no_drift_of_rounding() -> None:
             assert not chart.update(rls.parameters - reference, row).out
 
 
+@pytest.mark.parametrize("row", [3, 50, 250, 450, 497])
+@pytest.mark.parametrize("lags", [2, 3, 5])
+def test_a_training_with_one_step_of_the_input_cannot_tell_how_its_lags_scatter(row: int, lags: int) -> None:
+    """The difference of two lags is other than 0 in one row, which the regression explains wholly."""
+    rng = np.random.default_rng(row)
+    step = (np.arange(-lags, 500) >= row).astype(np.float64)
+    regressors = np.column_stack([step[lags - k : 500 + lags - k] for k in range(lags)] + [np.ones(500)])
+    with pytest.raises(InputError, match="moves of the inputs in more rows"):
+        parameter_drift.learn(
+            regressors, rng.standard_normal(500), 0.99, 500, 1e4, [str(k) for k in range(lags + 1)], past_outputs=0
+        )
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
