@@ -89,7 +89,7 @@ def of_a_plant() -> None:
         watch = ChartWatch(config, Annunciator(config))
         e = rng.standard_normal((1000, 2))
         values = np.column_stack([rng.standard_normal(1000), e])
-        watch.choose([True, True], e, values)
+        watch.design.choose([True, True], e, values)
         watch.start(learned, e, values, 2e6)
 
         def run(watch: ChartWatch = watch) -> None:

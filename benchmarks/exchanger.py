@@ -139,7 +139,7 @@ def watch(flow: Array, measured: Array, config: MonitorConfig, sizes: Sequence[f
         if k in onsets:
             copies[k] = monitor.to_bytes()
         alarms += [f"{name}@{k}" for name in _take_row(monitor, k, values)]
-    result = Result(monitor.reference, alarms, {}, {}, monitor.unjudged_rows)
+    result = Result(monitor.pipeline.reference, alarms, {}, {}, monitor.pipeline.unjudged_rows)
     for size in sizes:
         delays = result.delays[size] = []
         result.missed[size] = []

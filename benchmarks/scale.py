@@ -166,9 +166,9 @@ def report_memory(endpoint: str, plants: int) -> None:
     assert bus is not None
     node = Counting(FAST, bus, stop)
     node.learn(plants)
-    assert isinstance(node._watched, WatchedPlants)
-    assert isinstance(node._watched, WatchedPlants)
-    quiet = node._watched._quiet
+    assert isinstance(node.watched, WatchedPlants)
+    assert isinstance(node.watched, WatchedPlants)
+    quiet = node.watched._quiet
     assert quiet is not None
     due_ns = quiet._slots.health_due_ns
     due_ns[plants // 2 : plants] = NEVER_NS

@@ -2,70 +2,13 @@
 
 import argparse
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 
-import numpy as np
-
-import reactorwatch as rw
 from benchmarks import false_alarms
 from benchmarks.promise import black_box, costs, faults, statements
-from benchmarks.promise.plants import INPUTS, KINDS, simulate
-from benchmarks.promise.pool import median_interval, poisson_interval, run_jobs, share_interval
-from reactorwatch.runtime.parallel.jobs import Executor, choose_executor
-
-SEED, SEED_STEP = 100, 1000
-"""Seed of the first plant of the first set, and the difference to that of the next set."""
-
-HIGH_RATE = 30.0
-"""False alarms promised in 30 days in the second table."""
-
-ONSET_MIN, WITHIN_MIN = 400.0, 10.0
-NOT_WATCHED = ("C every tenth row", "2 % of the rows lost")
-"""Kinds without a fault: 27 of the 33 are of the others."""
-
-
-class Plant(NamedTuple):
-    """A plant and its monitor.
-
-    Attributes:
-        kind: index of its kind.
-        moves: index of its input.
-        set: index of the set of plants, which differ in their seeds.
-        rate: false alarms promised in 30 days; None: the default of the monitor.
-        is_faulty: true if its feed is 1.5 K warmer from `ONSET_MIN` on.
-    """
-
-    kind: int
-    moves: int
-    set: int = 0
-    rate: float | None = None
-    is_faulty: bool = False
-
-
-class Outcome(NamedTuple):
-    """Result of a back-test.
-
-    Attributes:
-        raised_min: times of the alarms.
-        expected: false alarms promised.
-        kept: false if the monitor says that the promise is not kept.
-    """
-
-    raised_min: list[float]
-    expected: float
-    kept: bool
-
-
-def watch(plant: Plant) -> Outcome:
-    """Simulate a plant and watch it."""
-    seed = SEED + 10 * plant.kind + plant.moves + SEED_STEP * plant.set
-    flow = list(INPUTS.values())[plant.moves]
-    record = simulate(KINDS[plant.kind], flow, seed, warmer_from_min=ONSET_MIN if plant.is_faulty else None)
-    settings: dict[str, Any] = {} if plant.rate is None else {"false_alarms_per_30_days": plant.rate}
-    found = rw.backtest(record, **settings)
-    kept = found.promise is None or found.promise["kept"]
-    return Outcome([item.raised_min for item in found.alarms], found.expected_false_alarms, kept)
+from benchmarks.promise.not_quite import print_plants
+from benchmarks.promise.plants import KINDS
+from reactorwatch.runtime.parallel.jobs import choose_executor
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -90,73 +33,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         costs.main()
     print(f"\n{time.perf_counter() - start:.0f} s")
     return 0
-
-
-def print_plants(executor: Executor, count: int) -> None:
-    """Watch sound plants and plants with a fault, and print the tables.
-
-    Args:
-        executor: executor of the jobs.
-        count: number of kinds of plants.
-    """
-    kinds, moves = range(count), range(len(INPUTS))
-    sound = [Plant(kind, move) for kind in kinds for move in moves]
-    often = [Plant(kind, move, number, HIGH_RATE) for number in (0, 1) for kind in kinds for move in moves]
-    faulty = [item._replace(is_faulty=True) for item in sound if KINDS[item.kind].name not in NOT_WATCHED]
-    outcomes = run_jobs(executor, watch, [*sound, *often, *faulty])
-    print_counts("the default promise", sound, outcomes)
-    for number in (0, 1):
-        own = [item for item in often if item.set == number]
-        print_counts(f"{HIGH_RATE:g} false alarms promised in 30 days, set {number + 1}", own, outcomes)
-    print_delays(faulty, outcomes)
-
-
-def print_counts(title: str, plants: Sequence[Plant], outcomes: Iterator[Outcome]) -> None:
-    """Print the table of false alarms.
-
-    Args:
-        title: heading of the table.
-        plants: sound plants, by kind and input.
-        outcomes: outcomes of these plants, then those of later tables.
-    """
-    print(f"| sound plant, {title} | false alarms, by input | promised | not kept |\n|---|---|---|---|", flush=True)
-    found = [(plant, next(outcomes)) for plant in plants]
-    for kind in dict.fromkeys(plant.kind for plant in plants):
-        own = [(plant.moves, outcome) for plant, outcome in found if plant.kind == kind]
-        counts = [sum(len(item.raised_min) for moves, item in own if moves == index) for index in range(len(INPUTS))]
-        promised, broken = sum_up(item for _, item in own)
-        print(f"| {KINDS[kind].name} | {' + '.join(map(str, counts))} | {promised:.2g} | {broken} |")
-    raised = sum(len(item.raised_min) for _, item in found)
-    promised, broken = sum_up(item for _, item in found)
-    low, high = poisson_interval(raised)
-    interval = f"(95 %: {low:.1f} to {high:.1f})"
-    print(f"| all | {raised} {interval} | {promised:.2g} | {broken} of {len(found)} |\n", flush=True)
-
-
-def sum_up(outcomes: Iterable[Outcome]) -> tuple[float, int]:
-    """False alarms promised, and number of plants whose monitor says that the promise is not kept."""
-    both = [(item.expected, not item.kept) for item in outcomes]
-    return sum(expected for expected, _ in both), sum(broken for _, broken in both)
-
-
-def print_delays(plants: Sequence[Plant], outcomes: Iterator[Outcome]) -> None:
-    """Print how many faults are seen, and when."""
-    found = [(KINDS[plant.kind].name, delay(next(outcomes))) for plant in plants]
-    seen = sum(size <= WITHIN_MIN for _, size in found)
-    low, high = share_interval(seen, len(found))
-    unseen = sorted({name for name, size in found if size > WITHIN_MIN})
-    delays = [size for _, size in found]
-    least, most = median_interval(delays)
-    print(
-        f"Feed 1.5 K warmer from {ONSET_MIN:g} min on: {seen} of {len(found)} seen within {WITHIN_MIN:g} min (95 %: "
-        f"{100 * low:.0f} to {100 * high:.0f} %), median {np.median(delays):.2f} min ({least:.2f} to {most:.2f})"
-        f"{'; unseen: ' + ', '.join(unseen) if unseen else ''}."
-    )
-
-
-def delay(outcome: Outcome) -> float:
-    """Minutes from the fault to the first alarm after it."""
-    return min((time - ONSET_MIN for time in outcome.raised_min if time >= ONSET_MIN), default=np.inf)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,15 @@
 """The plants of `make promise` are the reactor by an independent integration, each with its difference."""
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.promise import black_box, faults, plants
-from benchmarks.promise.__main__ import Outcome, Plant, delay, print_counts, print_delays
+from benchmarks.promise.not_quite import Outcome, Plant, delay, print_counts, print_delays
 from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
 from benchmarks.promise.pool import median_interval, poisson_interval, run_jobs, share_interval
 from plant_node.record import simulate_record
@@ -14,6 +17,7 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.runtime.parallel.jobs import SerialExecutor
 
+ROOT = Path(__file__).parents[3]
 RANDOM_STEPS = INPUTS["a new flow in 90 to 111 each minute"]
 EFFECT_OF = {
     "reaction 3 % slower": "reaction_rate:constant:-0.03",
@@ -125,3 +129,11 @@ def test_the_tables_of_black_boxes_and_of_faults_have_a_line_for_each_kind(
     assert lines[2] == "| steps, with equations | 13 | 100 % (75 to 100) | 1.00 (1.00 to 1.00) |"
     assert lines[4].startswith("| steps, without equations | 13 | 0 % (0 to 25) | inf (inf to inf) |")
     assert lines[6].startswith("| all, with equations | 16 |")
+
+
+@pytest.mark.slow
+def test_the_command_prints_its_tables_from_worker_processes() -> None:
+    command = [sys.executable, "-m", "benchmarks.promise", "--kinds", "1", "--plants-only", "--processes", "2"]
+    found = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
+    assert found.stdout.count("| all |") == 3
+    assert "of 3 seen within 10 min" in found.stdout
