@@ -105,8 +105,7 @@ class Monitor:
         self.pipeline = self._new_pipeline(self.alarms)
         judged_by = self.pipeline.model
         self._sample_units = make_sample_units(config.units, {} if judged_by is None else judged_by.units)
-        self._plain_units: dict[str, str] = {}  # newest unit by signal that needs no conversion
-        self._converted: set[str] = set()  # signals whose samples were converted
+        self._plain_units = self._sample_units.plain
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -154,16 +153,10 @@ class Monitor:
             return []
         if unit != self._plain_units.get(signal):
             try:
-                value, converted = self._sample_units.convert(signal, unit, value)
+                value, unit = self._sample_units.convert(signal, unit, value)
             except InputError as error:
                 self.rejects.add("unit", str(error))
                 return []
-            if converted == unit:
-                self._plain_units[signal] = unit
-                self._converted.discard(signal)
-            else:
-                self._converted.add(signal)
-            unit = converted
         index = self._indices.get(signal)
         if index is None:
             self.pipeline.operation.on_sample(signal, sample.time_ns, value)
@@ -190,7 +183,7 @@ class Monitor:
                 self._accept(signal, *item, publications)
         if is_accepted and now_ns >= self.stats.heard_ns + HEARD_AGAIN_NS:
             self.stats.heard_ns = now_ns
-            self._silence.of_plant.on_receipt(now_ns)
+            self.silence.of_plant.on_receipt(now_ns)
         self._published += len(publications)
         return publications
 
@@ -241,7 +234,7 @@ class Monitor:
         if self.stats.ticked and now_ns - self.next_tick_ns() > STALL_NS:
             self.stats.stalls += 1
         self.stats.ticked = True
-        publications = self._check_timeout(now_ns)
+        publications = self._guard("silence", self.silence.check, now_ns)
         if self._republishes_baseline and self.baseline is not None:
             publications.append(Publication(keys.key(self.config.plant, keys.BASELINE, NODE), self.baseline))
         self._republishes_baseline = False
@@ -253,7 +246,7 @@ class Monitor:
 
     def next_tick_ns(self) -> int:
         """Time when health or the plant's data timeout is due."""
-        overdue_ns = self._silence.of_plant.due_ns()
+        overdue_ns = self.silence.of_plant.due_ns()
         return self.stats.health_due_ns if overdue_ns is None else min(self.stats.health_due_ns, overdue_ns)
 
     @property
@@ -422,16 +415,6 @@ class Monitor:
         return self.pipeline.equations
 
     @property
-    def reference(self) -> str:
-        """Kind of the reference: `equations` or `arx`; empty before there is one."""
-        return self.pipeline.reference
-
-    @property
-    def noise_levels(self) -> dict[str, dict[str, float]] | None:
-        """Noise levels of the equations by sensor and by state; None with another reference."""
-        return self.pipeline.noise_levels
-
-    @property
     def rows(self) -> int:
         """Number of rows so far, including incomplete rows."""
         return self._aligner.state.counts.rows
@@ -452,19 +435,14 @@ class Monitor:
         return self._watching_since_ns
 
     @property
+    def silence(self) -> SilenceCheck:
+        """Data timeouts of the plant and of its signals."""
+        return self.pipeline.evaluation.signals.silence
+
+    @property
     def converts_samples(self) -> bool:
         """True if samples come in other units than those in which they are judged."""
-        return bool(self._converted)
-
-    @property
-    def unjudged_rows(self) -> int:
-        """Number of rows that were not judged, see `PlantPipeline.unjudged_rows`."""
-        return self.pipeline.unjudged_rows
-
-    @property
-    def expected_false_alarms(self) -> float:
-        """Mean number of false alarms expected so far."""
-        return self.pipeline.expected_false_alarms
+        return bool(self._sample_units.converted)
 
     @property
     def promise(self) -> Promise | None:
@@ -479,41 +457,12 @@ class Monitor:
         return dict.fromkeys(never_came, NO_VALUE) | self.pipeline.evaluation.left_out
 
     @property
-    def refused_trainings(self) -> int:
-        """Number of refused trainings."""
-        return self.pipeline.refused_trainings
-
-    @property
     def notes(self) -> list[str]:
         """Notes to log; the caller empties the list."""
         notes, failures = self.pipeline.evaluation.notes, self.failures.notes
         notes += failures
         failures.clear()
         return notes
-
-    # --- replay of timeouts ----------------------------------------------------------------------------------
-
-    @property
-    def _silence(self) -> SilenceCheck:
-        return self.pipeline.evaluation.signals.silence
-
-    @property
-    def receipts_ns(self) -> tuple[int | None, int | None]:
-        """See `DataTimeout.receipts_ns`, of the plant."""
-        return self._silence.of_plant.receipts_ns
-
-    @receipts_ns.setter
-    def receipts_ns(self, receipts_ns: tuple[int | None, int | None]) -> None:
-        self._silence.of_plant.receipts_ns = receipts_ns
-
-    @property
-    def timeout_deadline_ns(self) -> int | None:
-        """Sample time at which the plant's data timeout expires; None if unknown."""
-        return self._silence.of_plant.deadline_ns()
-
-    def declare_timeout(self) -> list[Publication]:
-        """Declare a data timeout that was recorded, where the receive time expired it."""
-        return self._silence.declare_timeout()
 
     # --- rows ------------------------------------------------------------------------------------------------
 
@@ -552,23 +501,9 @@ class Monitor:
         if due_ns is None or not 0 <= due_ns - time_ns <= self._snapshot_ns:
             self._snapshot_due_ns = time_ns + self._snapshot_ns
             if due_ns is not None:
-                publications.extend(self._snapshots(time_ns))
+                publications.extend(self._guard("models", self.pipeline.snapshots, time_ns))
         if self.on_row_end is not None:
             self.on_row_end(time_ns, publications[before:])
-
-    def _snapshots(self, time_ns: int) -> list[Publication]:
-        try:
-            return self.pipeline.snapshots(time_ns)
-        except Exception as error:  # noqa: BLE001 # the plant's border, see `_on_row`
-            self._contain("models", error)
-            return []
-
-    def _check_timeout(self, now_ns: int) -> list[Publication]:
-        try:
-            return self._silence.check(now_ns)
-        except Exception as error:  # noqa: BLE001 # the plant's border, see `_on_row`
-            self._contain("silence", error)
-            return []
 
     # --- after an error of this software ---------------------------------------------------------------------
 
@@ -586,6 +521,14 @@ class Monitor:
             ),
         )
 
+    def _guard(self, stage: str, step: Callable[[int], list[Publication]], time_ns: int) -> list[Publication]:
+        """Publications of a step at a time; none after an error, which is contained."""
+        try:
+            return step(time_ns)
+        except Exception as error:  # noqa: BLE001 # the plant's border, see `_on_row`
+            self._contain(stage, error)
+            return []
+
     def _contain(self, stage: str, error: Exception) -> None:
         """Contain an error: count it and train again, as the pipeline's state may be inconsistent.
 
@@ -594,9 +537,9 @@ class Monitor:
         self.failures.add(stage, error, "the plant is learned again, its alarms stay")
         alarms = self.alarms.all_alarms()
         self._changes = deque(item for item in self._changes if item.at_ns is not None)  # findings on its training
-        notes, receipts_ns = self.pipeline.evaluation.notes, self.receipts_ns
+        notes, receipts_ns = self.pipeline.evaluation.notes, self.silence.of_plant.receipts_ns
         self.pipeline = self._new_pipeline(self.alarms)
-        self.pipeline.evaluation.notes, self.receipts_ns = notes, receipts_ns
+        self.pipeline.evaluation.notes, self.silence.of_plant.receipts_ns = notes, receipts_ns
         self._watching_since_ns = None
         self.resume_from_alarms(alarms)
 

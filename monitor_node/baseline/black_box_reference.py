@@ -15,6 +15,7 @@ from monitor_node.baseline.references import GATE, RowPrediction
 from monitor_node.ingest.sampling import TOLERANCE, regular_intervals
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
+from reactorwatch.errors import InputError
 from reactorwatch.identification.black_box.filter import MEMORY, BlackBoxFilter, BlackBoxState
 from reactorwatch.identification.black_box.fit import fit_black_box
 from reactorwatch.identification.black_box.model import BlackBoxModel
@@ -108,9 +109,11 @@ class BlackBoxReference:
             The reference, and the normalised residuals, scaled to the size of out-of-sample residuals; NaN if missing.
 
         Raises:
-            InputError: there are too few rows or too many signals.
+            InputError: there are too few rows or too many signals, or no output varies.
         """
         outputs = np.flatnonzero(np.isfinite(measured).any(axis=0)).tolist()
+        if not outputs:
+            raise InputError("outputs must vary in the training, none does")
         follows = np.concatenate([[False], regular_intervals(time_min)])
         smallest = np.array(smallest_sd)[outputs]
         model = fit_black_box(inputs, measured[:, outputs], follows, smallest, delay)

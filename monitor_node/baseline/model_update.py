@@ -8,8 +8,9 @@ same.
 from collections import deque
 from typing import NamedTuple
 
+from monitor_node.baseline.arx_fit import arx_structure
 from monitor_node.baseline.commands import is_command
-from monitor_node.baseline.predictor import ArxPredictor, arx_structure
+from monitor_node.baseline.predictor import ArxPredictor
 from monitor_node.baseline.references import ProcessReference
 from monitor_node.baseline.training import Training, TrainingResult
 from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, Finding, read_equations

@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from reactorwatch.arrays import Array
+
 Mask = NDArray[np.bool_]
 
 BLOCKS = 25

@@ -9,8 +9,8 @@ and the training counts as so many: a model that learned faster would learn a fa
 learned shortly before an alarm is taken back: its state becomes that of a copy that is `COPY_ROWS` to twice as many
 rows old.
 
-If the training has too few rows for the parameters, the models get fewer lags of the inputs, then no inputs, then fewer
-lags of the output (`simpler_structures`), and the adaptive model is updated with the rows of the training again.
+If the training has too few rows for the parameters, the models get a simpler structure (`arx_fit`), and the adaptive
+model is updated with the rows of the training again.
 
 Where these models are not the monitor's reference, rows are buffered, and the adaptive model is updated with all of
 them when it is read.
@@ -19,23 +19,28 @@ Signals are scaled by mean and spread of the first rows, so that the estimator w
 Snapshots are in the signals' own units.
 """
 
-from collections.abc import Iterator, Sequence
-from math import inf, isfinite, nan, sqrt
+from collections.abc import Sequence
+from math import isfinite, nan, sqrt
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec.structs import replace
-from numpy.typing import NDArray
 
+from monitor_node.baseline.arx_fit import (
+    arx_snapshot,
+    fit_arx,
+    fit_snapshot,
+    fitting_structure,
+    input_columns,
+    simpler_structures,
+)
 from monitor_node.baseline.training_record import check_training
-from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals
-from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
+from reactorwatch.arrays import Array
+from reactorwatch.contract.messages_pb2 import ModelSnapshot
 from reactorwatch.errors import InputError
-from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.recursion import RlsState
-from reactorwatch.identification.regressor import BufferState, RegressorBuffer, Rows, rows_of
+from reactorwatch.identification.regressor import BufferState, RegressorBuffer, Rows
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
 from reactorwatch.records.record import MINUTE_NS
@@ -44,16 +49,8 @@ from reactorwatch.spc.charts.parameters import ParameterState, ParameterT2
 from reactorwatch.spc.parameter_drift import learn
 from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
 
-Array = NDArray[np.float64]
-
 SCALING_ROWS = 50
 """Rows from which the scaling is made; there is no prediction before."""
-
-ROWS_A_PARAMETER = 10
-"""Least number of rows per parameter of the reference."""
-
-MOSTLY = 0.5
-"""Least share of the output's values that a simpler structure must predict; it is no cure for irregular rows."""
 
 MOST_BUFFERED = 1000
 """Buffered rows; memory stays bounded."""
@@ -150,7 +147,7 @@ class ArxPredictor:
 
     def _start(self, structure: Structure) -> None:
         """Start the adaptive model, and the scaling, with the next row."""
-        self._structure = structure
+        self._structure, self._inputs = structure, input_columns(structure)
         self._rls = RecursiveLeastSquares(structure.parameters, self._forgetting)
         self._buffer = RegressorBuffer(structure)
         self._first_rows: list[tuple[float, ...]] = []
@@ -301,37 +298,19 @@ class ArxPredictor:
             Residuals, shape (rows,), scaled to the size of out-of-sample residuals; NaN if missing. With too few rows
             for any structure there is no reference, and all are NaN.
         """
-        residual = np.full(time_min.size, nan)
-        self._simplify(time_min, inputs, outputs)
-        if self._scaling is None:
-            return residual
-        inputs, parameters = inputs[:, : self._structure.inputs], self._structure.parameters
-        rows = rows_of(self._structure, self._scaling.inputs(inputs), self._scaling.outputs(outputs[:, None]))
-        rows = _consecutive_rows(rows, time_min, self._structure.history)
-        if len(rows.outputs) < ROWS_A_PARAMETER * parameters:
-            return residual
-        y, spread = rows.outputs[:, 0], self._output_scale[1]
-        theta: Array = np.asarray(np.linalg.lstsq(rows.regressors, y, rcond=1e-10)[0], dtype=np.float64)
-        # With n parameters fitted to N rows, in-sample residuals are sqrt((N - n) / (N + n)) of out-of-sample ones.
-        in_sample = np.sqrt((len(y) - parameters) / (len(y) + parameters))
-        residual[rows.position] = spread * (y - rows.regressors @ theta) / in_sample
-        self._reference, self._fitted = theta, rows
-        given = rows.regressors[:, self._inputs]
-        self._ranges = np.array([given.min(axis=0), given.max(axis=0)]) if given.shape[1] else None
+        structure = fitting_structure(self._structure, time_min, inputs, outputs)
+        if structure != self._structure:
+            self._structure = structure
+            self.learn_again(time_min, inputs, outputs)
+        fit = None if self._scaling is None else fit_arx(structure, self._scaling, time_min, inputs, outputs)
+        if fit is None or self._scaling is None:
+            return np.full(time_min.size, nan)
+        self._reference, self._fitted, self._ranges = fit.parameters, fit.rows, fit.ranges
         if self._with_snapshots:
-            covariance = _covariance(rows.regressors, y, theta)
-            singular = np.linalg.svd(rows.regressors, compute_uv=False)
-            condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else inf
-            checks = check_training(self._structure, time_min, inputs, outputs, residual)
-            self._reference_model = self._snapshot(theta, covariance, condition, len(y), 1.0)
-            self._reference_model.checks.extend(checks)
-        return residual
-
-    @property
-    def _inputs(self) -> slice:
-        """Inputs in a regressor."""
-        first = self._structure.output_lags
-        return slice(first, first + self._structure.input_lags * self._structure.inputs)
+            self._reference_model = fit_snapshot(structure, self._scaling, fit)
+            given = inputs[:, : structure.inputs]
+            self._reference_model.checks.extend(check_training(structure, time_min, given, outputs, fit.residual))
+        return fit.residual
 
     def _extrapolation_sd(self, regressor: Array) -> float:
         if self._ranges is None or self._reference is None:
@@ -357,18 +336,6 @@ class ArxPredictor:
         for lag, coefficient in enumerate(self._reference[:lags].tolist(), start=1):
             response[lag:] -= coefficient
         return response
-
-    def _simplify(self, time_min: Array, inputs: Array, outputs: Array) -> None:
-        """Change to the largest structure for which the rows of the training suffice; the present one if none is."""
-        if _count_rows(self._structure, time_min, inputs, outputs) >= ROWS_A_PARAMETER * self._structure.parameters:
-            return
-        least = MOSTLY * np.count_nonzero(np.isfinite(outputs))
-        for structure in simpler_structures(self._structure):
-            rows = _count_rows(structure, time_min, inputs, outputs)
-            if rows >= max(least, ROWS_A_PARAMETER * structure.parameters):
-                self._structure = structure
-                self.learn_again(time_min, inputs, outputs)
-                return
 
     def learn_again(self, time_min: Array, inputs: Array, outputs: Array) -> None:
         """Update a new adaptive model with the rows of a training; arguments as for `fit_reference`."""
@@ -462,7 +429,10 @@ class ArxPredictor:
         if not rls.rows:
             return None
         covariance = self._weight * rls.parameter_covariance
-        return self._snapshot(rls.parameters, covariance, rls.condition, rls.rows, rls.forgetting)
+        assert self._scaling is not None
+        return arx_snapshot(
+            self._structure, self._scaling, rls.parameters, covariance, rls.condition, rls.rows, rls.forgetting
+        )
 
     def reference_snapshot(self) -> ModelSnapshot | None:
         """Snapshot of the reference, without a time; None before the fit."""
@@ -486,75 +456,3 @@ class ArxPredictor:
         self._scaling = scaling
         self._input_scales = list(zip(scaling.input_centres, scaling.input_spreads, strict=True))
         self._output_scale = scaling.output_centres[0], scaling.output_spreads[0]
-
-    def _snapshot(
-        self, scaled: Array, scaled_covariance: Array, condition: float, rows: int, forgetting: float
-    ) -> ModelSnapshot:
-        assert self._scaling is not None
-        matrix, shift = self._scaling.unscaling(self._structure)
-        values = matrix @ scaled + shift
-        deviations = standard_deviations(scaled_covariance, matrix)
-        return ModelSnapshot(
-            structure="arx",
-            order=self._structure.output_lags,
-            delay=self._structure.delay,
-            parameters=[
-                Parameter(name=name, value=value, sd=sd)
-                for name, value, sd in zip(self._structure.parameter_names(), values, deviations, strict=True)
-            ],
-            rows=rows,
-            forgetting=forgetting,
-            excitation=1.0 / condition,
-            condition=condition,
-        )
-
-
-def arx_structure(config: MonitorConfig) -> Structure:
-    """Structure of the identified models that the settings ask for."""
-    return Structure.of_order(config.order, config.delay, inputs=len(config.inputs))
-
-
-def simpler_structures(structure: Structure) -> Iterator[Structure]:
-    """Structures with fewer parameters, the largest first.
-
-    They have fewer lags of the inputs, then no inputs, then fewer lags of the output.
-
-    >>> [(item.output_lags, item.inputs and item.input_lags) for item in simpler_structures(Structure.of_order(2))]
-    [(2, 1), (2, 0), (1, 0)]
-    """
-    if structure.inputs:
-        for lags in range(structure.input_lags - 1, 0, -1):
-            yield replace(structure, input_lags=lags)
-        yield (structure := replace(structure, inputs=0))
-    for lags in range(structure.output_lags - 1, 0, -1):
-        yield replace(structure, output_lags=lags)
-
-
-def fewest_rows(structure: Structure) -> int:
-    """Least number of consecutive rows for a reference of a structure."""
-    return structure.history + ROWS_A_PARAMETER * structure.parameters
-
-
-def _count_rows(structure: Structure, time_min: Array, inputs: Array, outputs: Array) -> int:
-    """Number of rows of a training that a model can be fitted to."""
-    rows = rows_of(structure, inputs[:, : structure.inputs], outputs)
-    return len(_consecutive_rows(rows, time_min, structure.history).outputs)
-
-
-def _consecutive_rows(rows: Rows, time_min: Array, history: int) -> Rows:
-    """Select the rows whose whole history is evenly spaced by one period, as `update` requires it."""
-    number = np.arange(time_min.size)
-    last_late = np.maximum.accumulate(np.where(np.append(False, regular_intervals(time_min)), 0, number))
-    kept = (number - last_late)[rows.position] >= history
-    return Rows(rows.regressors[kept], rows.outputs[kept], rows.position[kept])
-
-
-def _covariance(regressors: Array, outputs: Array, theta: Array) -> Array:
-    """Least-squares covariance of the parameters; NaN if the rows do not determine them."""
-    residual = outputs - regressors @ theta
-    variance = float(residual @ residual) / max(len(outputs) - theta.size, 1)
-    gram = regressors.T @ regressors
-    try:
-        return np.asarray(variance * np.linalg.inv(gram))
-    except np.linalg.LinAlgError:
-        return np.full(gram.shape, nan)

@@ -162,7 +162,7 @@ class PlantPromise:
         else:
             found = f"{_count(check.found)}, {check.expected:.2g} promised"
             parts = [
-                (f"in the second half of its training, judged by the first, {found}: " if check.rows else "")
+                (f"in the second half of its training, judged by the first, {found}: " if check.found else "")
                 + "this plant wanders, its model errs after moves of the inputs, or its training has not seen enough of"
                 f" it; from this training {describe_rate(self.can_keep_per_30_days)} can be promised; {REMEDY}"
             ]

@@ -12,9 +12,9 @@ from math import isfinite, nan, sqrt
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monitor_node.ingest.sampling import missing_in_intervals
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
 from reactorwatch.kalman.noise_estimation import NoiseFit, fit_noise
@@ -22,8 +22,6 @@ from reactorwatch.kalman.uncertain_model import is_disturbance, learned_paramete
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import StoredState
-
-Array = NDArray[np.float64]
 
 GATE = 6.0
 """Standard deviations beyond which a residual does not correct the filter until the next one confirms it."""

@@ -16,26 +16,25 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
+from monitor_node.baseline.arx_fit import ROWS_A_PARAMETER, arx_structure, fewest_rows
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.move_check import AfterMoves, compare_after_moves
 from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
-from monitor_node.baseline.predictor import ROWS_A_PARAMETER, ArxPredictor, arx_structure, fewest_rows
+from monitor_node.baseline.predictor import ArxPredictor
 from monitor_node.baseline.references import ArxReference, ProcessReference, Reference
 from monitor_node.baseline.resolution import resolution_sd
 from monitor_node.baseline.signal_range import possible_ranges
 from monitor_node.baseline.training_rows import TrainingRows
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals
+from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.prewhitening import Prewhitening, learn
 from reactorwatch.spc.step_test import ROWS as STEP_ROWS
-
-Array = NDArray[np.float64]
 
 FEWEST_ROWS = 50
 """Least number of residuals; the training continues until there are as many."""
@@ -62,6 +61,9 @@ USUAL_SHARE = 0.9
 
 NO_VALUE = "no value of it has come"
 """Reason for leaving a signal without values out."""
+
+FEWEST_MOVES = 5
+"""Moves of an input without which nothing checks how a model without equations follows it."""
 
 NOTHING_LEARNED = Prewhitening(0.0, (), 1.0, FEWEST_ROWS, 0.5 / FEWEST_ROWS, 0.0)
 """Prewhitening of an output that is left out and not evaluated."""
@@ -199,6 +201,8 @@ class Training(TrainingRows):
                 name="training", result=refused or _screening_summary(outputs, time_min, screenings, evaluated) or "ok"
             )
         ]
+        if not isinstance(reference, ProcessReference):
+            self._weakness = _few_moves(self._config.inputs, inputs) or self._weakness
         if self._weakness:
             checks.append(Check(name=BlackBoxReference.kind, result=self._weakness))
         if self._without_black_box and self._config.reference == "black-box":
@@ -373,6 +377,22 @@ def _prewhiten(z: Array, learned: Prewhitening) -> Array:
         e[lag:] -= coefficient * z[:-lag]
         e[:lag] = np.nan
     return np.asarray(e / learned.sd)
+
+
+def _few_moves(names: tuple[str, ...], inputs: Array) -> str:
+    """Reason why the training cannot show how the outputs follow an input that hardly ever moved; empty if it can."""
+    counts = np.count_nonzero(np.nan_to_num(np.diff(inputs, axis=0)), axis=0).tolist()
+    few = [
+        f"{name} ({count}; {FEWEST_MOVES} are needed)"
+        for name, count in zip(names, counts, strict=True)
+        if 0 < count < FEWEST_MOVES
+    ]
+    if not few:
+        return ""
+    return (
+        f"the training has too few moves of {', '.join(few)}: at other set points false alarms may be more than "
+        "promised; train over more set points"
+    )
 
 
 def _predicts_as_well(process: Array, identified: Array) -> bool:

@@ -1,16 +1,12 @@
 """Checks of the rows and the residuals of a training."""
 
-import numpy as np
-from numpy.typing import NDArray
-
+from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.errors import InputError
 from reactorwatch.identification.excitation import check_record
 from reactorwatch.identification.identify import WORST_MINUS_LOG10_P
 from reactorwatch.identification.residual_tests import ResidualTest, independence, whiteness
 from reactorwatch.identification.structure import Structure
-
-Array = NDArray[np.float64]
 
 
 def check_training(

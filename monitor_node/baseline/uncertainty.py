@@ -13,10 +13,10 @@ from math import nan
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from monitor_node.baseline.outlier_blocks import screen_baseline
 from monitor_node.baseline.references import GATE, fit_training_noise, output_indices
+from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.whiteness import minus_log10_p
 from reactorwatch.kalman.ekf import Filter, FilterState
 from reactorwatch.kalman.innovations import FilterResult
@@ -31,8 +31,6 @@ from reactorwatch.kalman.uncertain_model import (
     widen_model,
 )
 from reactorwatch.process.model import ProcessModel
-
-Array = NDArray[np.float64]
 
 LEAST_ROWS = 100
 """Number of values of each output below which nothing is sought."""

@@ -19,13 +19,12 @@ have (`resume`). For those it resumes from their states.
 Nothing here reads a clock or does I/O.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
 
-from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.admission import PROVEN_MESSAGES, PROVEN_ROWS, UnverifiedPlants
+from monitor_node.fleet.admission import PROVEN_MESSAGES, PROVEN_ROWS, PlantRegister
+from monitor_node.fleet.callbacks import NO_CALLBACKS, Callbacks
 from monitor_node.fleet.handed_over_alarms import HandedOverAlarms, alarm_of
 from monitor_node.fleet.recently_adopted import RecentlyAdopted
 from monitor_node.fleet.sharding import ShardGroup
@@ -43,37 +42,8 @@ from reactorwatch.records.record import NEVER_NS
 PRESUME_GONE_NS = 10_000_000_000
 """Time after the start, when a shard without a monitor is presumed gone."""
 
-MOST_PLANTS = 100_000
-
 MOST_HELD = 500_000
 """Messages buffered in a pause; with more they are evaluated, as late alarms are worse than alarms twice."""
-
-
-class Callbacks(NamedTuple):
-    """Functions through which a fleet's monitor reaches the world; by default none does anything.
-
-    Attributes:
-        request_history: called with a plant to adopt, and True if another owned it until now; returns True if its
-            history will be passed to `on_history`. If not, the plant is adopted at once.
-        store: called with a released plant and its state.
-        unusable: called with a plant whose state is unusable, and the reason; returns a note on the state.
-        put_back: called with a plant without a usable state, and its new monitor; returns True if the monitor was
-            restored from a state that had been kept aside.
-        claimed_elsewhere: returns True if another monitor has claimed a plant since it was adopted here.
-        on_ownership: called with True when a plant is adopted, and with False when it is released.
-        diagnose: called with an own plant and the diagnosis of its training, which is passed to `on_finding`.
-    """
-
-    request_history: Callable[[str, bool], bool] = lambda _plant, _taken_over: False
-    store: Callable[[str, State], None] = lambda _plant, _state: None
-    unusable: Callable[[str, InputError], str] = lambda _plant, _why: ""
-    put_back: Callable[[str, Monitor], bool] = lambda _plant, _monitor: False
-    claimed_elsewhere: Callable[[str], bool] = lambda _plant: False
-    on_ownership: Callable[[str, bool], None] = lambda _plant, _ours: None
-    diagnose: Callable[[str, DiagnosisJob], None] = lambda _plant, _job: None
-
-
-NO_CALLBACKS = Callbacks()
 
 
 class FleetMonitor:
@@ -90,6 +60,9 @@ class FleetMonitor:
 
     Raises:
         InputError: the settings are inconsistent.
+
+    Attributes:
+        watched: the own plants with their monitors.
     """
 
     def __init__(
@@ -105,21 +78,20 @@ class FleetMonitor:
     ) -> None:
         self._shards, self._callbacks = shards, callbacks
         all_kinds = (*kinds, PlantKind(ANY, config, model))
-        self._watched: WatchedPlants | WatchedKinds = (
+        self.watched: WatchedPlants | WatchedKinds = (
             WatchedKinds(all_kinds, start_ns, points=points, diagnose=callbacks.diagnose)
             if kinds
             else WatchedPlants(config, start_ns, model, points=points, diagnose=callbacks.diagnose)
         )
         self._pending = PendingPlants()
         self._presume_gone_ns: int | None = start_ns + PRESUME_GONE_NS
-        self._registered: dict[str, None] = {}  # all plants, with any owner
-        self._unverified = UnverifiedPlants()
+        self._register = PlantRegister()
         configs = [kind.config for kind in all_kinds]
         self._signals = tuple(
             dict.fromkeys(name for item in configs for name in (*item.signals, *item.carried_signals))
         )
         self._plants: dict[str, str] = {}  # plants that are not quiet, by key of a sample
-        self._handed_over, self._recent = HandedOverAlarms(self._watched.alarms), RecentlyAdopted()
+        self._handed_over, self._recent = HandedOverAlarms(self.watched.alarms), RecentlyAdopted()
         self._paused_messages: list[Encoded] | None = None  # buffered in a pause
         self._paused_histories: list[PlantHistory] = []
 
@@ -128,12 +100,12 @@ class FleetMonitor:
     @property
     def plants(self) -> list[str]:
         """The own plants."""
-        return self._watched.plants
+        return self.watched.plants
 
     @property
     def quiet(self) -> list[str]:
         """The own plants in packed form."""
-        return self._watched.quiet
+        return self.watched.quiet
 
     def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
         """Process the liveliness token of a plant's node or of another monitor."""
@@ -155,7 +127,7 @@ class FleetMonitor:
         if past.plant not in self._pending:
             return []
         if past.state is not None:
-            self._unverified.verify(past.plant)
+            self._register.verify(past.plant)
         messages = self._pending.end(past.plant, past.messages)
         self._handed_over.on_history(past.plant, past.alarms)
         self.adopt(past.plant, past.state, now_ns)
@@ -183,7 +155,7 @@ class FleetMonitor:
                 state is noted, and counts as none.
             now_ns: present time.
         """
-        monitor = self._watched.new_monitor(plant, now_ns)
+        monitor = self.watched.new_monitor(plant, now_ns)
         unusable = kept = ""
         if state is not None:
             try:
@@ -198,8 +170,8 @@ class FleetMonitor:
                 self._callbacks.store(plant, monitor.to_bytes())  # or the folder would not list the plant
         elif unusable:
             monitor.notes.append(f"{unusable}{kept}")
-        self._watched.add(plant, monitor)
-        self._registered[plant] = None
+        self.watched.add(plant, monitor)
+        self._register.add(plant)
         self._callbacks.on_ownership(plant, True)
 
     def _timeouts_after(self, plant: str, monitor: Monitor) -> list[Alarm]:
@@ -208,7 +180,7 @@ class FleetMonitor:
 
     def release(self, plant: str) -> State | None:
         """Release a plant; returns its state for the next owner. None: it was not owned."""
-        monitor = self._watched.remove(plant)
+        monitor = self.watched.remove(plant)
         if monitor is None:
             return None
         self._callbacks.on_ownership(plant, False)
@@ -222,7 +194,7 @@ class FleetMonitor:
             now_ns: present time.
             withheld_ns: time of the first change of an alarm that was not published; None: all were.
         """
-        monitor = self._watched.remove(plant)
+        monitor = self.watched.remove(plant)
         if monitor is None:
             return
         self._handed_over.publish_ours(plant, monitor.alarms.all_alarms(), monitor.last_ns, withheld_ns)
@@ -272,14 +244,10 @@ class FleetMonitor:
             topic = keys.parse(message.key)
             if topic is None or topic.kind != keys.ALARM:
                 continue
-            alarm, own = alarm_of(message), self._watched.detach(topic.plant)
+            alarm, own = alarm_of(message), self.watched.detach(topic.plant)
             if alarm is not None and own is not None and alarm.time_ns > (own.last_ns or 0):
                 plants.add(topic.plant)
         return plants
-
-    def on_finding(self, plant: str, finding: Finding) -> None:
-        """Process the diagnosis of a plant's training; what it found holds from the plant's next row on."""
-        self._watched.on_finding(plant, finding)
 
     def monitor(self, plant: str) -> Monitor:
         """Monitor of a plant.
@@ -287,54 +255,42 @@ class FleetMonitor:
         Raises:
             InputError: the plant is not owned.
         """
-        monitor = self._watched.detach(plant)
+        monitor = self.watched.detach(plant)
         if monitor is None:
             raise InputError(f"plant {plant!r} is not watched here (there are: {', '.join(self.plants)})")
         return monitor
 
     def is_watched(self, plant: str) -> bool:
         """True if a plant is owned."""
-        return plant in self._watched
+        return plant in self.watched
 
     def is_pending(self, plant: str) -> bool:
         """True while a plant's history is requested."""
         return plant in self._pending
 
-    def active_monitor(self, plant: str) -> Monitor | None:
-        """Monitor of a plant; None if it is quiet, or not owned."""
-        return self._watched.active_monitor(plant)
-
     def state_of(self, plant: str) -> State:
         """State of a plant."""
-        return self._watched.state_of(plant)
+        return self.watched.state_of(plant)
 
     def alarms_of(self, plant: str) -> list[Alarm] | None:
         """Alarms of a plant; None for a quiet plant, whose alarms have not changed."""
-        own = self._watched.active_monitor(plant)
+        own = self.watched.active_monitor(plant)
         return None if own is None else own.alarms.all_alarms()
 
     def is_worth_storing(self, plant: str) -> bool:
         """True if a plant is verified and has rows."""
-        own = self._watched.active_monitor(plant)
-        return plant not in self._unverified and (own is None or own.rows > 0)
+        own = self.watched.active_monitor(plant)
+        return not self._register.is_unverified(plant) and (own is None or own.rows > 0)
 
     @property
     def evictions(self) -> int:
         """Number of unverified plants that were evicted."""
-        return self._unverified.evicted
-
-    def received_count(self, plant: str) -> int | None:
-        """Number of messages of a plant; None: it is not owned."""
-        return self._watched.received_count(plant)
-
-    def count_not_stored(self, plant: str) -> None:
-        """Count a failure to store the state of a plant."""
-        self._watched.count_not_stored(plant)
+        return self._register.evicted
 
     @property
     def registered_plants(self) -> int:
         """Number of registered plants, with any owner."""
-        return len(self._registered)
+        return len(self._register)
 
     def register(self, plant: str, now_ns: int, *, verified: bool) -> None:
         """Register a plant, if it is new.
@@ -344,28 +300,14 @@ class FleetMonitor:
             now_ns: present time.
             verified: True if the plant certainly exists; if not, see `admission`.
         """
-        if plant in self._registered:
-            if verified:
-                self._unverified.verify(plant)
-            return
-        if len(self._registered) >= MOST_PLANTS or not (verified or self._unverified.has_capacity):
-            return
-        try:
-            keys.check_plant(plant)
-        except ValueError:
-            return
-        self._registered[plant] = None
-        if not verified:
-            self._unverified.add(plant, now_ns)
-        if self._shards.is_ours(plant):
+        if self._register.register(plant, now_ns, verified=verified) and self._shards.is_ours(plant):
             self._start_adoption(plant, now_ns, taken_over=False)
 
     def _evict(self, plant: str) -> None:
-        """Remove a plant."""
-        del self._registered[plant]
+        """Remove a plant that is not registered any more."""
         if plant in self._pending:
             self._pending.end(plant)
-        if self._watched.remove(plant) is not None:
+        if self.watched.remove(plant) is not None:
             self._callbacks.on_ownership(plant, False)
         self._handed_over.remove(plant)
         self._remove_keys(plant)
@@ -376,9 +318,9 @@ class FleetMonitor:
 
     def _reassign(self, now_ns: int) -> None:
         """Adopt plants that are owned now, and release those that are not."""
-        for plant in list(self._registered):
+        for plant in self._register.plants:
             ours = self._shards.is_ours(plant)
-            watched, arriving = plant in self._watched, plant in self._pending
+            watched, arriving = plant in self.watched, plant in self._pending
             if ours and not (watched or arriving):
                 self._start_adoption(plant, now_ns, taken_over=True)
             elif arriving and not ours:
@@ -410,12 +352,12 @@ class FleetMonitor:
         return self._process(messages, now_ns)
 
     def _process(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
-        publications, messages, touched = self._watched.on_messages(messages, now_ns)
+        publications, messages, touched = self.watched.on_messages(messages, now_ns)
         publications = self._handed_over.filter_new(publications)
         for message in messages:
             plant = self._plants.get(message.key) or self._plant_of(message, now_ns)
-            own = self._watched.active_monitor(plant)
-            messages_of = self._unverified.on_message(plant, now_ns) if plant in self._unverified else 0
+            own = self.watched.active_monitor(plant)
+            messages_of = self._register.on_message(plant, now_ns) if self._register.is_unverified(plant) else 0
             if own is not None:
                 touched.add(plant)
                 if self._recent.is_repeat(plant, message, now_ns):
@@ -425,12 +367,12 @@ class FleetMonitor:
             elif plant in self._pending:
                 self._pending.add(plant, message)
             elif messages_of >= PROVEN_MESSAGES:
-                self._unverified.verify(plant)
-        for plant in [plant for plant in touched if plant in self._unverified]:
-            own = self._watched.active_monitor(plant)
+                self._register.verify(plant)
+        for plant in [plant for plant in touched if self._register.is_unverified(plant)]:
+            own = self.watched.active_monitor(plant)
             if own is not None and own.rows >= PROVEN_ROWS:
-                self._unverified.verify(plant)
-        for plant in self._watched.settle(touched):
+                self._register.verify(plant)
+        for plant in self.watched.settle(touched):
             self._remove_keys(plant)
         return self._confirm(publications, now_ns)
 
@@ -448,17 +390,17 @@ class FleetMonitor:
             return ""
         self.register(topic.plant, now_ns, verified=False)
         if topic.kind == keys.ALARM:
-            if topic.plant in self._registered and topic.plant not in self._watched:  # else it may be an own alarm
+            if topic.plant in self._register and topic.plant not in self.watched:  # else it may be an own alarm
                 self._handed_over.on_message(topic.plant, message)
             return ""
-        if topic.plant in self._registered and topic.name in self._signals:
+        if topic.plant in self._register and topic.name in self._signals:
             self._plants[message.key] = topic.plant
         return topic.plant
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
         """Execute an operator's command; None as reply: another monitor owns the plant."""
         plant = _plant_of_key(question.key)
-        monitor = self._watched.detach(plant) if not self.paused else None
+        monitor = self.watched.detach(plant) if not self.paused else None
         if monitor is not None and self._callbacks.claimed_elsewhere(plant):
             self.rejoin(plant, now_ns)
             return None, []
@@ -472,15 +414,15 @@ class FleetMonitor:
             self._presume_gone_ns = None
             if self._shards.drop_unseen():
                 self._reassign(now_ns)
-        for plant in self._unverified.evict(now_ns):
+        for plant in self._register.evict(now_ns):
             self._evict(plant)
-        return self._confirm(self._watched.on_tick(now_ns), now_ns)
+        return self._confirm(self.watched.on_tick(now_ns), now_ns)
 
     def next_tick_ns(self) -> int:
         """Earliest deadline of the plants."""
         if self.paused:
             return NEVER_NS
-        due_ns = self._watched.next_tick_ns()
+        due_ns = self.watched.next_tick_ns()
         return due_ns if self._presume_gone_ns is None else min(due_ns, self._presume_gone_ns)
 
     @property
@@ -490,21 +432,13 @@ class FleetMonitor:
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish the health of all plants' monitors for the last time."""
-        return self._watched.on_stop(now_ns)
+        return self.watched.on_stop(now_ns)
 
     def copy(self, plant: str, name: str) -> None:
         """Adopt a copy of a quiet plant, for trials with many plants."""
-        self._watched.copy(plant, name)
-        self._registered[name] = None
+        self.watched.copy(plant, name)
+        self._register.add(name)
         self._callbacks.on_ownership(name, True)
-
-    def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
-        """Notes to log: plant and line."""
-        return self._watched.reports(now_ns)
-
-    def tracebacks(self) -> Iterator[tuple[str, str]]:
-        """Plant and traceback of each contained error that was reported."""
-        return self._watched.tracebacks()
 
 
 def _plant_of_key(key: str) -> str:

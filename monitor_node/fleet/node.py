@@ -13,8 +13,9 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import COMMANDS, Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker
 from monitor_node.fleet import sharding
+from monitor_node.fleet.callbacks import Callbacks
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.monitor import Callbacks, FleetMonitor
+from monitor_node.fleet.monitor import FleetMonitor
 from monitor_node.fleet.partition import LeaseMonitor
 from monitor_node.fleet.sharding import ShardGroup
 from monitor_node.fleet.watched_kinds import ANY, PlantKind, WatchedKinds
@@ -203,7 +204,7 @@ class FleetNode(FleetMonitor):
         refusal = self._rate.check(sender_name(question), now_ns)
         if refusal is not None:
             self._commands_refused.add("too_many_commands", refusal)
-            if (own := self.active_monitor(topic.plant)) is not None:  # a quiet plant stays packed
+            if (own := self.watched.active_monitor(topic.plant)) is not None:  # a quiet plant stays packed
                 own.rejects.add("too_many_commands", refusal)
             return CommandReply(accepted=False, text=refusal), []
         reply, publications = super().on_command(question, now_ns)
@@ -222,13 +223,13 @@ class FleetNode(FleetMonitor):
             self._store_due(now_ns)
             for plant, finding in self._worker.pop_findings():
                 log.info("training diagnosed", plant=plant, verdict=finding.verdict)
-                self.on_finding(plant, finding)
+                self.watched.on_finding(plant, finding)
         publications += self._log_alarms(super().on_tick(now_ns))
         if now_ns >= self._report_ns:
             self._report_ns = now_ns + LOG_INTERVAL_NS
-            for plant, line in self.reports(now_ns):
+            for plant, line in self.watched.reports(now_ns):
                 log.warning(line, plant=plant)
-            for plant, text in self.tracebacks():
+            for plant, text in self.watched.tracebacks():
                 log.debug("traceback", plant=plant, traceback=text)
             if (refused := self._commands_refused.report(now_ns)) is not None:
                 log.warning(refused)
@@ -326,24 +327,24 @@ class FleetNode(FleetMonitor):
         for plant in self._states.pop_lost():
             log.info("another monitor has stored a newer state", plant=plant)
             self.rejoin(plant, now_ns)
-        due = [plant for plant in self._changed if self.received_count(plant) is not None]
+        due = [plant for plant in self._changed if self.watched.received_count(plant) is not None]
         self._changed.clear()
         if not self._round and not 0 <= now_ns - self._round_ns < self._every_ns:
             self._round, self._round_ns = self.plants, now_ns
         checked = 0
         while self._round and checked < MOST_STORED and self._states.has_room:
             plant, checked = self._round.pop(), checked + 1
-            if self.received_count(plant) not in (None, self._stored_at.get(plant)):
+            if self.watched.received_count(plant) not in (None, self._stored_at.get(plant)):
                 due.append(plant)
         for plant in filter(self.is_worth_storing, due):
             self._states.put(plant, self.state_of(plant))
-            self._stored_at[plant] = self.received_count(plant) or 0
+            self._stored_at[plant] = self.watched.received_count(plant) or 0
 
     def _count_failures(self) -> None:
         """Count failures to store states, and log each reason once."""
         failures = self._states.pop_failures() if self._states is not None else []
         for plant, why in failures:
-            self.count_not_stored(plant)
+            self.watched.count_not_stored(plant)
             self._stored_at.pop(plant, None)
             if self._logged.get(plant) != why:
                 self._logged[plant] = why

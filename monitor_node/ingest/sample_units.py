@@ -18,10 +18,16 @@ class SampleUnits:
     Args:
         wanted: unit by signal; samples of another signal stay as they are.
         declared: unit by signal of samples that name none, where it is not the wanted one.
+
+    Attributes:
+        plain: newest unit by signal that needed no conversion.
+        converted: signals whose newest sample in another unit than `plain` was converted.
     """
 
     def __init__(self, wanted: Mapping[str, str], declared: Mapping[str, str]) -> None:
         self._wanted, self._declared = dict(wanted), dict(declared)
+        self.plain: dict[str, str] = {}
+        self.converted: set[str] = set()
         self._conversions: dict[tuple[str, str], tuple[float, float]] = {}
 
     def convert(self, signal: str, unit: str, value: float) -> tuple[float, str]:
@@ -35,6 +41,15 @@ class SampleUnits:
         Raises:
             InputError: the unit measures another quantity.
         """
+        value, wanted = self._convert(signal, unit, value)
+        if wanted == unit:
+            self.plain[signal] = unit
+            self.converted.discard(signal)
+        else:
+            self.converted.add(signal)
+        return value, wanted
+
+    def _convert(self, signal: str, unit: str, value: float) -> tuple[float, str]:
         wanted = self._wanted.get(signal)
         if wanted is None or unit == wanted:
             return value, unit

@@ -60,11 +60,12 @@ def sums_of(w: Array, measured: NDArray[np.bool_]) -> np.void:
 
 def log_evidence_of_sums(sums: np.void) -> float:
     """Evidence as `log_evidence_of_residual`, from the sums of one hypothesis."""
-    return _log_evidence(sums["square"], sums["count"])
+    return log_evidence_of_squares(sums["square"], sums["count"])
 
 
 @jit
-def _log_evidence(square: Array, count: Array) -> float:
+def log_evidence_of_squares(square: Array, count: Array) -> float:
+    """Evidence as `log_evidence_of_residual`, from these two fields of `sums_dtype`."""
     best, n_y = -inf, square.shape[1]
     for b in range(len(square)):
         total = n = 0.0

@@ -240,7 +240,11 @@ class Suspicion:
 
     def _may_look_early(self, since: int) -> bool:
         """Return true if a look may be taken because the rows contradict what the last one named."""
-        return 0 < LEAST_GROWTH * self._named_rows <= since < LOOKS[-1] and self._has_rows(since)
+        return self._is_early_look_useful(since) and self._has_rows(since)
+
+    def _is_early_look_useful(self, since: int) -> bool:
+        """Return true if the last look named a cause, and enough rows have come since."""
+        return 0 < LEAST_GROWTH * self._named_rows <= since < LOOKS[-1]
 
     def _has_rows(self, since: int) -> bool:
         """Return true if the rows for a look are known; late looks need rows that are not far apart."""
@@ -271,9 +275,10 @@ class Suspicion:
             self._live = None
             return []
         before, since = self._published, self._since or 0
-        is_unknown = max(before, key=before.__getitem__, default="") == UNKNOWN
-        if not (is_unknown or live.has_moved(WORTH_PUBLISHING - LEAST)):  # suspects below `LEAST` are not published
-            return []
+        if not live.has_moved(WORTH_PUBLISHING - LEAST):  # suspects below `LEAST` are not published
+            is_unknown = max(before, key=before.__getitem__, default="") == UNKNOWN
+            if not (is_unknown and self._is_early_look_useful(since)):
+                return []
         suspects = live.suspects()
         if suspects[0].cause == UNKNOWN and suspects[0].probability > CONVINCED and self._may_look_early(since):
             return self._look(time_ns, since)

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from monitor_node.baseline.training import TrainingResult
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.stage import SignalChecks
-from monitor_node.stages.charts import ChartWatch, count_chance_alarms
+from monitor_node.stages.chart_alarms import count_chance_alarms
+from monitor_node.stages.chart_design import ChartDesign
 from monitor_node.stages.drift import DriftWatch
 from monitor_node.stages.shift import NAME as SHIFT
 from monitor_node.stages.shift import ShiftWatch
@@ -38,14 +39,14 @@ class AlarmBudget:
 
     Args:
         config: settings of the monitor.
-        charts: charts of the plant.
+        charts: design of the plant's charts.
         signals: signal checks of the plant.
         shift: tests of lasting steps of the plant.
         drift: drift charts of the plant.
     """
 
     def __init__(
-        self, config: MonitorConfig, charts: ChartWatch, signals: SignalChecks, shift: ShiftWatch, drift: DriftWatch
+        self, config: MonitorConfig, charts: ChartDesign, signals: SignalChecks, shift: ShiftWatch, drift: DriftWatch
     ) -> None:
         self._asked = config.false_alarms_per_30_days
         self._charts, self._signals, self._shift, self._drift = charts, signals, shift, drift

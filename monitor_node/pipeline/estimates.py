@@ -40,6 +40,27 @@ def estimates(
             yield Publication(path, estimate)
 
 
+def chart_limits(
+    predictions: Sequence[float],
+    sds: Sequence[float],
+    scales: Sequence[float],
+    expected: Sequence[float],
+    widths: Sequence[float],
+) -> Iterator[tuple[float, float, float]]:
+    """Standard deviation of each residual, and limits about the value that the prewhitening filter expects.
+
+    Args:
+        predictions: prediction of each output.
+        sds: standard deviation of each prediction error.
+        scales: standard deviation of each prewhitened residual in the output's unit.
+        expected: residual that the prewhitening filter expects, in standard deviations.
+        widths: Shewhart limit of each output, in standard deviations.
+    """
+    for prediction, sd, scale, mean, width in zip(predictions, sds, scales, expected, widths, strict=True):
+        usual, reach = prediction + sd * mean, scale * width
+        yield scale, usual - reach, usual + reach
+
+
 def model_snapshots(
     config: MonitorConfig, predictors: Sequence[ArxPredictor], reference: Reference | None, checks: Sequence[Check]
 ) -> Iterator[list[ModelSnapshot]]:

@@ -4,7 +4,7 @@ An ordinary row is taken by the compiled step. Any other row passes the stages h
 A reference that learns does so while nothing is wrong: otherwise it would learn a fault as normal.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from math import isfinite, nan
 
 from monitor_node.alarms.annunciator import Annunciator
@@ -25,7 +25,7 @@ from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingState
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.pipeline.budget import AlarmBudget
-from monitor_node.pipeline.estimates import estimates
+from monitor_node.pipeline.estimates import chart_limits, estimates
 from monitor_node.pipeline.identified_models import IdentifiedModels
 from monitor_node.pipeline.ordinary_rows import OrdinaryRows
 from monitor_node.pipeline.pipeline_state import TrainedState
@@ -33,7 +33,8 @@ from monitor_node.pipeline.power import Watch
 from monitor_node.pipeline.promise_stage import PromiseStage
 from monitor_node.pipeline.row_step import EVENT, VIOLATING
 from monitor_node.signal_checks.stage import SignalChecks
-from monitor_node.stages.charts import ChartWatch, has_values_only
+from monitor_node.stages.chart_alarms import has_values_only
+from monitor_node.stages.charts import ChartWatch
 from monitor_node.stages.drift import DriftWatch
 from monitor_node.stages.shift import ShiftWatch
 from reactorwatch.contract.codec import Publication
@@ -93,7 +94,7 @@ class Evaluation:
         self._use_ranges()
         self._drift = DriftWatch(config, board, publish=self._points)
         self._shift = ShiftWatch(config, board)
-        self._budget = AlarmBudget(config, self._charts, self.signals, self._shift, self._drift)
+        self._budget = AlarmBudget(config, self._charts.design, self.signals, self._shift, self._drift)
         self._suspicion: Suspicion | None = None
         self._whiteners: list[Prewhitener] = []
         self._whitened_sds: list[float] = []
@@ -204,7 +205,7 @@ class Evaluation:
             again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
         """
         self._leave_out(trained.left_out)
-        unmade = self._charts.choose(self._evaluated, trained.e, trained.values)
+        unmade = self._charts.design.choose(self._evaluated, trained.e, trained.values)
         self._shift.is_active = trained.responses is not None and not has_values_only(self._config)
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
@@ -236,7 +237,7 @@ class Evaluation:
             trained.reference,
             self._models.predictors,
             trained.learned,
-            self._charts.detectors(trained.learned, trained.e, self._arl0),
+            self._charts.design.detectors(trained.learned, trained.e, self._arl0),
             self._shift.sensitivities,
             self._evaluated,
             dict(zip(self._config.outputs, units, strict=True)),
@@ -349,7 +350,7 @@ class Evaluation:
         predictions, sds, z, expected = self.ordinary.predictions
         if self._points:
             scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
-            limits = self._limits(predictions, sds, scales, expected)
+            limits = chart_limits(predictions, sds, scales, expected, self._charts.widths)
             row.publications.extend(estimates(row, self._models.paths, predictions, limits))
             row.publications.extend(self._charts.points(row.time_ns, self.ordinary.points))
         if self._shift.is_active:
@@ -408,7 +409,7 @@ class Evaluation:
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             expected = [whitener.expected_value() for whitener in self._whiteners]
-            limits = self._limits(predictions, sds, scales, expected)
+            limits = chart_limits(predictions, sds, scales, expected, self._charts.widths)
             publications.extend(estimates(row, self._models.paths, predictions, limits))
         e = innovations(self.ordinary.numbers["whiteners"][0], z)
         self.rows_watched += 1
@@ -426,15 +427,6 @@ class Evaluation:
         self._set_learning()
         self._keep_incident(row)
         self._note_unjudged(reference)
-
-    def _limits(
-        self, predictions: Sequence[float], sds: Sequence[float], scales: Sequence[float], expected: Sequence[float]
-    ) -> Iterator[tuple[float, float, float]]:
-        """Standard deviation of each residual, and limits about the value that the prewhitening filter expects."""
-        of_outputs = zip(predictions, sds, scales, expected, self._charts.widths, strict=True)
-        for prediction, sd, scale, mean, width in of_outputs:
-            usual, reach = prediction + sd * mean, scale * width
-            yield scale, usual - reach, usual + reach
 
     def _update_drift(self, row: MeasuredRow) -> None:
         if self._drift.wanted:

@@ -9,13 +9,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from monitor_node.baseline.arx_bank import ArxBank, ArxBankState
-from monitor_node.baseline.predictor import ArxPredictor, PredictorState, arx_structure
+from monitor_node.baseline.arx_fit import arx_structure
+from monitor_node.baseline.predictor import ArxPredictor, PredictorState
 from monitor_node.baseline.references import ArxReference, Reference
 from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import MeasuredRow
 from monitor_node.pipeline.estimates import estimates
-from monitor_node.stages.charts import has_values_only
+from monitor_node.stages.chart_alarms import has_values_only
 from reactorwatch.contract import keys
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import unpack_numbers, unpack_times

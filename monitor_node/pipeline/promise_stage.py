@@ -15,7 +15,7 @@ from monitor_node.health.failures import Failures
 from monitor_node.health.message import NODE
 from monitor_node.pipeline.power import Watch, state_power
 from monitor_node.signal_checks.stage import SignalChecks
-from monitor_node.stages.charts import alarm_names
+from monitor_node.stages.chart_alarms import alarm_names
 from monitor_node.stages.shift import NAME as SHIFT
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys

@@ -42,7 +42,7 @@ from monitor_node.pipeline.row_frame import (
 from monitor_node.signal_checks.catalogue import CHECKS
 from monitor_node.signal_checks.stuck import is_stuck, take_reading
 from monitor_node.signal_checks.timeout import update_timeout
-from monitor_node.stages.charts import alarm_names
+from monitor_node.stages.chart_alarms import alarm_names
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.codegen.numba_kernel import Entry, call_at, jit

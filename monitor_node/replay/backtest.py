@@ -46,7 +46,7 @@ class Backtest:
         span_ns: time span of the rows, summed over the runs of the plant.
         runs: number of runs of the plant: one more than restarts of the plant or its clock.
         watching_since_ns: time of the first evaluated row; None if the record is shorter than the training.
-        expected_false_alarms: see `Monitor.expected_false_alarms`.
+        expected_false_alarms: see `PlantPipeline.expected_false_alarms`.
         alarm_messages: every change of an alarm, in order.
         refused: number of rejected messages by reason.
         notes: notes on the training.
@@ -177,14 +177,14 @@ def run(
         span_ns=monitor.span_ns,
         runs=1 + monitor.restarts,
         watching_since_ns=monitor.watching_since_ns,
-        expected_false_alarms=monitor.expected_false_alarms,
+        expected_false_alarms=monitor.pipeline.expected_false_alarms,
         alarm_messages=alarms,
         refused=dict(monitor.rejects.by_reason),
         notes=[*(trained.notes if trained is not None else ()), *monitor.notes],
         left_out=monitor.excluded_signals,
-        refused_trainings=monitor.refused_trainings,
+        refused_trainings=monitor.pipeline.refused_trainings,
         reference=monitor.pipeline.newest_reference or None,
-        noise_levels=monitor.noise_levels,
+        noise_levels=monitor.pipeline.noise_levels,
         baseline=monitor.baseline,
         training_rows=monitor.pipeline.training_rows if trained is None else trained.rows,
         promise=monitor.promise,

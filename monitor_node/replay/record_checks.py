@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from monitor_node.baseline.predictor import arx_structure, fewest_rows
+from monitor_node.baseline.arx_fit import arx_structure, fewest_rows
 from monitor_node.baseline.training import FEWEST_ROWS
 from monitor_node.config import MonitorConfig
 from reactorwatch.errors import InputError

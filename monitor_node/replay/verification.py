@@ -183,12 +183,16 @@ class _Replay:
 
     def _is_due(self, alarm: Alarm) -> bool:
         """True if an operator's action or a data timeout was before the next row."""
-        now_ns = self.monitor.timeout_deadline_ns if is_timeout(alarm) else self.monitor.alarms.time_ns
+        now_ns = self.monitor.silence.of_plant.deadline_ns() if is_timeout(alarm) else self.monitor.alarms.time_ns
         return now_ns is not None and alarm.time_ns <= now_ns
 
     def _replay_event(self, alarm: Alarm) -> list[Publication]:
         if is_timeout(alarm):
-            return self.monitor.declare_timeout() if alarm.time_ns == self.monitor.timeout_deadline_ns else []
+            return (
+                self.monitor.silence.declare_timeout()
+                if alarm.time_ns == self.monitor.silence.of_plant.deadline_ns()
+                else []
+            )
         return self._act(alarm)
 
     def _act(self, alarm: Alarm) -> list[Publication]:

@@ -30,10 +30,10 @@ of their rate is an alarm (`spike_rate`). For tails heavier than exponential the
 but isolated far values are then what the signal has.
 """
 
+from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Sequence
 from math import ceil, isfinite, log, sqrt
-from statistics import median
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -113,6 +113,58 @@ class SpikeState(StoredState, frozen=True):
     usual: UsualSpikes | None = None
 
 
+class RecentValues:
+    """The newest values of a signal, `RECENT` at most, with their median and median absolute deviation.
+
+    They are also kept in ascending order, so that a row does not sort them.
+    """
+
+    def __init__(self) -> None:
+        self._values: deque[float] = deque()
+        self._ascending: list[float] = []
+
+    def __len__(self) -> int:
+        return len(self._ascending)
+
+    @property
+    def values(self) -> list[float]:
+        """The values, oldest first."""
+        return list(self._values)
+
+    def append(self, value: float) -> None:
+        """Add a finite value; the oldest one goes if there are too many."""
+        if len(self._values) == RECENT:
+            del self._ascending[bisect_left(self._ascending, self._values.popleft())]
+        self._values.append(value)
+        insort(self._ascending, value)
+
+    def clear(self) -> None:
+        """Remove all values."""
+        self._values.clear()
+        self._ascending.clear()
+
+    def median_and_deviation(self) -> tuple[float, float]:
+        """Median, and median absolute deviation from it; of at least one value."""
+        ordered, n = self._ascending, len(self._ascending)
+        half = n // 2
+        level = ordered[half] if n % 2 else (ordered[half - 1] + ordered[half]) / 2
+        # The values nearest to the median are neighbours: those from `low` to `low + half`, by bisection.
+        low, high = 0, n - half - 1
+        while low < high:
+            middle = (low + high) // 2
+            if level - ordered[middle] > ordered[middle + half + 1] - level:
+                low = middle + 1
+            else:
+                high = middle
+        below, above = level - ordered[low], ordered[low + half] - level
+        largest = max(below, above)
+        if n % 2:
+            return level, largest
+        if below > above:
+            return level, (largest + max(level - ordered[low + 1], above)) / 2
+        return level, (largest + max(below, ordered[low + half - 1] - level)) / 2
+
+
 class Spike:
     """Distinguishes spikes from changes in the standardised residuals of one signal.
 
@@ -135,7 +187,7 @@ class Spike:
         self.limit = positive("limit", limit)
         self._phase: Phase = "quiet"
         self._held = 0.0
-        self._recent: deque[float] = deque(maxlen=RECENT)
+        self._recent = RecentValues()
 
     @classmethod
     def from_state(cls, state: SpikeState) -> "Spike":
@@ -146,13 +198,14 @@ class Spike:
         """
         spike = cls(state.limit)
         spike._phase, spike._held = state.phase, finite(state.held)
-        spike._recent.extend(finite(z) for z in state.recent)
+        for z in state.recent:
+            spike._recent.append(finite(z))
         return spike
 
     @property
     def state(self) -> SpikeState:
         """A copy of the state."""
-        return SpikeState(self.limit, self._phase, self._held, list(self._recent))
+        return SpikeState(self.limit, self._phase, self._held, self._recent.values)
 
     @property
     def is_normal(self) -> bool:
@@ -176,9 +229,9 @@ class Spike:
             return self._decide(z)
         level, spread, is_decided = 0.0, 1.0, recent or self._phase in ("quiet", "changed")
         if len(recent) >= LEAST_RECENT:
-            level = median(recent)
+            level, deviation = recent.median_and_deviation()
             margin = 1.0 + ERRORS / sqrt(len(recent))
-            spread = max(1.0, margin * _TO_SD * median(abs(other - level) for other in recent))
+            spread = max(1.0, margin * _TO_SD * deviation)
         elif is_decided:
             recent.append(finite(z))
             self._phase, self._held = "changed", 0.0

@@ -13,39 +13,28 @@ from typing import NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from monitor_node.alarms.alarms import ChartAlarm, Explanation, SuspectedCause, chart_point
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig, PriorityName
 from monitor_node.ingest.alignment import MeasuredRow
+from monitor_node.stages.chart_alarms import ALL, alarm_names, has_values_only
+from monitor_node.stages.chart_design import ChartDesign
+from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.spc import false_alarm_budget
-from reactorwatch.spc.baseline import Baseline, complete_rows, memory_sds
 from reactorwatch.spc.charts.base import Chart, Judgement, Shown, SignalChart
 from reactorwatch.spc.charts.catalogue import chart
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.shewhart import designed_width
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalState
-from reactorwatch.spc.detection import Detector
 from reactorwatch.spc.joint_chart import JointChart
-from reactorwatch.spc.m_of_n import false_alarm_rates
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.training_errors import TrainingErrors
-from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
+from reactorwatch.spc.value_chart import ValueChart
 from reactorwatch.stored_state import StoredState
-
-Array = NDArray[np.float64]
-
-ALL = "all"
-"""Name in place of a signal for charts of all outputs together."""
 
 SD = "sd"
 """The unit of what charts show: standard deviations of the residual."""
-
-SUBSTITUTES = ("shewhart", "ewma")
-"""Charts of each output that are made where the settings have charts of values only, and none of them can be made."""
 
 MOST_ENTRIES = 3
 """Signals that an alarm names as possible entries of a disturbance."""
@@ -63,31 +52,6 @@ class ChartsState(StoredState, frozen=True):
     charts: dict[str, bytes]
     widths: list[float]
     passed: list[float]
-
-
-def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
-    """(chart, signal or `ALL`) of every alarm that the charts of a plant can raise."""
-    names: list[tuple[str, str]] = []
-    for name in config.charts:
-        kind = chart(name)
-        if issubclass(kind, SignalChart):
-            names += [(name, signal) for signal in config.outputs]
-        elif issubclass(kind, ValueChart) or (issubclass(kind, JointChart) and len(config.outputs) > 1):
-            names.append((name, ALL))
-    if has_values_only(config):
-        names += [(name, signal) for name in SUBSTITUTES for signal in config.outputs]
-    return names
-
-
-def has_values_only(config: MonitorConfig) -> bool:
-    """True if all charts of the settings are of values, so that there may be none after a training."""
-    return all(issubclass(chart(name), ValueChart) for name in config.charts)
-
-
-def count_chance_alarms(config: MonitorConfig) -> int:
-    """Number of the charts' alarms that share the false alarms, with every signal monitored; see `ValueChart`."""
-    of_settings = [pair for pair in alarm_names(config) if pair[0] in config.charts]
-    return sum(len(config.signals) if issubclass(chart(name), ValueChart) else 1 for name, _ in of_settings)
 
 
 _Judgements: TypeAlias = list[Judgement | None] | None
@@ -265,23 +229,21 @@ class ChartWatch:
     Args:
         config: configuration of the monitor.
         board: the alarms of the plant; those of the charts are declared here.
+
+    Attributes:
+        design: design of the charts; choose the charts by it before `start`.
+        widths: Shewhart limits, one an output, in standard deviations; they are shown about the predictions.
     """
 
     def __init__(self, config: MonitorConfig, board: Annunciator) -> None:
-        self._config = config
-        self._board = board
+        self._config, self._board, self.design = config, board, ChartDesign(config)
         self._alarms = {
             pair: board.declare(*pair, without_on_delay=chart(pair[0]).has_memory, priority=self._priority(pair[1]))
             for pair in alarm_names(config)
         }
-        self._names = list[str](dict.fromkeys(name for name, _ in self._alarms))
         self._watched: dict[str, _Watched] = {}
-        self._evaluated: list[bool] = []
-        self._chosen: list[str] = []
-        self._signals: tuple[str, ...] = ()  # of charts of values
         self._passed: list[float] = []
         self.widths: list[float] = []
-        """Shewhart limits, one an output, in standard deviations; they are shown about the predictions."""
 
     def _priority(self, signal: str) -> PriorityName | None:
         if signal != ALL:
@@ -292,7 +254,7 @@ class ChartWatch:
     @property
     def is_normal(self) -> bool:
         """True if all charts are made, and at most their alarms remember points."""
-        return list(self._watched) == self._names and self._board.is_at_rest(self._alarms.values())
+        return list(self._watched) == self.design.names and self._board.is_at_rest(self._alarms.values())
 
     def load(self, p: np.void) -> None:
         """Fill the numbers of a plant, see `row_frame.row_type`, from the charts and their alarms."""
@@ -334,130 +296,28 @@ class ChartWatch:
             for path, judgement in zip(paths, judgements, strict=False)
         ]
 
-    def choose(self, evaluated: list[bool], e: Array, values: Array) -> dict[str, str]:
-        """Choose the charts that can be made; returns the others, by alarm, each with the reason.
-
-        Args:
-            evaluated: for each output, True if it is evaluated.
-            e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
-            values: its measured values, shape (n, signals), the inputs first; NaN where missing, for each row of a
-                signal that is left out.
-        """
-        rows, signals = (
-            complete_rows(e, np.flatnonzero(evaluated).tolist()),
-            list(compress(self._config.outputs, evaluated)),
-        )
-        obstacles = {
-            name: why
-            for name in self._names
-            if issubclass(kind := chart(name), JointChart) and (why := kind.obstacle(rows, signals))
-        }
-        self._signals, complete = self._complete_values(values)
-        obstacles |= {
-            name: why
-            for name in self._names
-            if issubclass(kind := chart(name), ValueChart)
-            and (why := kind.obstacle(complete, self._signals, self._config.chart_signals))
-        }
-        charts = [name for name in dict.fromkeys(self._config.charts) if name in self._names and name not in obstacles]
-        self._evaluated, self._chosen = evaluated, charts or [name for name in self._names if name not in obstacles]
-        return {self._alarms[name, ALL].name: why for name, why in obstacles.items()}
-
-    @property
-    def chance_alarms(self) -> int:
-        """Number of their alarms that chance can raise."""
-        kinds = [chart(name) for name in self._chosen]
-        joint = sum(issubclass(kind, JointChart) for kind in kinds)
-        of_each = sum(issubclass(kind, SignalChart) for kind in kinds) * sum(self._evaluated)
-        return joint + of_each + sum(issubclass(kind, ValueChart) for kind in kinds) * len(self._signals)
-
-    def _complete_values(self, values: Array) -> tuple[tuple[str, ...], Array]:
-        """Names of the signals with values that vary, and the rows in which none of them is missing."""
-        indices = np.flatnonzero(np.isfinite(values).any(axis=0))
-        complete = complete_rows(values, indices.tolist())
-        varies = np.ptp(complete, axis=0) > 0.0 if len(complete) else np.ones(indices.size, np.bool_)
-        names = tuple(self._config.signals[index] for index in indices[varies].tolist())
-        return names, complete[:, varies]
-
     def start(self, learned: list[Prewhitening], e: Array, values: Array, arl0: float) -> None:
-        """Make the charts, after `choose`.
+        """Make the charts that the design has chosen.
 
         Args:
             learned: from the training, one an output.
             e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
-            values: measured values of the training, see `choose`.
+            values: measured values of the training, see `ChartDesign.choose`.
             arl0: run length of each alarm without a fault, in rows.
         """
-        config, baseline = self._config, self._baseline(learned, e, arl0)
+        design, baseline = self.design, self.design.baseline(learned, e, arl0)
         p = baseline.point_probability
         self.widths, self._passed = [designed_width(p, item) for item in learned], [item.shift_gain for item in learned]
 
         def design_charts(kind: type[Chart]) -> _Charts:
             if issubclass(kind, SignalChart):
-                return _of_each(kind, [kind.design(baseline.of([index])) for index in range(len(config.outputs))])
+                return _of_each(kind, [kind.design(baseline.of([index])) for index in range(len(learned))])
             if issubclass(kind, ValueChart):
-                return _OfValues(kind.design(self._value_baseline(values, arl0)), config)
+                return _OfValues(kind.design(design.value_baseline(values, arl0)), self._config)
             assert issubclass(kind, JointChart)
-            return _OfAll(kind.design(baseline.of(np.flatnonzero(self._evaluated).tolist())), self._evaluated)
+            return _OfAll(kind.design(baseline.of(np.flatnonzero(design.evaluated).tolist())), design.evaluated)
 
         self._watch(design_charts)
-
-    def _value_baseline(self, values: Array, arl0: float) -> ValueBaseline:
-        return ValueBaseline(
-            *self._complete_values(values), arl0, self._config.chart_settings, self._config.chart_signals
-        )
-
-    def _baseline(self, learned: list[Prewhitening], e: Array, arl0: float) -> Baseline:
-        config = self._config
-        p = false_alarm_budget.point_probability(arl0, config.raise_count, config.window)
-        sds = memory_sds(e, config.chart_settings["ewma_weight"])
-        return Baseline(tuple(learned), e, sds, arl0, p, config.chart_settings)
-
-    def relative_rates(
-        self, learned: list[Prewhitening], e: Array, values: Array, arl0: float, errors: TrainingErrors
-    ) -> Array:
-        """Rate of false alarms of all charts by the errors of the training, in shares of one alarm, shape (draws,).
-
-        Args:
-            learned: prewhitening of each output.
-            e: prewhitened residuals of the training, shape (n, outputs); NaN where there is none.
-            values: measured values of the training, see `choose`.
-            arl0: run length of each alarm without a fault, in rows.
-            errors: errors of all outputs.
-        """
-        baseline, evaluated = self._baseline(learned, e, arl0), np.flatnonzero(self._evaluated).tolist()
-        total = np.zeros(len(errors.mean))
-        for name in self._chosen:
-            kind = chart(name)
-            if issubclass(kind, ValueChart):
-                total += kind.relative_rates(self._value_baseline(values, arl0))
-                continue
-            groups = [[index] for index in evaluated] if issubclass(kind, SignalChart) else [evaluated]
-            assert issubclass(kind, SignalChart | JointChart)
-            for group in groups:
-                rates = kind.relative_rates(baseline.of(group), errors.of(group))
-                total += rates if kind.has_memory else self._rule_rates(baseline, rates)
-        return total
-
-    def detectors(self, learned: list[Prewhitening], e: Array, arl0: float) -> list[Detector]:
-        """The charts as moving averages, as far as they are; arguments as for `start`."""
-        baseline, evaluated, found = self._baseline(learned, e, arl0), np.flatnonzero(self._evaluated).tolist(), []
-        for name in self._chosen:
-            kind = chart(name)
-            for group in [[index] for index in evaluated] if issubclass(kind, SignalChart) else [evaluated]:
-                average = kind.detector(baseline.of(group))
-                if average is not None:
-                    weight, level, matrix = average
-                    rule = (1, 1) if kind.has_memory else (self._config.raise_count, self._config.window)
-                    found.append(Detector(tuple(group), matrix, weight, level, rule))
-        return found
-
-    def _rule_rates(self, baseline: Baseline, rates: Array) -> Array:
-        """Relative rate of an alarm that takes several points, from that of single points."""
-        count, window, p = self._config.raise_count, self._config.window, baseline.point_probability
-        nodes = np.geomspace(0.1 * p, 1.0, 40)  # rates of far rarer points are rounding errors, and nothing
-        of_rule = np.maximum(false_alarm_rates(count, window, nodes) * baseline.arl0, 1e-9)
-        return np.asarray(np.exp(np.interp(np.log(np.maximum(rates * p, nodes[0])), np.log(nodes), np.log(of_rule))))
 
     @property
     def state(self) -> ChartsState:
@@ -475,14 +335,15 @@ class ChartWatch:
         Raises:
             ValueError: the state is damaged.
         """
+        design, names = self.design, self.design.names
         self.widths, self._passed = list(state.widths), list(state.passed)
-        self._evaluated, self._chosen = evaluated, [name for name in self._names if name in state.charts]
+        design.evaluated, design.chosen = evaluated, [name for name in names if name in state.charts]
         outputs = len(self._config.outputs)
-        each = {name for name in self._names if issubclass(chart(name), SignalChart)}
+        each = {name for name in names if issubclass(chart(name), SignalChart)}
         if has_values_only(self._config) and not each & set(state.charts):
             each = set()
-        if not each <= set(state.charts) <= set(self._names) or not len(self.widths) == len(self._passed) == outputs:
-            raise ValueError(f"there must be the charts {', '.join(self._names)}, got {', '.join(state.charts)}")
+        if not each <= set(state.charts) <= set(names) or not len(self.widths) == len(self._passed) == outputs:
+            raise ValueError(f"there must be the charts {', '.join(names)}, got {', '.join(state.charts)}")
 
         def restore_charts(kind: type[Chart]) -> _Charts:
             data = state.charts[kind.name]
@@ -495,10 +356,10 @@ class ChartWatch:
                 return _OfEach([kind.from_state(kind.State.from_bytes(item)) for item in _split(data, outputs)])
             if issubclass(kind, ValueChart):
                 of_values = kind.from_state(kind.State.from_bytes(data))
-                self._signals = of_values.names
+                design.signals = of_values.names
                 return _OfValues(of_values, self._config)
             assert issubclass(kind, JointChart)
-            return _OfAll(kind.from_state(kind.State.from_bytes(data)), self._evaluated)
+            return _OfAll(kind.from_state(kind.State.from_bytes(data)), design.evaluated)
 
         self._watch(restore_charts)
 
@@ -511,7 +372,7 @@ class ChartWatch:
     def _watch(self, made: Callable[[type[Chart]], _Charts]) -> None:
         """Give the charts of each name their alarms and keys."""
         self._watched = {}
-        for name in self._chosen:
+        for name in self.design.chosen:
             pairs = [pair for pair in self._alarms if pair[0] == name]
             alarms = [self._alarms[pair] for pair in pairs]
             paths = [keys.key(self._config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]

@@ -40,7 +40,8 @@ from monitor_node.signal_checks.spike import SpikeState
 from monitor_node.signal_checks.stage import SignalChecksState
 from monitor_node.signal_checks.stuck import Stuck
 from monitor_node.signal_checks.timeout import DataTimeout
-from monitor_node.stages.charts import ChartsState, alarm_names
+from monitor_node.stages.chart_alarms import alarm_names
+from monitor_node.stages.charts import ChartsState
 from monitor_node.state.monitor_state import MonitorState
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import AlarmKpis
@@ -151,7 +152,7 @@ class Conversion:
             return None
         if pipeline.pending_commands:
             return None
-        if None in monitor.receipts_ns or monitor.converts_samples:
+        if None in monitor.silence.of_plant.receipts_ns or monitor.converts_samples:
             return None
         state = monitor.state
         watched, alignment = state.watch.watched, state.alignment

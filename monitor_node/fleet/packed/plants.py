@@ -169,7 +169,8 @@ class PackedPlants:
         monitor.on_history_end()
         p["health_due_ns"] = self._slots.health_due_ns[slot]
         received_ns, counted_ns = p["receipts"]["received_ns"], p["receipts"]["counted_ns"]
-        monitor.stats, monitor.receipts_ns = _receive_stats(p), (int(received_ns), int(counted_ns))
+        monitor.stats = _receive_stats(p)
+        monitor.silence.of_plant.receipts_ns = int(received_ns), int(counted_ns)
         self._slots.leave(plant)
         return monitor
 

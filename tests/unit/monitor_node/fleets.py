@@ -7,7 +7,8 @@ import msgspec
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.monitor import Callbacks, FleetMonitor
+from monitor_node.fleet.callbacks import Callbacks
+from monitor_node.fleet.monitor import FleetMonitor
 from monitor_node.fleet.sharding import WHOLE, Shard, ShardGroup
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication

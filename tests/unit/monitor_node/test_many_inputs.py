@@ -208,7 +208,7 @@ def test_equations_with_two_inputs_judge_a_plant_in_closed_loop(missing: float) 
     monitor, staged = (Monitor(config, START_NS, model=model) for _ in range(2))
     staged.pipeline.evaluation.find_normal = lambda *_: False  # type: ignore[method-assign]
     published = [live(monitor, [message]) for message in messages]
-    assert monitor.reference == "equations"
+    assert monitor.pipeline.reference == "equations"
     assert [live(staged, [message]) for message in messages] == published
     raised = [item.message.alarm for told in published for item in told if isinstance(item.message, Alarm)]
     assert raised[0] == "shewhart/h3" or "mewma/all" in raised[:2]
@@ -290,7 +290,7 @@ def test_equations_without_an_input_judge_a_plant() -> None:
     first = live(monitor, messages[:120])
     resumed.from_bytes(monitor.to_bytes())
     resumed.on_history_end()
-    assert monitor.reference == "equations"
+    assert monitor.pipeline.reference == "equations"
     told = live(monitor, messages[120:])
     assert live(resumed, messages[120:]) == told
     assert not alarms(first)

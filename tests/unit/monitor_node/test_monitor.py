@@ -169,8 +169,8 @@ def test_what_judges_is_published_with_its_noise_levels_and_nothing_else_says_th
         assert {model.structure for model in judging} == {judge}
         assert min(model.time_ns for model in judging) == since_ns
         assert [model.time_ns for model in judging] == sorted({model.time_ns for model in judging})
-    assert monitor.reference == judge
-    levels = monitor.noise_levels
+    assert monitor.pipeline.reference == judge
+    levels = monitor.pipeline.noise_levels
     assert (levels is not None) == (judge == "equations")
     if levels is not None:
         for signal, sd in levels["sensors"].items():

@@ -54,7 +54,7 @@ def test_its_prediction_is_that_of_its_newest_parameters(
             compared += 1
     assert compared >= 6
     assert adaptive(monitor).reference == (reference == "arx")
-    assert monitor.reference == reference
+    assert monitor.pipeline.reference == reference
 
 
 def test_it_learns_nothing_while_an_alarm_is_active_and_what_it_learned_last_is_taken_back(

@@ -53,7 +53,7 @@ def test_a_row_in_one_compiled_step_gives_what_it_gives_stage_by_stage(leak: lis
     assert steps > 1000
     assert raised
     assert stepped.to_bytes() == staged.to_bytes()
-    assert stepped.reference == "black-box"
+    assert stepped.pipeline.reference == "black-box"
 
 
 @pytest.mark.parametrize("row", [650, 1090, 1140])
@@ -74,7 +74,7 @@ def test_nothing_is_learned_while_an_alarm_is_active_and_what_was_learned_last_i
     monitor, history = Monitor(BLACK_BOX, 0, points=False), []
     for k, message in enumerate(leak):
         monitor.on_message(message, 0)
-        if k % 3 == 2 and monitor.reference:
+        if k % 3 == 2 and monitor.pipeline.reference:
             reference = reference_of(monitor)
             history.append((reference.parameters[0], monitor.alarms.has_unexplained))
     active = [is_active for _, is_active in history]

@@ -105,3 +105,26 @@ def test_the_process_model_of_another_plant_is_refused_in_one_line(setting: dict
 
     with pytest.raises(InputError, match="reference 'equations' needs the signals of cstr"):
         Monitor(MonitorConfig(**setting), 0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("moves", "is_too_few"), [(0, False), (1, True), (4, True), (5, False), (40, False)])
+def test_without_equations_a_training_with_few_moves_of_the_input_is_said_not_to_keep_the_promise(
+    moves: int, is_too_few: bool
+) -> None:
+    generator = np.random.default_rng(moves)
+    time_min = np.arange(1100) / 10
+    u = np.where(np.arange(1100) * (moves + 1) // 1000 % 2, 1.0, 0.0)
+    u[1000:] = u[999]
+    y = np.zeros(1100)
+    for row in range(1, 1100):
+        y[row] = 0.8 * y[row - 1] + u[row - 1] + generator.normal(0.0, 0.05)
+    config = MonitorConfig(
+        process="", inputs=("qc",), outputs=("T",), priorities={}, smallest_sd={}, isolation=False, training_min=100.0
+    )
+    run = watched(time_min, {"qc": u, "T": y}, config)
+    few = [note for note in run.monitor.notes if "too few moves of qc" in note]
+    assert bool(few) == is_too_few
+    if is_too_few:
+        assert f"qc ({moves}; 5 are needed)" in few[0]
+        assert run.monitor.promise is not None
+        assert not run.monitor.promise.kept

@@ -81,7 +81,7 @@ def test_a_fleet_publishes_of_each_plant_what_its_own_monitor_does(runs: dict[st
     monitors = watched(runs, queue)
     published = publish(monitors, part(runs, 0, FOUND))
     for name, finding in reversed(findings(queue, warm)):
-        monitors.on_finding(name, finding)
+        monitors.watched.on_finding(name, finding)
     published += publish(monitors, part(runs, FOUND))
     assert len(queue) == 3
     assert len(changes(of("warm", published))) == 1
@@ -101,8 +101,8 @@ def test_a_plant_that_is_taken_over_while_its_diagnosis_is_pending_is_diagnosed_
         second.monitor(name).on_history_end()
     assert sorted(after) == sorted(before)
     for name, finding in findings(after, warm):
-        first.on_finding(name, finding)  # too late: it has released the plants
-        second.on_finding(name, finding)
+        first.watched.on_finding(name, finding)  # too late: it has released the plants
+        second.watched.on_finding(name, finding)
     published += publish(second, part(runs, FOUND))
     for name, run in runs.items():
         assert of(name, published) == of(name, own_monitor(name, run, dict(findings(after, warm))[name]))
@@ -112,7 +112,7 @@ def test_a_plant_that_is_taken_over_after_the_change_keeps_it(runs: dict[str, li
     queue, after = Queue(), Queue()
     first, second = watched({"warm": runs["warm"]}, queue), fleet(CONFIG, diagnose=after.submit)
     published = publish(first, runs["warm"][:FOUND])
-    first.on_finding("warm", warm.finding)
+    first.watched.on_finding("warm", warm.finding)
     published += publish(first, runs["warm"][FOUND : FOUND + 90])
     second.adopt("warm", first.release("warm"), 0)
     second.monitor("warm").on_history_end()
@@ -128,7 +128,7 @@ def test_a_diagnosis_that_failed_leaves_its_plant_and_the_others_as_they_are(
     monitors = watched(runs, queue)
     published = publish(monitors, part(runs, 0, FOUND))
     for name, _ in queue:
-        monitors.on_finding(name, Finding(warm.finding.first_ns, FAILED, "the worker died"))
+        monitors.watched.on_finding(name, Finding(warm.finding.first_ns, FAILED, "the worker died"))
     published += publish(monitors, part(runs, FOUND))
     for name, run in runs.items():
         assert of(name, published) == of(name, own_monitor(name, run, None))

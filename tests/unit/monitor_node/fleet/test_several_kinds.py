@@ -86,11 +86,11 @@ def test_a_restored_plant_resumes_with_the_process_of_its_name(runs: dict[str, l
     first, second = several_kinds(), several_kinds()
     cut = 3 * len(runs["north_1"]) // 4
     first.on_messages(runs["north_1"][:cut], 0)
-    monitor = second._watched.new_monitor("north_1", 0)
+    monitor = second.watched.new_monitor("north_1", 0)
     monitor.from_bytes(first.state_of("north_1"))
     second.register("north_1", 0, verified=True)
-    second._watched.remove("north_1")
-    second._watched.add("north_1", monitor)
+    second.watched.remove("north_1")
+    second.watched.add("north_1", monitor)
     after, again = (of("north_1", fleet.on_messages(runs["north_1"][cut:], 0)) for fleet in (first, second))
     assert alarms(after)
     assert after == again

@@ -209,7 +209,7 @@ def test_a_state_that_cannot_be_used_is_told_and_the_plant_learned_anew(runs: di
     assert (asked, monitor.plants) == ([("a", False)], [])
     monitor.on_history(PlantHistory("a", b"rubbish", runs["a"][:30]), 0)
     assert (monitor.plants, monitor.monitor("a").rows) == (["a"], 10)
-    ((plant, line),) = monitor.reports(0)
+    ((plant, line),) = monitor.watched.reports(0)
     assert plant == "a"
     assert "learned again; a is kept aside" in line
 

@@ -97,11 +97,11 @@ def test_an_error_in_one_plant_of_a_fleet_changes_nothing_for_the_others(
     health = health_message(monitors.on_stop(0), BROKEN)
     assert health.failures[stage] >= 1
     assert health.rows == 401 or stage == "promotion"
-    notes = [line for plant, line in monitors.reports(0) if plant == BROKEN]
+    notes = [line for plant, line in monitors.watched.reports(0) if plant == BROKEN]
     assert len([line for line in notes if "ZeroDivisionError" in line and "a number that was" in line]) == 1
     assert all("\n" not in line for line in notes)
     if stage not in ("promotion", "demotion"):
-        assert [plant for plant, text in monitors.tracebacks() if "Traceback" in text] == [BROKEN]
+        assert [plant for plant, text in monitors.watched.tracebacks() if "Traceback" in text] == [BROKEN]
 
 
 def test_alarms_stay_when_the_plant_is_learned_again_and_are_cleared_when_they_are_over(
@@ -207,6 +207,6 @@ def test_settings_that_cannot_be_kept_end_the_monitor_of_one_plant_and_no_fleet(
     error = InputError("false_alarms_per_30_days must be larger")
     with pytest.raises(InputError, match="must be larger"):
         Failures().add("row", error, "the plant is learned again")
-    one_of_many = fleet()._watched.new_monitor("b", 0).failures
+    one_of_many = fleet().watched.new_monitor("b", 0).failures
     one_of_many.add("row", error, "the plant is learned again")
     assert one_of_many.by_stage == {"row": 1}

@@ -8,6 +8,7 @@ import pytest
 from monitor_node.isolation.causes import causes_of
 from monitor_node.isolation.isolation import Isolation
 from monitor_node.isolation.live_posterior import LivePosterior
+from monitor_node.isolation.residual import log_evidence_of_sums
 from monitor_node.isolation.suspect import UNKNOWN, Suspect
 from monitor_node.isolation.window import Row
 from reactorwatch.kalman.ekf import Filter
@@ -119,6 +120,33 @@ def test_a_single_outlier_or_a_missing_value_changes_no_probability_much(leak: l
         live = after_look(leak)
         for item in follow(live, bad)[-1]:
             assert item.probability == pytest.approx(expected[item.cause], abs=0.05)
+
+
+def test_a_first_far_value_has_the_effect_of_a_missing_one_and_a_second_one_counts(leak: list[Row]) -> None:
+    (time_min, inputs, (concentration, temperature)), (next_min, *_) = leak[ALARM + LOOK : ALARM + LOOK + 2]
+    missing, far = after_look(leak), after_look(leak)
+    assert missing.update(time_min, inputs, (nan, temperature))
+    assert far.update(time_min, inputs, (50.0 * concentration, temperature))
+    assert far.state.filters == missing.state.filters
+    assert far.update(next_min, inputs, (50.0 * concentration, temperature))
+    assert missing.update(next_min, inputs, (nan, temperature))
+    assert far.state.filters != missing.state.filters
+
+
+def test_probabilities_have_moved_if_they_differ_by_the_least_from_those_published(leak: list[Row]) -> None:
+    live = after_look(leak)
+    live.note_published()
+    before = live._published
+    assert not live.has_moved(1e-12)
+    follow(live, leak[ALARM + LOOK : ALARM + LOOK + 20])
+    evidence = live._filters["log_evidence"]
+    best = int(np.argmax(evidence[:-1]))
+    weights = np.append(evidence, evidence[best] + log_evidence_of_sums(live._filters[best]))
+    shares = np.exp(weights - np.max(weights))
+    moved = float(np.sum(np.abs(shares / np.sum(shares) - before)))
+    assert moved > 1e-6
+    assert live.has_moved(moved * (1 - 1e-9))
+    assert not live.has_moved(moved * (1 + 1e-9))
 
 
 def test_a_restored_posterior_goes_on_bit_for_bit_and_one_of_other_causes_is_refused(leak: list[Row]) -> None:

@@ -97,11 +97,11 @@ def test_restore_judges_by_what_was_learned_before_as_if_nothing_had_been_learne
     run = Run((flow, measured)).take_until(CHANGE + 20)
     run.ask("relearn")
     run.take_until(CHANGE + 21)
-    assert run.monitor.reference == ""
+    assert run.monitor.pipeline.reference == ""
     assert run.ask("restore").accepted
     run.rows[CHANGE + 21 :] = [(u, y - 3.0) for u, y in run.rows[CHANGE + 21 :]]
     run.take_until(CHANGE + 400)
-    assert run.monitor.reference == "black-box"
+    assert run.monitor.pipeline.reference == "black-box"
     assert [(item.what, item.id, item.restored) for item in run.changes] == [("relearn", 1, 0), ("restore", 2, 0)]
     assert run.raised(CHANGE + 60) == []
     run.rows[CHANGE + 400 :] = [(u, y + 3.0) for u, y in run.rows[CHANGE + 400 :]]

@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 from math import inf, nan
+from statistics import median
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from monitor_node.signal_checks.spike import Spike, SpikeState, false_spike_rate, spike_limit
+from monitor_node.signal_checks.spike import RECENT, RecentValues, Spike, SpikeState, false_spike_rate, spike_limit
 from reactorwatch.errors import InputError
 
 LIMIT = 6.0
@@ -224,3 +225,14 @@ def test_whether_an_alarm_stands_or_not_no_three_values_in_a_row_are_withheld(va
     spike = Spike(LIMIT)
     said = "".join("w" if spike.update(z, is_moved=is_moved).quarantine else "." for z, is_moved in values)
     assert "www" not in said
+
+
+@given(st.lists(st.one_of(st.floats(-1e3, 1e3), st.sampled_from([-1.0, 0.0, 2.0])), min_size=1, max_size=2 * RECENT))
+def test_median_and_deviation_of_recent_values_are_those_of_the_sorted_values(values: list[float]) -> None:
+    recent = RecentValues()
+    for end, value in enumerate(values, start=1):
+        recent.append(value)
+        newest = values[max(0, end - RECENT) : end]
+        assert recent.values == newest
+        level = median(newest)
+        assert recent.median_and_deviation() == (level, median(abs(item - level) for item in newest))

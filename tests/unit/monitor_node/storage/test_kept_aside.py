@@ -290,7 +290,7 @@ def test_a_silence_that_stood_ends_with_the_next_sample(tmp_path: Path, rows: li
     node = MonitorNode(settings_, 0)
     for message in rows[:150]:
         node.on_message(message, 0)
-    node.declare_timeout()
+    node.silence.declare_timeout()
     node.on_tick(0)
     again = MonitorNode(settings_, 0)
     assert stands(again.alarms.alarm("silence/plant"))
