@@ -54,6 +54,12 @@ NOT_HERE = {
 """All commands that this test leaves out, by page, and why; a page's mark gives the same reason."""
 
 
+SLOW_PAGES = {
+    f"docs/{name}.md" for name in ("dashboards", "deployment", "diagnosis", "fleet", "many_files", "processes")
+}
+"""Pages that take more than eight seconds each; README, getting-started and the others are in `make test`."""
+
+
 def name_of(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
@@ -102,7 +108,13 @@ def check_settings(block: Block, path: Path) -> None:
         section(TABLES[table], table, tables, {})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[pytest.mark.slow] if name_of(page) in SLOW_PAGES else [], id=name_of(page))
+        for page in PAGES
+    ],
+)
 def test_the_page_works_as_it_is_written(
     page: Path, tmp_path: Path, files: Files, machine: Machine, called: Command
 ) -> None:
