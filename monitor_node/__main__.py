@@ -25,7 +25,7 @@ from monitor_node.storage.state_file import StateFile
 from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus
@@ -87,6 +87,7 @@ class MonitorNode(Monitor):
             self._file = StateFile(Path(config.state_file), self, config.state_every_s)
             log.info(self._file.load())
         self.resumed = self.rows > 0
+        self._repeated = self.unconfirmed if self.resumed else []
         if self._alarm_file is not None:
             # The state's alarms belong to its rows; but the alarms of a state that was aside are older than the file.
             line = self._alarm_file.load(
@@ -102,7 +103,7 @@ class MonitorNode(Monitor):
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """See `Monitor`; alarms are stored and logged."""
-        publications = super().on_message(message, now_ns)
+        publications = self._pop_repeated() + super().on_message(message, now_ns)
         if self.awaits_diagnosis and not self._worker.is_busy and (job := self.diagnosis_job) is not None:
             self._worker.submit(self.config.plant, job)
         self._keep(publications, now_ns)
@@ -141,7 +142,7 @@ class MonitorNode(Monitor):
         report = self.rejects.report(now_ns)
         if report is not None:
             log.warning(report)
-        publications = super().on_tick(now_ns)
+        publications = self._pop_repeated() + super().on_tick(now_ns)
         self._keep(publications, now_ns)
         return publications
 
@@ -155,11 +156,17 @@ class MonitorNode(Monitor):
     def on_stop(self, now_ns: int) -> list[Publication]:
         """See `Monitor`; the state is stored for the last time."""
         self._worker.close()
+        self.unconfirmed = []
         if self._file is not None:
             self._try(self._file.store)
         return super().on_stop(now_ns)
 
+    def _pop_repeated(self) -> list[Publication]:
+        repeated, self._repeated = self._repeated, []
+        return repeated
+
     def _keep(self, publications: list[Publication], now_ns: int) -> None:
+        self.unconfirmed = [item for item in publications if not isinstance(item.message, Health)] or self.unconfirmed
         for publication in publications:
             alarm = publication.message
             if isinstance(alarm, Alarm):

@@ -8,7 +8,7 @@ follow from its samples and from operators' actions. So a replay reproduces them
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, cast
 
 from google.protobuf.message import Message
 
@@ -36,7 +36,7 @@ from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
 from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode, encode
 from reactorwatch.contract.commands import decode_command
 from reactorwatch.contract.messages_pb2 import Alarm, Baseline, BaselineCommand, CommandReply, Promise, Sample
 from reactorwatch.errors import InputError
@@ -72,6 +72,8 @@ class Monitor:
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
         received: number of messages so far.
         on_row_end: called after each row with its time and the publications because of it; None: not called.
+        unconfirmed: the newest publications, which a kill may keep from leaving the process; the caller sets them. They
+            are stored with the state.
         stats: statistics by receive time, which a restart resets.
     """
 
@@ -117,6 +119,7 @@ class Monitor:
         self.stats = ReceiveStats(start_ns, start_ns)
         self.on_row_end: Callable[[int, list[Publication]], None] | None = None
         self._published = 0
+        self.unconfirmed: list[Publication] = []
         self._snapshot_due_ns: int | None = None
         self._snapshot_ns = int(config.snapshot_min * MINUTE_NS)
 
@@ -298,6 +301,7 @@ class Monitor:
             self._published,
             self.rejects.by_reason,
             self.failures.by_stage,
+            [encode(item)[:3] for item in self.unconfirmed],
         )
 
     def restore(self, state: MonitorState) -> None:
@@ -311,6 +315,9 @@ class Monitor:
             pipeline = self._new_pipeline(board)
             board.from_bytes(state.board)
             pipeline.restore(state.watch, self.stats.start_ns)
+            unconfirmed = [
+                Publication(key, cast(Body, decode(payload, encoding))) for key, payload, encoding in state.unconfirmed
+            ]
         except ValueError as error:
             raise InputError(f"is no state of this software's monitor: {error}") from error
         self.alarms, self.pipeline = board, pipeline
@@ -324,6 +331,7 @@ class Monitor:
         self.received, self._published = state.received, state.published
         self.rejects.by_reason = state.refused
         self.failures.restore(state.failures)
+        self.unconfirmed = unconfirmed
 
     def _learning_settings(self) -> dict[str, Any]:
         if self._settings is None:

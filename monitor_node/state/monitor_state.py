@@ -61,6 +61,7 @@ class MonitorState(StoredState, frozen=True):
         published: number of messages published.
         refused: number of rejected messages by reason.
         failures: number of contained errors of this software by stage.
+        unconfirmed: the newest publications, which may not have left the process; empty if they have.
     """
 
     settings: dict[str, Any]
@@ -78,6 +79,7 @@ class MonitorState(StoredState, frozen=True):
     published: int
     refused: dict[str, int]
     failures: dict[str, int] = msgspec.field(default_factory=dict)
+    unconfirmed: list[tuple[str, bytes, str]] = msgspec.field(default_factory=list)  # key, payload and encoding
 
 
 def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, points: bool) -> dict[str, Any]:

@@ -108,6 +108,7 @@ class RunReader:
         self._plant = ""
         self._columns: dict[str, _KeyColumns | None] = {}
         self._alarms: list[AlarmChange] = []
+        self._newest_changes: dict[str, AlarmChange] = {}
         self._faults: list[FaultChange] = []
         self._models: dict[tuple[str, str], list[Snapshot]] = {}
         self._health: dict[str, list[HealthReport]] = {}
@@ -154,7 +155,9 @@ class RunReader:
                 self._newest_ns = time_ns
         elif kind == keys.ALARM:
             change = AlarmChange(*(getattr(message, name) for name in AlarmChange._fields))
-            self._alarms.append(change._replace(time_ns=time_ns))
+            if self._newest_changes.get(change.alarm) != change:  # a restarted monitor publishes its newest again
+                self._newest_changes[change.alarm] = change
+                self._alarms.append(change._replace(time_ns=time_ns))
         elif kind == keys.FAULT:
             fault = FaultChange(*(getattr(message, name) for name in FaultChange._fields))
             onset_ns = fault.onset_ns + time_ns - fault.time_ns

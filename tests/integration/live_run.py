@@ -127,9 +127,9 @@ class LiveRun:
         assert self.nodes.stop(["monitor", "recorder"]) == {"monitor": 0, "recorder": 0}
 
     def recorded_alarms(self) -> list[Change]:
-        """What the monitor said of its alarms."""
+        """What the monitor said of its alarms; what it said again after a restart counts once."""
         recorded = [decode(item.payload, item.encoding) for item in read_messages(self.recording, {keys.ALARM})]
-        return _changes(item for item in recorded if isinstance(item, Alarm))
+        return list(dict.fromkeys(_changes(item for item in recorded if isinstance(item, Alarm))))
 
     def expected_alarms(self) -> list[Change]:
         """Publications of a monitor that hears all of the plant, and nothing else, without a stop.

@@ -11,8 +11,7 @@ from .live_run import PLANT, LiveRun
 KILLS_MIN = (8.0, 20.0)
 """In training, and watching; the third kill comes while the alarms of the leak stand."""
 LOOKS = 3
-"""Looks for causes heard before that kill; the next one comes five seconds later. A monitor stores its state once it
-has published, and what is on its way from a process that is killed is lost."""
+"""Looks for causes heard before that kill; other messages of the same row are then still on their way."""
 
 
 def looks(run: LiveRun) -> int:

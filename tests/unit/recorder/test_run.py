@@ -62,6 +62,11 @@ def test_the_order_of_receipt_does_not_matter(run: RunColumns) -> None:
     assert backwards.alarms == run.alarms
 
 
+def test_messages_that_a_restarted_monitor_publishes_again_count_once(run: RunColumns) -> None:
+    twice = [entry for entry in golden.entries() for _ in range(2)]
+    assert read_run(twice).alarms == run.alarms
+
+
 def test_unusable_values_are_gaps_and_what_cannot_be_read_is_passed_over() -> None:
     key = "reactor/cstr/sample/T"
     bad = messages.Sample(time_ns=1, value=5.0, quality=messages.QUALITY_BAD, unit="K")

@@ -10,7 +10,7 @@ import pytest
 from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Encoded, encode_message
+from reactorwatch.contract.codec import Encoded, encode, encode_message
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, Health
 from reactorwatch.errors import InputError
 
@@ -67,6 +67,29 @@ def test_a_change_of_an_alarm_is_stored_before_it_is_told(config: MonitorConfig,
         if any("/alarm/" in item.key for item in said):
             break
     assert stored_rows(config) == node.rows
+
+
+def test_messages_that_a_kill_kept_from_leaving_are_published_first_after_the_restart(
+    config: MonitorConfig, leak: list[Encoded]
+) -> None:
+    node = MonitorNode(config, 0)
+    messages = iter(leak)
+    for message in messages:
+        said = node.on_message(message, 0)
+        if any("/alarm/" in item.key for item in said):
+            break
+    resumed = MonitorNode(config, 0)
+    again = resumed.on_message(next(messages), 0)
+    assert [encode(item) for item in again[: len(said)]] == [encode(item) for item in said]
+    assert not any("/alarm/" in item.key for item in resumed.on_tick(0))
+
+
+def test_a_monitor_that_ended_publishes_nothing_again(config: MonitorConfig, leak: list[Encoded]) -> None:
+    node = MonitorNode(config, 0)
+    for message in leak[:30]:
+        node.on_message(message, 0)
+    node.on_stop(0)
+    assert {type(item.message) for item in MonitorNode(config, 0).on_tick(0)} == {Health}
 
 
 def test_at_its_end_it_is_stored(config: MonitorConfig, leak: list[Encoded]) -> None:
