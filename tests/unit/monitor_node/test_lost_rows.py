@@ -1,7 +1,7 @@
 """Of a row that is lost the input is unknown, and so is what it did until it shows: a sound plant raises no alarm."""
 
 from math import nan
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from reactorwatch.process.simulate import Simulator
 from .faulty import SENSORS, rows_of
 from .samples import Rows, samples
 
-Reference = Literal["process", "arx"]
+Reference = Literal["process", "arx", "black-box"]
 TRAINED, ROWS, AT = 420, 520, 450
 """Rows until the monitors of the tests are past their training, rows in all, and the row of the move."""
 
@@ -63,7 +63,7 @@ def trained() -> dict[tuple[str, str], bytes]:
     found = {}
     for name, qc in INPUTS.items():
         messages = sound(qc, seed=3)
-        for reference in ("process", "arx"):
+        for reference in get_args(Reference):
             monitor = Monitor(config(reference), 0, points=False)
             for message in messages[: 3 * TRAINED]:
                 monitor.on_message(message, 0)
@@ -99,20 +99,21 @@ LOST = st.just({0, 1, 2}) | st.sets(st.sampled_from(range(3)), min_size=1)
 
 @pytest.mark.parametrize("move", [-13.0, -8.0, 8.0])
 @pytest.mark.parametrize("by_ns", [0, -HOUR_NS])
+@pytest.mark.parametrize("reference", ["process", "black-box"])
 def test_the_row_of_a_move_that_is_lost_or_stamped_an_hour_early_raises_no_alarm(
-    trained: dict[tuple[str, str], bytes], move: float, by_ns: int
+    trained: dict[tuple[str, str], bytes], reference: Reference, move: float, by_ns: int
 ) -> None:
     qc = steps()
     qc[TRAINED:AT], qc[AT:] = 103.0, 103.0 + move
     messages = sound(qc, seed=6)
     moved = [stamped(message, by_ns) for message in messages[3 * AT : 3 * AT + 3]] if by_ns else []
     left = [*messages[3 * TRAINED : 3 * AT], *moved, *messages[3 * AT + 3 :]]
-    assert raised(trained["process", "held"], "process", left) == set()
+    assert raised(trained[reference, "held"], reference, left) == set()
 
 
 @settings(max_examples=20, deadline=None)
 @given(
-    reference=st.sampled_from(["process", "arx"]),
+    reference=st.sampled_from(get_args(Reference)),
     move=st.floats(-13.0, 8.0),
     lost=st.lists(st.tuples(st.just(AT) | st.integers(AT - 2, AT + 3), LOST), min_size=1, max_size=3),
     by_ns=st.sampled_from([0, -HOUR_NS, HOUR_NS]),
@@ -126,7 +127,7 @@ def test_losing_or_misstamping_samples_about_any_move_raises_no_alarm(
     by_ns: int,
     seed: int,
 ) -> None:
-    """Any move, any rows about it, any of their signals, by both references; or stamped an hour early or late."""
+    """Any move, any rows about it, any of their signals, by each reference; or stamped an hour early or late."""
     qc = steps()
     qc[TRAINED:AT] = 103.0
     qc[AT:] = 103.0 + move
