@@ -127,7 +127,7 @@ class LiveRun:
         assert self.nodes.stop(["monitor", "recorder"]) == {"monitor": 0, "recorder": 0}
 
     def recorded_alarms(self) -> list[Change]:
-        """What the monitor said of its alarms; what it said again after a restart counts once."""
+        """Changes of alarms in the recording; messages repeated after a restart count once."""
         recorded = [decode(item.payload, item.encoding) for item in read_messages(self.recording, {keys.ALARM})]
         return list(dict.fromkeys(_changes(item for item in recorded if isinstance(item, Alarm))))
 
