@@ -167,7 +167,6 @@ def report_memory(endpoint: str, plants: int) -> None:
     node = Counting(FAST, bus, stop)
     node.learn(plants)
     assert isinstance(node.watched, WatchedPlants)
-    assert isinstance(node.watched, WatchedPlants)
     quiet = node.watched._quiet
     assert quiet is not None
     due_ns = quiet._slots.health_due_ns

@@ -70,7 +70,7 @@ def read_summary(path: Path) -> Summary:
         if not magic:
             raise InputError(f"{path}: expected an MCAP recording, got an empty file")
         if magic != MCAP0_MAGIC[: len(magic)]:
-            raise InputError(f"{path}: expected an MCAP recording, got another kind of file; {TABLE_CURE}")
+            raise foreign_file_error(path)
         tail = FOOTER.size + len(MCAP0_MAGIC)
         if size < len(MCAP0_MAGIC) + tail:
             raise damage_error(path, "is cut off")
@@ -277,6 +277,11 @@ def _messages_of(
             described = Channel.read(ReadDataStream(io.BytesIO(data[at : at + length])))
             channels[described.id] = keyed_channel(described, schemas)
         at += length
+
+
+def foreign_file_error(path: Path) -> InputError:
+    """Error for a file that is no recording."""
+    return InputError(f"{path}: expected an MCAP recording, got another kind of file; {TABLE_CURE}")
 
 
 def damage_error(path: Path, what: str, error: Exception | None = None) -> InputError:

@@ -30,7 +30,7 @@ from recorder.storage.mcap_chunks import (
     LATCHED,
     MESSAGE,
     RECORD,
-    TABLE_CURE,
+    foreign_file_error,
     keyed_channel,
     read_summary,
 )
@@ -126,7 +126,7 @@ class Scan:
         if self._bytes[: self._start] != MCAP0_MAGIC:
             chunk = self._next_chunk(0)
             if chunk is None and not MCAP0_MAGIC.startswith(self._bytes[: self._start]):
-                raise InputError(f"{path}: expected an MCAP recording, got another kind of file; {TABLE_CURE}")
+                raise foreign_file_error(path)
             self.damages.append(Damage(0, "the beginning cannot be read"))
             self._start = self._size if chunk is None else chunk
 
