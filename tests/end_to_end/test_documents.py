@@ -40,6 +40,12 @@ NOT_HERE = {
         ("docker buildx imagetools inspect --format '{{.Manifest.Digest}}' python:3.13.9-slim-trixie", REGISTRY),
         ("docker buildx imagetools inspect --format '{{.Manifest.Digest}}' eclipse/zenoh:1.10.2", REGISTRY),
         ("cp deploy/systemd/*.service /etc/systemd/system/", ROOT_ONLY),
+        (
+            "systemd-run --wait --uid=reactorwatch -p CacheDirectory=reactorwatch"
+            " -E NUMBA_CACHE_DIR=/var/cache/reactorwatch -E XDG_CACHE_HOME=/var/cache"
+            " /opt/reactorwatch/bin/reactorwatch compile",
+            ROOT_ONLY,
+        ),
         ("systemctl enable --now reactorwatch-router reactorwatch@monitor reactorwatch@record", ROOT_ONLY),
         ("pip install 'reactorwatch[metrics]'", INDEX),
     ],
