@@ -36,7 +36,7 @@ demo: $(READY) ## run a reactor with a fault, watch, record and draw it
 test: $(READY) ## the tests, but for the slow ones: ten minutes
 	@$(PYTEST) -m "not slow"
 
-slow: $(READY) ## the slow tests: pages with many commands, whole fleets, studies in small; five minutes
+slow: $(READY) ## the slow tests: pages with many commands, whole fleets, kills and cuts, studies in small; eight minutes
 	@$(PYTEST) -m slow
 
 lint: $(READY) ## style, types, and layers of imports

@@ -25,6 +25,7 @@ NODES = tuple(PORT_OFFSET)
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.slow
 def test_every_node_of_up_has_a_page_with_what_it_has_counted(endpoint: str, start: Start, tmp_path: Path) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     from prometheus_client.parser import text_string_to_metric_families

@@ -54,6 +54,7 @@ def test_a_demonstration_runs_on_a_secured_router_and_each_node_has_its_own_cert
     assert {body.node for body in bodies if isinstance(body, Health)} == set(NODES)
 
 
+@pytest.mark.slow
 def test_up_lets_in_who_has_a_certificate_and_nobody_else(site: Path, tmp_path: Path, start: Start) -> None:
     process = start("up", "--site", site, "--out", tmp_path / "runs", "--speed", "60")
     viewer = connect(bus_of(site / "cstr" / "viewer" / "settings.toml"), "viewer", StopSignal())

@@ -81,6 +81,7 @@ def viewed(settings: Path) -> Iterator[str]:
             assert view.wait(PATIENCE_S) == 0
 
 
+@pytest.mark.slow
 def test_a_browser_shows_the_lines_of_a_run_while_it_runs(page: Browser, settings: Path) -> None:
     with viewed(settings) as address:
         port = urlsplit(address).port

@@ -31,6 +31,7 @@ def run(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LiveRun]:
         yield going
 
 
+@pytest.mark.slow
 def test_a_monitor_that_was_frozen_hears_later_what_it_missed(run: LiveRun) -> None:
     """Stopped for longer than its patience with the plant, while it watches."""
     monitor, plant = run.start_all()
@@ -56,6 +57,7 @@ def test_a_plant_that_is_frozen_is_silent_until_it_goes_on(run: LiveRun) -> None
     assert run.recorded_alarms() == run.expected_alarms()
 
 
+@pytest.mark.slow
 def test_a_router_that_is_killed_and_started_again_costs_no_alarm(run: LiveRun) -> None:
     _, plant = run.start_all()
     for minute in (8.0, 20.0):
@@ -97,6 +99,7 @@ def memory_mb(process: "subprocess.Popen[bytes]") -> float:
     return int(line.split()[1]) / 1024
 
 
+@pytest.mark.slow
 def test_a_flood_of_garbage_and_of_large_payloads_is_refused_and_takes_no_memory(run: LiveRun) -> None:
     monitor, plant = run.start_all()
     run.wait_until(17.0)
@@ -109,6 +112,7 @@ def test_a_flood_of_garbage_and_of_large_payloads_is_refused_and_takes_no_memory
     assert run.recorded_alarms() == run.expected_alarms()
 
 
+@pytest.mark.slow
 def test_a_second_plant_of_the_same_name_is_refused(run: LiveRun) -> None:
     """It has a clock of its own, and publishes for half of the run, a sample after each of the first plant's.
 

@@ -313,6 +313,7 @@ LEAKS_MIN, CUT_AT, BACK_AT = 30.0, 280, 330
 """The leak sets in at row 300, while the first monitor is cut off."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absence", ["cut off", "frozen"])
 def test_who_comes_back_after_another_took_his_plants_over_tells_no_alarm_again_and_loses_none(
     absence: str, bus_config: BusConfig, tmp_path: Path

@@ -142,6 +142,7 @@ def running(host: int, program: str, *arguments: str) -> Iterator[Process]:
         process.kill()
 
 
+@pytest.mark.slow
 def test_two_routers_are_one_bus_and_a_cut_between_them_loses_and_disorders_nothing(hosts: None) -> None:
     with ExitStack() as stack:
         stack.enter_context(running(0, ROUTER, ENDPOINTS[0]))

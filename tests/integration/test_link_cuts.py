@@ -90,7 +90,7 @@ def test_the_first_messages_on_keys_are_heard_though_the_router_was_gone_when_th
     listener.close()
 
 
-@pytest.mark.parametrize("whose", ["recorder", "publisher"])
+@pytest.mark.parametrize("whose", ["recorder", pytest.param("publisher", marks=pytest.mark.slow)])
 def test_what_could_not_be_recovered_is_counted_and_named_in_the_file_and_by_info(tmp_path: Path, whose: Whose) -> None:
     """The publisher remembers a tenth of what was published while the link was down."""
     kept = RATE_PER_S // SIGNALS // 10
@@ -124,6 +124,7 @@ def test_who_begins_to_listen_late_hears_what_was_before(tmp_path: Path, router:
     assert heard == [number // SIGNALS for number in range(len(heard))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("killed", [False, True], ids=["stopped", "killed"])
 def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
     tmp_path: Path, router: Router, killed: bool
@@ -150,6 +151,7 @@ def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
     assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
 
 
+@pytest.mark.slow
 def test_a_stuck_recorder_costs_another_nothing_and_gets_it_all_later(tmp_path: Path) -> None:
     """Its process is stopped for longer than it takes until a link that takes nothing is closed; the other hears on."""
     for found in stick(tmp_path, 3.0, cache_messages=KEPT, rate_per_s=RATE_PER_S):

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from monitor_node.replay.verification import verify
 from reactorwatch.api.files import messages
 
@@ -19,6 +21,7 @@ def looks(run: LiveRun) -> int:
     return len({alarm.time_ns for alarm in run.alarms if alarm.event == "suspected"})
 
 
+@pytest.mark.slow
 def test_three_kills_change_no_alarm(tmp_path: Path) -> None:
     """What was published while it was down, and since it was stored, the plant tells it once more.
 

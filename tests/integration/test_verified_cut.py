@@ -63,6 +63,7 @@ class Counter:
             assert self._changed.wait_for(lambda: self.count >= count, WITHIN_S), f"{self.count} of {count}"
 
 
+@pytest.mark.slow
 def test_a_run_that_was_recorded_over_a_cut_link_is_exact(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, published, judged, said = tmp_path / "run.mcap", Counter(), Counter(), Counter()
     about = {"settings": settings_text({"monitor": MONITOR})}

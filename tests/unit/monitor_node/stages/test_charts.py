@@ -44,6 +44,7 @@ def test_each_chart_alone_finds_a_lasting_shift_of_a_sensor_and_says_whose_it_is
     assert first.unit == "sd"
 
 
+@pytest.mark.slow
 def test_all_charts_together_are_quiet_on_a_sound_plant_and_share_the_budget() -> None:
     names = tuple(kind.name for kind in CHARTS if kind.name != "parameters")
     signals: dict[str, Any] = {item.key: ("C",) for item in CHART_SIGNALS}
