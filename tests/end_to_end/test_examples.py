@@ -33,7 +33,10 @@ def test_a_notebook_is_stored_without_output_and_begins_with_its_title(path: Pat
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells(path) if "outputs" in cell)
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=[pytest.mark.slow] if path.stem == "fleet" else [], id=path.stem) for path in NOTEBOOKS],
+)
 def test_every_cell_runs(path: Path, tmp_path: Path, called: Command) -> None:
     for library in ("matplotlib", *NEEDS.get(path.stem, ())):
         if find_spec(library) is None:

@@ -37,13 +37,14 @@ WITH_CAUSE = (
     ("missing rows", "coolant_flow"),
     ("irregular", "coolant_flow"),
     ("coarsely quantised", "coolant_flow"),
-    ("many outliers", "coolant_flow"),
-    ("correlated noise", "coolant_flow"),
-    ("process noise", "coolant_flow"),
-    ("wrong branch", "coolant_flow"),
-    ("extinguished", "coolant_temperature"),
     ("narrow", "coolant_flow"),
+    pytest.param("many outliers", "coolant_flow", marks=pytest.mark.slow),
+    pytest.param("correlated noise", "coolant_flow", marks=pytest.mark.slow),
+    pytest.param("process noise", "coolant_flow", marks=pytest.mark.slow),
+    pytest.param("wrong branch", "coolant_flow", marks=pytest.mark.slow),
+    pytest.param("extinguished", "coolant_temperature", marks=pytest.mark.slow),
 )
+"""Those marked `slow` take ten seconds together."""
 
 
 def hidden(case: str, *causes: str) -> Hidden:

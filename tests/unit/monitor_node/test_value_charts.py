@@ -19,7 +19,9 @@ CHARTS: dict[str, dict[str, Any]] = {
 """Charts of values, with the settings that they need."""
 
 
-@pytest.mark.parametrize("name", CHARTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "multiple_pca" else []) for name in CHARTS]
+)
 def test_a_chart_of_values_raises_its_alarm_and_resumes_bit_for_bit(name: str) -> None:
     """Stored in the middle of the watch; a signal is missing at times."""
     values = plant(TRAINING + 200, TRAINING + 50, 3)

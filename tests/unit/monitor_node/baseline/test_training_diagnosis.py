@@ -181,7 +181,7 @@ def test_the_alarms_of_a_nominal_plant_are_the_same_with_the_diagnosis_and_witho
     assert found.alarm_messages == given.alarm_messages
 
 
-@pytest.mark.parametrize("is_warm", [False, True])
+@pytest.mark.parametrize("is_warm", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_disturbance_of_the_training_changes_no_model_and_a_lasting_deviation_beside_it_is_found(
     warm: Run, *, is_warm: bool
 ) -> None:
