@@ -44,6 +44,9 @@ def reliability_table(found: Mapping[str, Sequence[Judged]], suspects: Sequence[
                 rows.append([group.name, f"{what} in its interval", f"{100 * level:.0f}", percent(inside)])
         named = [item for item in group.judged if item.verdict not in (NOMINAL, UNKNOWN) and not item.remark]
         rows += _bins(group.name, "verdict", [(item.probability, item.first) for item in named])
+        if named:
+            held = Share.of(set(item.truth) <= set(item.said) for item in named)
+            rows.append([group.name, "hidden cause among those named", "–", percent(held)])
     for nearly in (False, True):
         of_kind = [item for item in suspects if item.nearly is nearly]
         name = NEARLY if nearly else "the model itself"

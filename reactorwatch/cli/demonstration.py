@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
 
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
@@ -28,8 +29,9 @@ from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.processes import Processes, settings_text
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.run_progress import POLL_S, RunProgress
+from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import suspects_text
-from reactorwatch.contract.codec import decode
+from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Fault, Sample
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
@@ -47,6 +49,7 @@ from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.terminal import printable_lines
 from recorder.config import RecorderConfig
+from recorder.policy.own_alarms import DISK_ALARM
 
 PLANT = "demo"
 NODES = ("recorder", "monitor", "plant")
@@ -162,24 +165,47 @@ def _run_nodes(
     assert plant.rows is not None, "a demonstration has an end"
     duration_min = plant.rows * plant.period_min
     progress = RunProgress(bus, PLANT, to_time_ns((plant.rows - 1) * plant.period_min))
+    unwritten: SimpleQueue[str] = SimpleQueue()
+
+    def on_disk_alarm(message: Encoded) -> None:
+        alarm = decode(message.payload, message.encoding)
+        if isinstance(alarm, Alarm) and alarm.event == "raised":
+            unwritten.put(alarm.text)
+
+    bus.subscribe(keys.key(PLANT, keys.ALARM, DISK_ALARM), on_disk_alarm)
     with Processes(settings, logs=folder) as processes, bar("starting the nodes", duration_min) as advance:
         for node in NODES:
             processes.start(node)
         started = time.monotonic()
         while not woken.wait(POLL_S):
+            if not unwritten.empty():
+                break
             ended = processes.exit_codes()
             failed = {node: code for node, code in ended.items() if code or node != "plant"}
             if failed:
                 node, code = next(iter(failed.items()))
-                raise InputError(f"the {node} ended with code {code}; the reason is in {folder / (node + '.log')}")
+                raise InputError(_describe_end(node, code, folder))
             if "plant" in ended:
                 break
             if not progress.started and time.monotonic() - started > START_WITHIN_S:
                 raise InputError(f"no sample within {START_WITHIN_S:g} s of the start; see the .log files in {folder}")
             advance(progress.plant_min, "starting the nodes" if not progress.started else f"running {process}")
-        progress.wait_until_evaluated(lambda seconds: woken.wait(seconds) or stop.is_set)
-        processes.stop(("plant", "monitor", "recorder"))
+        progress.wait_until_evaluated(lambda seconds: woken.wait(seconds) or stop.is_set or not unwritten.empty())
+        ended = processes.stop(("plant", "monitor", "recorder"))
+    if not unwritten.empty():
+        raise InputError(f"{folder} is not complete: {unwritten.get()}; make room, and run it again")
+    for node, code in ended.items():
+        if code and not stop.is_set:
+            raise InputError(_describe_end(node, code, folder))
     return not stop.is_set
+
+
+def _describe_end(node: str, code: int, folder: Path) -> str:
+    """Describe the end of a node that failed, by the last line of its log."""
+    path = folder / f"{node}.log"
+    lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
+    last = next((line for line in reversed(lines) if line.strip()), "it says nothing")
+    return f"the {node} ended with code {code}; the last line of {path}: {last.removeprefix(node + ': ')}"
 
 
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:

@@ -7,6 +7,8 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
@@ -69,3 +71,26 @@ def test_a_full_disk_is_listed_with_the_other_alarms_and_can_be_acknowledged(
         assert "can be acknowledged and nothing else" in shelved.stderr
     gone = called("alarm", "acknowledge", DISK, "--by", "Ada", *at)
     assert (gone.returncode, gone.stderr.count("no recorder of plant 'cstr' answered")) == (2, 1)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A folder on a disk of 300 kB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(folder)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("needs the right to mount a disk of its own")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.mark.slow
+def test_a_demonstration_on_a_full_disk_says_so_in_a_line(small_disk: Path, called: Command) -> None:
+    done = called("demo", "--out", small_disk / "runs", "--speed", "max")
+    assert (done.returncode, done.stdout) == (2, "")
+    *_, said = done.stderr.splitlines()
+    assert said == (
+        f"reactorwatch: {small_disk}/runs is not complete: recording stopped: No space left on device; "
+        "it resumes when a file can be written; make room, and run it again"
+    )

@@ -1,12 +1,17 @@
 """After `reactorwatch compile` no monitor and no diagnosis compiles a kernel: each is loaded from the disk."""
 
+import os
+import signal
 import subprocess
 import sys
+from contextlib import suppress
+from pathlib import Path
 
 import numba
 import pytest
 
 from reactorwatch.codegen.numba_kernel import jit
+from tests.running import WITHIN_S
 
 PROGRAM = """
 import numba
@@ -54,6 +59,27 @@ def test_another_record_finds_every_kernel_compiled() -> None:
     assert (parts > 10, made) == (True, 0)  # all that a look for causes needs was on the disk
     assert int(hits) > 10
     assert missed == "[]"
+
+
+@pytest.mark.parametrize("command", [["compile"], ["diagnose", "record.csv"]], ids=lambda command: command[0])
+def test_ctrl_c_while_kernels_are_compiled_ends_the_command_in_order(command: list[str], tmp_path: Path) -> None:
+    """On a new machine; the interrupt comes when the first kernel is stored, while the next one is compiled."""
+    reactorwatch = [sys.executable, "-m", "reactorwatch"]
+    subprocess.run(
+        [*reactorwatch, "example", "leak", "-o", "record.csv"], cwd=tmp_path, check=True, capture_output=True
+    )
+    cache = tmp_path / "cache"
+    fresh = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "XDG_CACHE_HOME": str(cache)}
+    process = subprocess.Popen(
+        [*reactorwatch, *command], cwd=tmp_path, env=fresh, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    while not any(cache.rglob("*.nbc")):
+        with suppress(subprocess.TimeoutExpired):
+            pytest.fail(f"ended with {process.wait(0.05)} before it had stored a kernel")
+    process.send_signal(signal.SIGINT)
+    said, error = process.communicate(timeout=WITHIN_S)
+    assert (process.returncode, said) == (130, "")
+    assert "Traceback" not in error
 
 
 def test_a_kernel_compiles_where_no_folder_can_be_written_to(monkeypatch: pytest.MonkeyPatch) -> None:

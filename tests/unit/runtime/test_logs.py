@@ -1,13 +1,17 @@
 """A log is a line an event: for people as text, for programs as an object."""
 
 import json
+import subprocess
+import sys
 from datetime import UTC, datetime, timedelta
+from errno import ENOSPC
+from io import StringIO
 from pathlib import Path
 
 import pytest
 import structlog
 
-from reactorwatch.runtime.logs import configure
+from reactorwatch.runtime.logs import LogFile, configure
 
 
 def test_for_programs_each_line_is_an_object_with_the_fields_of_the_event(capsys: pytest.CaptureFixture[str]) -> None:
@@ -40,3 +44,38 @@ def test_for_people_it_is_a_line_of_text(capsys: pytest.CaptureFixture[str]) -> 
     structlog.get_logger().info("alarm", alarm="ewma/T")
     (line,) = capsys.readouterr().err.splitlines()
     assert "alarm=ewma/T" in line
+
+
+class Disk(StringIO):
+    """A file on a disk that may be full."""
+
+    is_full = False
+
+    def write(self, text: str) -> int:
+        """Write, or fail."""
+        if self.is_full:
+            raise OSError(ENOSPC, "No space left on device")
+        return super().write(text)
+
+
+def test_lines_that_a_full_disk_refuses_are_counted_and_the_next_one_says_so() -> None:
+    disk = Disk()
+    log = LogFile(disk)
+    log.write("first\n")
+    disk.is_full = True
+    for _ in range(3):
+        log.write("lost\n")
+    disk.is_full = False
+    log.write("second\n")
+    log.write("third\n")
+    said = "lines of the log that could not be written: 3"
+    assert disk.getvalue().splitlines() == ["first", said, "second", "third"]
+
+
+def test_a_process_whose_log_cannot_be_written_goes_on_to_its_own_end() -> None:
+    program = (
+        "import structlog; from reactorwatch.runtime import logs; logs.configure(); "
+        "[structlog.get_logger().info('row', n=n) for n in range(1000)]; raise SystemExit(7)"
+    )
+    with Path("/dev/full").open("wb") as full:
+        assert subprocess.run([sys.executable, "-c", program], stderr=full, check=False).returncode == 7
