@@ -7,13 +7,14 @@ import contextlib
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 
 import pytest
 
 from benchmarks.link_cuts import (
     Heard,
     Manner,
+    Proxy,
     Router,
     Whose,
     connect_client,
@@ -88,6 +89,39 @@ def test_the_first_messages_on_keys_are_heard_though_the_router_was_gone_when_th
     assert sorted(heard.get(timeout=PATIENCE_S) for _ in published) == sorted(published)
     publisher.close()
     listener.close()
+
+
+def test_what_begins_while_the_link_of_a_listener_is_cut_is_heard_from_its_beginning(router: Router) -> None:
+    """A stream that is new, and new keys of one that is known; both go on when the link is back."""
+    proxy = Proxy(router.config.endpoint)
+    listener, publisher = connect_client(BusConfig(endpoint=proxy.endpoint)), connect_client(router.config)
+    heard: SimpleQueue[tuple[str, bytes]] = SimpleQueue()
+    listener.subscribe("reactor/*/chart/**", lambda message: heard.put((message.key, message.payload)))
+    published, arrived = list[tuple[str, bytes]](), list[tuple[str, bytes]]()
+
+    def publish(*names: str) -> None:
+        for name in names:
+            published.append((f"reactor/{name}", b"%d" % len(published)))
+            publisher.publish(Encoded(*published[-1], ""))
+
+    publish("known/chart/old")
+    arrived.append(heard.get(timeout=PATIENCE_S))
+    new = ("known/chart/old", "known/chart/new", "new/chart/T", "new/chart/C")
+    with proxy.cut("closed"):
+        for _ in range(50):
+            publish(*new)
+    while len(arrived) == 1:
+        publish(*new)
+        with contextlib.suppress(Empty):
+            arrived.append(heard.get(timeout=0.01))
+    while len(arrived) < len(published):
+        arrived.append(heard.get(timeout=PATIENCE_S))
+    for plant in ("known", "new"):  # each in its order
+        of_plant = [[item for item in items if item[0].split("/")[1] == plant] for items in (arrived, published)]
+        assert of_plant[0] == of_plant[1]
+    publisher.close()
+    listener.close()
+    proxy.close()
 
 
 @pytest.mark.parametrize("whose", ["recorder", pytest.param("publisher", marks=pytest.mark.slow)])

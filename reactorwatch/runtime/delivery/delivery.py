@@ -40,7 +40,8 @@ class Delivery:
     Nothing is delivered before `start`.
 
     Zenoh recovers messages missing on each key; but on a key that it has just subscribed to it was seen to lose some
-    without noticing. So before anything is given up, its publisher is queried once more.
+    without noticing, and it leaves out what was published on a new key before the first message that arrives. So before
+    anything is given up, and before a stream starts with another number than 0, its publishers are queried.
 
     Args:
         handler: called with the messages, as many at a time as can be delivered.
@@ -57,7 +58,9 @@ class Delivery:
         self._handler = handler
         self._on_gap = on_gap
         self._query_stream = query_stream
-        self._buffer: ReorderBuffer[Encoded] = ReorderBuffer(await_history=True, size=lambda item: len(item.payload))
+        self._buffer: ReorderBuffer[Encoded] = ReorderBuffer(
+            await_history=True, size=lambda item: len(item.payload), start_ns=time.monotonic_ns()
+        )
         self._changed = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._give_up_when_due, name="delivery", daemon=True)
@@ -136,7 +139,6 @@ class Delivery:
             self._handler(batch)
 
     def _give_up_when_due(self) -> None:
-        queried_ns = 0
         while True:
             with self._changed:
                 now_ns, due_ns = time.monotonic_ns(), self._buffer.due_ns()
@@ -145,10 +147,7 @@ class Delivery:
                     now_ns, due_ns = time.monotonic_ns(), self._buffer.due_ns()
                 if self._closed:
                     return
-                overdue = self._buffer.overdue_streams(now_ns)
-                if all(item.since_ns <= queried_ns for item in overdue.values()):
-                    self._deliver(self._buffer.release_overdue(now_ns))
-                    continue
-                queried_ns = now_ns
-            for stream, item in islice(overdue.items(), MAX_STREAMS_QUERIED):
-                self.receive(list(self._query_stream(stream, (now_ns - item.after_ns) / 1e9)))
+                self._deliver(self._buffer.release_overdue(now_ns, only_queried=True))
+                overdue = self._buffer.take_overdue(now_ns)
+            for stream, after_ns in islice(overdue.items(), MAX_STREAMS_QUERIED):
+                self.receive(list(self._query_stream(stream, (now_ns - after_ns) / 1e9)))

@@ -17,8 +17,9 @@ out of order.
 A new subscriber queries every publisher for its last number, and perhaps for its history; until that is complete all
 messages are held (`await_history`). It queries again while something is missing (`history_complete`): during a large
 history, live messages may be dropped on the way, and Zenoh does not notice before it has received the first of a key.
-The subscriber can then tell history from live messages. A stream without a known last number starts with 0 or, if
-another number arrives first, when nothing older has arrived for `START_WINDOW_NS`.
+The subscriber can then tell history from live messages. A stream without a known last number starts with 0. If another
+number arrives first, the stream may have begun while the link was down, so its publisher is queried too; it then starts
+with the oldest number, when nothing older has arrived for `START_WINDOW_NS`.
 """
 
 from collections import deque
@@ -60,32 +61,25 @@ class Gap(NamedTuple):
     noticed_ns: int
 
 
-class Overdue(NamedTuple):
-    """A missing message of a stream whose timeout is over.
-
-    Attributes:
-        since_ns: time when the first message arrived that is held because of it.
-        after_ns: time when a message arrived that was published before it.
-    """
-
-    since_ns: int
-    after_ns: int
-
-
 class ReorderBuffer(Generic[Item]):
     """Releases messages in the order of their numbers.
 
     Args:
         await_history: hold all messages until `end_history`.
         size: size of a message in bytes; by default 0.
+        start_ns: time when the subscription began.
     """
 
-    def __init__(self, *, await_history: bool = False, size: Callable[[Item], int] = lambda _: 0) -> None:
+    def __init__(
+        self, *, await_history: bool = False, size: Callable[[Item], int] = lambda _: 0, start_ns: int = 0
+    ) -> None:
         self._size = size
         self._streams: dict[tuple[int, str], StreamState[Item]] = {}
         self._by_key: dict[str, StreamState[Item]] = {}  # stream that a key's last released message was of
         self._holding: dict[tuple[int, str], StreamState[Item]] = {}  # all streams with held messages; perhaps others
         self._await_history = await_history
+        self._start_ns = start_ns
+        self._starts_known_ns: dict[str, int] = {}  # time up to which a stream was searched for unknown starts
         self._unconfirmed = deque[tuple[int, tuple[int, str]]]()  # when each stream was new, oldest first
 
     def accept_next(self, publisher: int, key: str, number: int, now_ns: int) -> bool:
@@ -140,15 +134,24 @@ class ReorderBuffer(Generic[Item]):
             hold.recovered_ns = now_ns
             self._holding[state.name] = state
         hold.newest = max(hold.newest, number)
+        if number == 0 and state.expected is None:
+            state.expected = 0
         yield from self._release_contiguous(state, hold)
         if hold.is_full:
             yield from self._give_up(state, hold, now_ns, now_ns, hold.newest)
 
-    def release_overdue(self, now_ns: int) -> Iterator[Item | Gap]:
-        """Give up missing messages whose timeout is over; yields the gaps and the messages released."""
+    def release_overdue(self, now_ns: int, *, only_queried: bool = False) -> Iterator[Item | Gap]:
+        """Give up missing messages whose timeout is over; yields the gaps and the messages released.
+
+        Args:
+            now_ns: clock reading.
+            only_queried: leave out streams that `take_overdue` has not named since their oldest held message arrived.
+        """
         for state in list(self._holding.values()):
             hold = state.hold
             if hold is None or hold.due_ns is None or now_ns < hold.due_ns:
+                continue
+            if only_queried and not hold.is_queried:
                 continue
             recovery_end_ns = hold.recovered_ns + RECOVERY_TIMEOUT_NS
             reached = hold.newest if now_ns >= recovery_end_ns else state.reached_by_all
@@ -206,18 +209,22 @@ class ReorderBuffer(Generic[Item]):
         self._holding = {name: state for name, state in self._holding.items() if due.get(name) is not None}
         return min((due_ns for due_ns in due.values() if due_ns is not None), default=None)
 
-    def overdue_streams(self, now_ns: int) -> dict[str, Overdue]:
-        """Streams with an overdue message; those with an unknown start are left out, as nothing is missing there."""
-        overdue: dict[str, Overdue] = {}
+    def take_overdue(self, now_ns: int) -> dict[str, int]:
+        """Streams in which a message is overdue, or may be missing before an unknown start; each gap is named once.
+
+        Returns:
+            Time by stream after which what is missing was published: when the message before it arrived or, with an
+            unknown start, when the subscription began or publishers were last queried for such a start.
+        """
+        overdue: dict[str, int] = {}
         for (_, stream), state in self._holding.items():
             hold = state.hold
-            if hold is None or state.expected is None or not hold.held:
+            if hold is None or hold.due_ns is None or hold.due_ns > now_ns or hold.is_queried:
                 continue
-            if hold.due_ns is not None and hold.due_ns <= now_ns:
-                since_ns = min(arrival_ns for arrival_ns, _ in hold.held.values())
-                other = overdue.get(stream, Overdue(since_ns, since_ns))
-                after_ns = min(other.after_ns, since_ns, hold.after_ns)
-                overdue[stream] = Overdue(min(other.since_ns, since_ns), after_ns)
+            hold.queried_ns = now_ns
+            is_start = state.expected is None
+            after_ns = self._starts_known_ns.get(stream, self._start_ns) if is_start else hold.after_ns
+            overdue[stream] = min(overdue.get(stream, after_ns), after_ns, hold.first_arrival_ns)
         return overdue
 
     def _stream(self, publisher: int, stream: str) -> StreamState[Item]:
@@ -246,6 +253,16 @@ class ReorderBuffer(Generic[Item]):
             if self._by_key.get(key) is state:
                 del self._by_key[key]
 
+    def _mark_starts_known(self, stream: str, until_ns: int) -> None:
+        """Mark that all publishers of a stream were queried for what they published until this time.
+
+        Otherwise each made-up publisher would cause a query for everything since the subscription began.
+        """
+        self._starts_known_ns.pop(stream, None)
+        self._starts_known_ns[stream] = until_ns
+        if len(self._starts_known_ns) > MAX_STREAMS:
+            del self._starts_known_ns[next(iter(self._starts_known_ns))]
+
     def _release(self, hold: HoldState[Item], number: int) -> Item:
         item = hold.held.pop(number)[1]
         hold.held_bytes -= self._size(item)
@@ -272,6 +289,8 @@ class ReorderBuffer(Generic[Item]):
         numbers = sorted(hold.held)
         arrival_ns = [hold.held[number][0] for number in numbers]
         noticed_ns = list(accumulate(reversed(arrival_ns), min))[::-1]  # earliest arrival at or behind each number
+        if is_start and hold.queried_ns:
+            self._mark_starts_known(state.stream, hold.queried_ns)
         for number, known_ns in zip(numbers, noticed_ns, strict=True):
             is_behind_gap = state.expected is not None and number > state.expected
             if is_behind_gap and (is_start or known_ns > since_ns or number > reached):
@@ -281,7 +300,7 @@ class ReorderBuffer(Generic[Item]):
             items.append(self._release(hold, number))
         hold.due_ns = None
         if hold.held:
-            first_ns = min(arrival for arrival, _ in hold.held.values())
+            first_ns = hold.first_arrival_ns
             hold.due_ns = first_ns + TIMEOUT_NS
             self._holding[state.name] = state
             hold.recovered_ns = max(hold.recovered_ns, first_ns)

@@ -31,6 +31,7 @@ class HoldState(Generic[Item]):
     newest: int = 0
     due_ns: int | None = None  # when to check whether to hold no longer; None: nothing is held
     after_ns: int = 0  # when the last message before the first held one arrived
+    queried_ns: int = 0  # when publishers were last queried for what is missing
     recovered_ns: int = 0  # when a missing message arrived last, or the first one was found missing
     reached: dict[str, int] = field(default_factory=dict)  # newest number by key, unless it is below the expected one
 
@@ -44,6 +45,16 @@ class HoldState(Generic[Item]):
     def is_full(self) -> bool:
         """True if more is held than there is room for."""
         return len(self.held) > MAX_HELD or self.held_bytes > MAX_HELD_BYTES
+
+    @property
+    def first_arrival_ns(self) -> int:
+        """Time when the first of the held messages arrived; 0 if none is held."""
+        return min((arrival_ns for arrival_ns, _ in self.held.values()), default=0)
+
+    @property
+    def is_queried(self) -> bool:
+        """True if publishers were queried after the first of the held messages arrived."""
+        return self.first_arrival_ns <= self.queried_ns
 
     @property
     def complete_from(self) -> int:

@@ -104,6 +104,71 @@ def test_the_query_reaches_back_to_the_message_before_the_gap(monkeypatch: pytes
     assert [item.payload.decode() for item in items if isinstance(item, Encoded)] == [*map(str, range(before + 4))]
 
 
+def test_a_stream_that_began_while_the_link_was_down_is_asked_for_from_its_beginning(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And again only for what was published since: a made-up publisher costs its victim little."""
+    clock = SimpleNamespace(now_ns=SECOND)
+    times = SimpleNamespace(monotonic_ns=lambda: clock.now_ns, time_ns=time.time_ns)
+    monkeypatch.setattr("reactorwatch.runtime.delivery.delivery.time", times)
+    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    asked: SimpleQueue[float] = SimpleQueue()
+
+    def ask(stream: str, since_s: float) -> list[SequencedMessage]:
+        asked.put(since_s)
+        return [message(number) for number in range(100)]
+
+    delivery = Delivery(each(heard), heard.put, ask)
+    delivery.start()
+    clock.now_ns += 600 * SECOND  # the link was down for most of them
+    delivery.receive([message(70)])
+    clock.now_ns += SECOND
+    delivery.receive([message(71)])
+    assert asked.get(timeout=WITHIN_S) == 601.0
+    items = [heard.get(timeout=WITHIN_S) for _ in range(100)]
+    assert [item.payload.decode() for item in items if isinstance(item, Encoded)] == [*map(str, range(100))]
+    for made_up in (2, 3):
+        clock.now_ns += 10 * SECOND
+        delivery.receive([message(7)._replace(publisher=made_up)])
+        clock.now_ns += SECOND
+        delivery.receive([message(8)._replace(publisher=made_up)])
+        asked_s = asked.get(timeout=WITHIN_S)
+        assert [heard.get(timeout=WITHIN_S) for _ in range(2)]
+    delivery.close()
+    assert asked_s == 11.0
+
+
+def test_each_stream_is_asked_for_before_its_messages_are_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another stream was asked for while a message of this one was missing already, but not yet overdue."""
+    timeout_ns = 20_000_000
+    monkeypatch.setattr(reorder_buffer, "TIMEOUT_NS", timeout_ns)
+    clock = SimpleNamespace(now_ns=SECOND)
+    times = SimpleNamespace(monotonic_ns=lambda: clock.now_ns, time_ns=time.time_ns)
+    monkeypatch.setattr("reactorwatch.runtime.delivery.delivery.time", times)
+    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    asked: SimpleQueue[str] = SimpleQueue()
+
+    def of(kind: str, number: int) -> SequencedMessage:
+        return SequencedMessage(1, number, Encoded(f"reactor/x/{kind}/T", str(number).encode(), ""))
+
+    def ask(stream: str, _since_s: float) -> list[SequencedMessage]:
+        asked.put(stream)
+        return [of(stream.split("/")[2], 1)]
+
+    delivery = Delivery(each(heard), heard.put, ask)
+    delivery.start()
+    delivery.receive([of("estimate", 0), of("chart", 0)])
+    delivery.receive([of("estimate", 2)])
+    clock.now_ns += timeout_ns // 2
+    delivery.receive([of("chart", 2)])
+    for stream in ("reactor/x/estimate", "reactor/x/chart"):
+        clock.now_ns += timeout_ns // 2
+        assert asked.get(timeout=WITHIN_S) == stream
+    items = [heard.get(timeout=WITHIN_S) for _ in range(6)]
+    delivery.close()
+    assert not any(isinstance(item, Gap) for item in items)
+
+
 def test_what_waits_is_handed_on_when_the_bus_is_closed() -> None:
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     delivery = Delivery(each(heard), heard.put)
