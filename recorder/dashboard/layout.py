@@ -105,7 +105,8 @@ class Layout:
             over_time = [item for item in placed if isinstance(item.view, TimePlot | StateLines)]
             rest = [item for item in placed if item not in over_time]
             columns = [self._column(title, number, items) for number, items in enumerate((over_time, rest)) if items]
-            return _with_stable_id(rrb.Horizontal(*columns, column_shares=[3, 2][: len(columns)], name=title), title)
+            # a grid and not a row: on a phone it puts the second column below the first
+            return _with_stable_id(rrb.Grid(*columns, column_shares=[3, 2][: len(columns)], name=title), title)
         views = [_with_stable_id(self._view(item), title, item.path) for item in placed]
         if tab.arranged == "grid" and len(placed) > 1:
             return _with_stable_id(rrb.Grid(*views, grid_columns=2, name=title), title)

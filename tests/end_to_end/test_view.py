@@ -22,6 +22,7 @@ from .browser import Browser, browser
 from .conftest import PATIENCE_S, REACTORWATCH, Command
 
 LEAST_PIXELS, LEAST_WIDTH = 300, 200
+PHONE = (390, 844)
 
 
 @pytest.fixture
@@ -96,6 +97,9 @@ def test_a_browser_shows_the_lines_of_a_run_while_it_runs(page: Browser, setting
             png = page.screenshot()
             colours = {"measured": MEASURED, "predicted": PREDICTED, "input": INPUT}
             found = {name: columns_of(png, colour) for name, colour in colours.items()}
+        page.resize(*PHONE)
+        while np.ptp(columns_of(page.screenshot(), INPUT)) < 0.7 * PHONE[0]:  # a plot has the width of the phone
+            assert time.monotonic() < deadline
     assert not listens("127.0.0.1", port), "the viewer ends with the command"
 
 
