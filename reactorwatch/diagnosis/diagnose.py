@@ -137,7 +137,7 @@ def diagnose(
                 "the residual is small, but not white: the course in time may be rougher than the fitted profile"
             )
     lasting: LastingResult | None = None
-    if verdict in (NAMED, AMBIGUOUS) and _may_last(result, best, model):
+    if verdict in (NAMED, AMBIGUOUS) and _may_last(result, best, model, uncertain or {}):
         lasting = prefer_lasting(search, result, best, model, uncertain or {})
         if lasting is not None:
             result, best, unknown = lasting.result, lasting.result.hypotheses[0], None
@@ -240,10 +240,12 @@ def _locations(best: FittedHypothesis, alternatives: Sequence[FittedHypothesis])
     return result
 
 
-def _may_last(result: SearchResult, best: FittedHypothesis, model: ProcessModel) -> bool:
-    """Return true if the best hypothesis drifts, and much process noise hides how well it simulates."""
+def _may_last(
+    result: SearchResult, best: FittedHypothesis, model: ProcessModel, uncertain: Mapping[str, float]
+) -> bool:
+    """Return true if the best hypothesis drifts, or has uncertain parameters, and process noise hides its errors."""
     profiles = [profile.name for profile in best.hypothesis.profiles]
-    return profiles != [CONSTANT.name] and _seems_noisy(result, model)
+    return (profiles != [CONSTANT.name] or bool(uncertain)) and _seems_noisy(result, model)
 
 
 def _seems_noisy(result: SearchResult, model: ProcessModel) -> bool:

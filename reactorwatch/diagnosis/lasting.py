@@ -3,8 +3,9 @@
 A filter with much process noise follows the measurements whatever its model lacks, so its likelihood hardly
 distinguishes a cause that lasts from one that drifts with the error of the model. Where the best explanation needs such
 noise, causes that are there from the beginning and stay are fitted once more without process noise, together with the
-uncertain parameters. If the one with the smallest error simulates held-out rows better than the explanation that
-drifts, each fitted to the others, it is the better explanation.
+uncertain parameters. A model with uncertain parameters may lack several terms that last; so further causes are added
+to the best one by one, as long as each makes the simulation of held-out rows much better. If the result simulates
+held-out rows better than the explanation that drifts, each fitted to the other rows, it is the better explanation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,8 +38,11 @@ from reactorwatch.process.model import ProcessModel
 BETTER = 0.95
 """Ratio of held-out errors below which one explanation simulates better than another."""
 
-MOST_CAUSES = 6
-"""Number of single causes that are fitted."""
+MUCH_BETTER, FAR = 0.85, 2.0
+"""Ratio of held-out errors below which a further cause is added, and beyond which none is tried."""
+
+MOST_CAUSES, MOST_TOGETHER, BRANCHES = 8, 3, 2
+"""Number of single causes that are fitted, of causes in one explanation, and of explanations to which one is added."""
 
 FIRST_STEPS, STEPS, ROUNDS = 4, 12, 2
 """Steps from each start, from the best start, and estimates of the error's size."""
@@ -48,17 +52,17 @@ _DAMPING, _LARGEST_DAMPING, _CONVERGED = 1e-3, 1e4, 0.05
 
 @dataclass(frozen=True, eq=False)
 class LastingFit:
-    """A lasting cause fitted as a simulation.
+    """Lasting causes fitted as a simulation.
 
     Attributes:
-        effect: the cause.
-        values: size, constants of the effect and uncertain parameters, by name in the extended model.
+        effects: the causes.
+        values: sizes, constants of the effects and uncertain parameters, by name in the extended model.
         sds: their standard deviations, if the errors of the simulation were white.
         error_sd: root mean square error of a fit to all rows, shape (n_y,).
         held_out: root mean square error on held-out rows, of a fit to the others, shape (n_y,).
     """
 
-    effect: Effect
+    effects: tuple[Effect, ...]
     values: Mapping[str, float]
     sds: Mapping[str, float]
     error_sd: Array
@@ -94,15 +98,42 @@ def prefer_lasting(
     if is_near_noise(errors, result.noise.sensor_sd(model.output_names)):
         return None
     drifting = errors.simulation
-    fits = [fit_lasting(model, effect, uncertain, run) for effect in _likely_causes(search, result)]
+    causes = _likely_causes(search, result)
+    fits = [fit_lasting(model, (effect,), uncertain, run) for effect in causes]
     usable = [item for item in fits if item is not None]
     if not usable:
         return None
-    first = min(usable, key=lambda item: float(np.mean(np.log(item.error_sd))))
-    if not _worst(first.held_out, drifting) < BETTER:
+    equal: Sequence[LastingFit] = sorted(usable, key=_mean_error)
+    if uncertain and _worst(equal[0].held_out, drifting) < FAR:
+        equal = _add_causes(equal, causes, model, uncertain, run)
+    if not _worst(equal[0].held_out, drifting) < BETTER:
         return None
-    near = [item for item in usable if item is not first and _worst(first.error_sd, item.error_sd) >= BETTER]
-    return _as_result(search, [first, *near], model, uncertain)
+    near = [item for item in equal[1:] if _worst(equal[0].error_sd, item.error_sd) >= BETTER]
+    return _as_result(search, [equal[0], *near], model, uncertain)
+
+
+def _add_causes(
+    fits: Sequence[LastingFit], causes: Sequence[Effect], model: ProcessModel, uncertain: Mapping[str, float], run: Run
+) -> Sequence[LastingFit]:
+    """Fits with further causes, as long as one makes the simulation of held-out rows much better; the best first."""
+    while len(fits[0].effects) < MOST_TOGETHER:
+        longer: dict[frozenset[Effect], LastingFit] = {}
+        for base, effect in product(fits[:BRANCHES], causes):
+            together = frozenset((*base.effects, effect))
+            if effect not in base.effects and together not in longer:
+                fit = fit_lasting(model, (*base.effects, effect), uncertain, run, base.values)
+                if fit is not None:
+                    longer[together] = fit
+        ranked = sorted(longer.values(), key=_mean_error)
+        if not ranked or not _worst(ranked[0].held_out, fits[0].held_out) < MUCH_BETTER:
+            break
+        fits = ranked
+    return fits
+
+
+def _mean_error(fit: LastingFit) -> float:
+    """Mean logarithm of the errors of a fit to all rows."""
+    return float(np.mean(np.log(fit.error_sd)))
 
 
 def _worst(errors: Array, others: Array) -> float:
@@ -122,16 +153,23 @@ def _likely_causes(search: Search, result: SearchResult) -> list[Effect]:
     return usable[:MOST_CAUSES]
 
 
-def fit_lasting(model: ProcessModel, effect: Effect, uncertain: Mapping[str, float], run: Run) -> LastingFit | None:
-    """Fit a constant deviation and the uncertain parameters as a simulation; None if that diverges.
+def fit_lasting(
+    model: ProcessModel,
+    effects: tuple[Effect, ...],
+    uncertain: Mapping[str, float],
+    run: Run,
+    start: Mapping[str, float] | None = None,
+) -> LastingFit | None:
+    """Fit constant deviations and the uncertain parameters as a simulation; None if that diverges.
 
     Args:
         model: process model of the plant.
-        effect: the cause.
+        effects: the causes.
         uncertain: standard deviations of uncertain parameters, by name.
         run: the record.
+        start: values of a fit without the last cause.
     """
-    fitter = _SimulationFitter(model, effect, uncertain, run)
+    fitter = _SimulationFitter(model, effects, uncertain, run, start or {})
     fitted = fitter.fit()
     if fitted is None:
         return None
@@ -140,25 +178,37 @@ def fit_lasting(model: ProcessModel, effect: Effect, uncertain: Mapping[str, flo
     errors, unseen = (run.measured - item.innovations.prediction for item in (fitted[1], without))
     values = dict(zip(fitter.names, fitted[0].tolist(), strict=True))
     sds = dict(zip(fitter.names, fitter.sds(*fitted).tolist(), strict=True))
-    return LastingFit(effect, values, sds, _rms(errors), _rms(unseen[hidden]))
+    return LastingFit(effects, values, sds, _rms(errors), _rms(unseen[hidden]))
 
 
 class _SimulationFitter:
     """Least squares of a simulation's error, with priors and bounds."""
 
-    def __init__(self, model: ProcessModel, effect: Effect, uncertain: Mapping[str, float], run: Run) -> None:
-        prefix, self._extended, self._run = effect.prefix(model), effect.extend(model), run
-        self.names = (f"{prefix}.size", *(f"{prefix}.{item.name}" for item in effect.constants), *uncertain)
+    def __init__(
+        self,
+        model: ProcessModel,
+        effects: Sequence[Effect],
+        uncertain: Mapping[str, float],
+        run: Run,
+        known: Mapping[str, float],
+    ) -> None:
+        self._extended, self._run = model, run
+        for effect in effects:
+            self._extended = effect.extend(self._extended)
+        self.names = (*(name for effect in effects for name in _names(effect)), *uncertain)
         parameters = [self._extended.parameter(name) for name in self.names]
         self._lower = np.array([item.lower for item in parameters])
         self._upper = np.array([item.upper for item in parameters])
         self._mean = np.array([item.value for item in parameters])
-        sds = [effect.upper - effect.lower, *(item.sd for item in effect.constants), *uncertain.values()]
-        self._weight = np.array(sds) ** -2.0
+        sds = {name: sd for effect in effects for name, sd in _prior_sds(effect).items()} | dict(uncertain)
+        self._weight = np.array([sds[name] for name in self.names]) ** -2.0
+        start = np.array([known.get(name, mean) for name, mean in zip(self.names, self._mean, strict=True)])
+        first = self.names.index(_names(effects[-1])[0])
+        shifts = [np.zeros(start.size)] if known else _shifts(self.names, uncertain)
         self._first = [
-            np.clip(start + shift, self._lower, self._upper)
-            for start in _starts(effect, self._mean)
-            for shift in _shifts(effect, list(uncertain.values()))
+            np.clip(near + shift, self._lower, self._upper)
+            for near in _starts(effects[-1], start, first)
+            for shift in shifts
         ]
         sd = [max(float(np.nanstd(column)), 1e-12) for column in run.measured.T]
         self._ekf = FaultFilter(self._extended, (), self._noise(sd), float(np.median(np.diff(run.time_min))))
@@ -204,7 +254,7 @@ class _SimulationFitter:
             while damping < _LARGEST_DAMPING:
                 damped = information + damping * np.diag(np.diag(information))
                 step = solve_bounded(damped, gradient, self._lower - best[0], self._upper - best[0])[1]
-                trial = best[0] + step
+                trial = np.clip(best[0] + step, self._lower, self._upper)
                 other = (trial, self._evaluate(trial))
                 if self._loss(*other) < before:
                     best, damping = other, 0.1 * damping
@@ -236,20 +286,40 @@ class _SimulationFitter:
         return Noise(tuple(sd), (0.0,) * len(self._extended.states))
 
 
-def _starts(effect: Effect, mean: Array) -> list[Array]:
-    """Initial parameters: the neutral size; of an effect with constants a typical one, at all their start values."""
+def _names(effect: Effect) -> tuple[str, ...]:
+    """Names of the size and the constants of an effect in a model that it extends once."""
+    return (f"{effect.name}.size", *(f"{effect.name}.{item.name}" for item in effect.constants))
+
+
+def _prior_sds(effect: Effect) -> dict[str, float]:
+    """Standard deviations of the priors of an effect's size and constants."""
+    sds = (effect.upper - effect.lower, *(item.sd for item in effect.constants))
+    return dict(zip(_names(effect), sds, strict=True))
+
+
+def _starts(effect: Effect, values: Array, first: int) -> list[Array]:
+    """Initial parameters: the neutral size; of an effect with constants a typical one, at all their start values.
+
+    Args:
+        effect: the effect.
+        values: values of all parameters.
+        first: index of the effect's size.
+    """
     if not effect.constants and not effect.start_values:
-        return [mean]
-    sizes = effect.start_values or (effect.typical,)
-    constants = product(*((item.value, *item.start_values) for item in effect.constants))
-    rest = mean[1 + len(effect.constants) :]
-    return [np.array([size, *values, *rest]) for values in constants for size in sizes]
+        return [values]
+    result = []
+    for constants in product(*((item.value, *item.start_values) for item in effect.constants)):
+        for size in effect.start_values or (effect.typical,):
+            start = values.copy()
+            start[first : first + 1 + len(constants)] = size, *constants
+            result.append(start)
+    return result
 
 
-def _shifts(effect: Effect, sds: Sequence[float]) -> list[Array]:
+def _shifts(names: Sequence[str], uncertain: Mapping[str, float]) -> list[Array]:
     """Shifts of the uncertain parameters in starts: none, and all by a standard deviation."""
-    own = np.zeros(1 + len(effect.constants))
-    return [np.append(own, sign * np.array(sds)) for sign in (0.0, -1.0, 1.0)[: 3 if sds else 1]]
+    sds = np.array([uncertain.get(name, 0.0) for name in names])
+    return [sign * sds for sign in (0.0, -1.0, 1.0)[: 3 if uncertain else 1]]
 
 
 def _as_result(
@@ -262,9 +332,9 @@ def _as_result(
     period_min = float(np.median(np.diff(run.time_min)))
     items = []
     for fit in fits:
-        hypothesis = Hypothesis(FaultFilter(about, (fit.effect,), noise, period_min), (constant,))
-        own = [value for name, value in fit.values.items() if name not in uncertain]
-        start = (np.array(own),)
+        profiles = (constant,) * len(fit.effects)
+        hypothesis = Hypothesis(FaultFilter(about, fit.effects, noise, period_min), profiles)
+        start = [np.array([fit.values[name] for name in _names(effect)]) for effect in fit.effects]
         fitted = hypothesis.evaluate(run, start) if fit is best else hypothesis.fit(run, start)
         items.append(search.score_fit(hypothesis, fitted))
     nominal = Hypothesis(FaultFilter(about, (), noise, period_min), ())
@@ -275,5 +345,7 @@ def _as_result(
 
 
 def _rms(errors: Array) -> Array:
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.sqrt(np.nanmean(np.square(errors), axis=0)))
+    """Root mean square of the finite errors of each output; infinite if there is none, as the simulation diverged."""
+    count = np.sum(np.isfinite(errors), axis=0)
+    mean = np.nansum(np.where(np.isfinite(errors), np.square(errors), 0.0), axis=0) / np.maximum(count, 1)
+    return np.asarray(np.where(count > 0, np.sqrt(mean), np.inf))

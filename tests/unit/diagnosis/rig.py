@@ -14,6 +14,7 @@ from reactorwatch.records.record import Record
 PERIOD_MIN = 1 / 15
 BRIM_V = 10.0
 NOISE_V = 0.01
+LOWER_SPILL_PER_MIN = 30.0
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,8 @@ class Rig:
     onset_min: float = 0.0
     brim: float = BRIM_V
     caught: float = 0.5
+    lower_brim: float = np.inf
+    outlet_power: float = 0.5
 
 
 def record_of(rig: Rig, seed: int, rows: int = 1500) -> Record:
@@ -55,7 +58,10 @@ def _next(rig: Rig, start_min: float, levels: Array, u: float) -> Array:
             upper, above = np.sqrt(x[0]), x[0] - rig.brim if over else 0.0
             return [
                 pump - (outlet + leak) * upper - spill * above,
-                outlet * upper - 3 * np.sqrt(x[1]) + rig.caught * spill * above,
+                outlet * upper
+                - 3 * x[1] ** rig.outlet_power
+                + rig.caught * spill * above
+                - LOWER_SPILL_PER_MIN * max(x[1] - rig.lower_brim, 0.0),
             ]
 
         brim = _Brim(-1.0 if over else 1.0, rig.brim)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import FittedProfile, PiecewiseLinear, Step
 from reactorwatch.diagnosis.lasting import fit_lasting, prefer_lasting
@@ -11,18 +12,19 @@ from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, Searc
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
 from reactorwatch.process.library.cascaded_tanks.model import tanks
-from tests.unit.diagnosis.rig import NOISE_V, Rig, record_of
+from tests.unit.diagnosis.rig import LOWER_SPILL_PER_MIN, NOISE_V, Rig, record_of
 
 CONSTANTS = ("k1", "k2", "k3", "k4")
-OVERFLOW, BIAS, PUMP = (
-    next(item for item in TANK_EFFECTS if item.name == name) for name in ("overflow", "level_bias", "pump_gain")
+OVERFLOW, BIAS, PUMP, LOWER_OUTLET, LOWER_OVERFLOW = (
+    next(item for item in TANK_EFFECTS if item.name == name)
+    for name in ("overflow", "level_bias", "pump_gain", "lower_outlet", "lower_overflow")
 )
 
 
 def test_a_lasting_cause_is_fitted_together_with_the_uncertain_constants() -> None:
     run = make_run(record_of(Rig(overflow_per_min=10.0, brim=7.5, caught=0.2), seed=5, rows=700), tanks())
     model = tanks().with_values({"k1": 2.5, "k2": 3.6, "k3": 3.5, "k4": 2.6})
-    fit = fit_lasting(model, OVERFLOW, dict.fromkeys(CONSTANTS, 1.0), run)
+    fit = fit_lasting(model, (OVERFLOW,), dict.fromkeys(CONSTANTS, 1.0), run)
     assert fit is not None
     # The scale of the upper level is not observed: flows and products that do not depend on it are.
     assert fit.values["k3"] == pytest.approx(3.0, rel=0.05)
@@ -54,3 +56,28 @@ def test_a_curve_that_does_not_hold_on_other_rows_loses_to_a_lasting_cause_that_
 def test_a_cause_that_did_set_in_later_is_kept() -> None:
     search, result = searched(Rig(pump=0.06, onset_min=22.0), PUMP, Step)
     assert prefer_lasting(search, result, result.hypotheses[0], tanks(), {}) is None
+
+
+def test_terms_that_a_rig_lacks_together_are_named_together() -> None:
+    """The upper tank overflows, and the flow of the lower outlet grows faster than the root of the level."""
+    record = record_of(Rig(overflow_per_min=10.0, brim=9.0, outlet_power=0.65), seed=7, rows=700)
+    found = diagnose(record, tanks(), uncertain=dict.fromkeys(CONSTANTS, 1.5))
+    assert {cause.cause for cause in found.causes} == {"overflow", "lower_outlet"}
+    (size,) = (cause.parameters["size"].value for cause in found.causes if cause.cause == "lower_outlet")
+    assert size == pytest.approx(0.15, abs=0.02)
+    assert found.gain.held_out["x2"].rmse_after < 1.15 * NOISE_V
+
+
+def test_three_lasting_causes_are_fitted_together() -> None:
+    rig = Rig(overflow_per_min=10.0, brim=9.0, lower_brim=5.5, outlet_power=0.6)
+    run = make_run(record_of(rig, seed=6, rows=700), tanks())
+    fit = fit_lasting(tanks(), (OVERFLOW, LOWER_OUTLET, LOWER_OVERFLOW), {}, run)
+    assert fit is not None
+    for name, truth, share in (
+        ("overflow.brim", 9.0, 0.05),
+        ("lower_outlet.size", 0.1, 0.05),
+        ("lower_overflow.brim", 5.5, 0.01),
+        ("lower_overflow.size", LOWER_SPILL_PER_MIN, 0.2),
+    ):
+        assert fit.values[name] == pytest.approx(truth, rel=share), name
+    assert fit.held_out[0] < 1.15 * NOISE_V

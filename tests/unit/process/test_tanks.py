@@ -104,7 +104,7 @@ def test_its_facts_make_sense(effect: Effect) -> None:
     assert effect.lower <= effect.typical <= effect.upper
     assert effect.typical != effect.neutral
     assert effect.label
-    assert effect.location in ("pump", "upper_tank", "level_sensor")
+    assert effect.location in ("pump", "upper_tank", "lower_tank", "level_sensor")
     assert set(effect.labels) <= {profile.name for profile in PROFILES}
 
 

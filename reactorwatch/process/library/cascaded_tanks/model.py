@@ -63,6 +63,12 @@ def tanks() -> ProcessModel:
     )
 
 
-def root(level: ca.SX) -> ca.SX:
-    """The root of a level, and a straight line where it is nearly zero or, on an integrator's way, below."""
-    return level / ca.sqrt(ca.sqrt(level**2 + SMALL_LEVEL_V**2))
+def root(level: ca.SX, power: ca.SX | None = None) -> ca.SX:
+    """The root of a level, or another power; a straight line where it is nearly zero or, on an integrator's way, below.
+
+    Args:
+        level: the level in V.
+        power: the power; None: 0.5.
+    """
+    square = level**2 + SMALL_LEVEL_V**2
+    return level / (ca.sqrt(ca.sqrt(square)) if power is None else square ** (0.5 - 0.5 * power))

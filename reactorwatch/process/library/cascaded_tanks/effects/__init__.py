@@ -2,6 +2,8 @@
 
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cascaded_tanks.effects.level_bias import LevelBias
+from reactorwatch.process.library.cascaded_tanks.effects.lower_outlet import LowerOutlet
+from reactorwatch.process.library.cascaded_tanks.effects.lower_overflow import LowerOverflow
 from reactorwatch.process.library.cascaded_tanks.effects.outlet_clogging import OutletClogging
 from reactorwatch.process.library.cascaded_tanks.effects.overflow import Overflow
 from reactorwatch.process.library.cascaded_tanks.effects.pump_gain import PumpGain
@@ -12,6 +14,8 @@ TANK_EFFECTS: tuple[Effect, ...] = (
     UpperLeak(),
     OutletClogging(),
     Overflow(),
+    LowerOverflow(),
+    LowerOutlet(),
     LevelBias(),
 )
 """Effects in the order of the flow, from the pump to the sensor."""
