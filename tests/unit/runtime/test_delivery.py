@@ -37,6 +37,15 @@ def taken(heard: "SimpleQueue[Encoded | Gap]") -> list[str]:
     return [item.payload.decode() for item in items if isinstance(item, Encoded)]
 
 
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Clock of the delivery, which a test sets."""
+    clock = SimpleNamespace(now_ns=SECOND)
+    times = SimpleNamespace(monotonic_ns=lambda: clock.now_ns, time_ns=time.time_ns)
+    monkeypatch.setattr("reactorwatch.runtime.delivery.delivery.time", times)
+    return clock
+
+
 def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reorder_buffer, "TIMEOUT_NS", 1_000_000)
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
@@ -79,11 +88,8 @@ def test_what_is_missing_is_asked_for_before_it_is_given_up(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("before", [1, 3])
-def test_the_query_reaches_back_to_the_message_before_the_gap(monkeypatch: pytest.MonkeyPatch, before: int) -> None:
+def test_the_query_reaches_back_to_the_message_before_the_gap(clock: SimpleNamespace, before: int) -> None:
     """Between them the link was down for a minute, and all that is missing was published then."""
-    clock = SimpleNamespace(now_ns=SECOND)
-    times = SimpleNamespace(monotonic_ns=lambda: clock.now_ns, time_ns=time.time_ns)
-    monkeypatch.setattr("reactorwatch.runtime.delivery.delivery.time", times)
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     asked: SimpleQueue[float] = SimpleQueue()
 
@@ -104,13 +110,8 @@ def test_the_query_reaches_back_to_the_message_before_the_gap(monkeypatch: pytes
     assert [item.payload.decode() for item in items if isinstance(item, Encoded)] == [*map(str, range(before + 4))]
 
 
-def test_a_stream_that_began_while_the_link_was_down_is_asked_for_from_its_beginning(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stream_that_began_while_the_link_was_down_is_asked_for_from_its_beginning(clock: SimpleNamespace) -> None:
     """And again only for what was published since: a made-up publisher costs its victim little."""
-    clock = SimpleNamespace(now_ns=SECOND)
-    times = SimpleNamespace(monotonic_ns=lambda: clock.now_ns, time_ns=time.time_ns)
-    monkeypatch.setattr("reactorwatch.runtime.delivery.delivery.time", times)
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     asked: SimpleQueue[float] = SimpleQueue()
 
@@ -138,13 +139,12 @@ def test_a_stream_that_began_while_the_link_was_down_is_asked_for_from_its_begin
     assert asked_s == 11.0
 
 
-def test_each_stream_is_asked_for_before_its_messages_are_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_stream_is_asked_for_before_its_messages_are_given_up(
+    clock: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Another stream was asked for while a message of this one was missing already, but not yet overdue."""
     timeout_ns = 20_000_000
     monkeypatch.setattr(reorder_buffer, "TIMEOUT_NS", timeout_ns)
-    clock = SimpleNamespace(now_ns=SECOND)
-    times = SimpleNamespace(monotonic_ns=lambda: clock.now_ns, time_ns=time.time_ns)
-    monkeypatch.setattr("reactorwatch.runtime.delivery.delivery.time", times)
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     asked: SimpleQueue[str] = SimpleQueue()
 
