@@ -91,7 +91,7 @@ def look_at_faults(period_min: float = 0.1, looks: Sequence[int] = LOOKS) -> Non
             PlantConfig(seed=4, period_min=period_min, faults=(f"{fault}@{onset_min}min",)), 601 + looks[-1]
         )
         columns = (record.time_min, record.columns["qc"], record.columns["C"], record.columns["T"])
-        rows = [(t, u, (c, T)) for t, u, c, T in zip(*(column.tolist() for column in columns), strict=True)]
+        rows = [(t, (u,), (c, T)) for t, u, c, T in zip(*(column.tolist() for column in columns), strict=True)]
         for after in looks:
             isolation = Isolation(cstr(), NoiseLevels((0.002, 0.3), (0.0, 0.0)))
             isolation.suspects(rows[600 - max(600 - after, ROWS_BEFORE) : 600 + after], since_rows=min(after, FEW_ROWS))
