@@ -125,9 +125,8 @@ def _at_one_time(model: ProcessModel, expression: ca.SX) -> tuple[list[ca.SX], c
     return [*model.arguments(), t], result
 
 
-def with_derivatives(function: ca.Function, *arguments: int) -> ca.Function:
-    """Append the derivatives of the only result with respect to some arguments, given by index."""
+def with_jacobian(function: ca.Function) -> ca.Function:
+    """Append the derivative of the only result with respect to the first argument."""
     symbols = function.sx_in()
     result = function(*symbols)
-    derivatives = (ca.densify(ca.jacobian(result, symbols[i])) for i in arguments)
-    return ca.Function(function.name(), symbols, [result, *derivatives])
+    return ca.Function(function.name(), symbols, [result, ca.densify(ca.jacobian(result, symbols[0]))])

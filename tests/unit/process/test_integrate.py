@@ -91,19 +91,6 @@ def test_grid_ends_a_step_at_every_sample_and_breakpoint() -> None:
     np.testing.assert_array_equal(grid.row, np.searchsorted(time_min, grid.start_min + 1e-9) - 1)
 
 
-def test_refined_grid_covers_the_same_time() -> None:
-    grid = step_grid(np.array([0.0, 0.1, 0.2]), np.array([0.1]))
-    fine = grid.refine({1: grid.length_min[1] * np.array([0.25, 0.75]), 3: grid.length_min[3] * np.array([0.5, 0.5])})
-    assert fine.length_min.size == grid.length_min.size + 2
-    np.testing.assert_allclose(fine.start_min[1:], np.cumsum(fine.length_min)[:-1], atol=1e-15)
-    np.testing.assert_allclose((fine.start_min + fine.length_min)[fine.end_of_row], [0.1, 0.2], atol=1e-15)
-    # the parts of a stretch add up to it, cut or not
-    for of_grid in (grid, fine):
-        assert np.isfinite(of_grid.share).all()
-        assert of_grid.share[of_grid.target == 0].sum() == pytest.approx(1.0)
-        assert of_grid.share[of_grid.origin == 0].sum() == pytest.approx(1.0)
-
-
 def test_two_faults_may_set_in_at_once() -> None:
     model = HeatTransfer().extend(CoolantFlow().extend(cstr(), STEP), STEP)
     p = model.values({"coolant_flow.onset": 0.03, "heat_transfer.onset": 0.03, "coolant_flow.size": -0.1})
