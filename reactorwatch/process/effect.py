@@ -7,7 +7,7 @@ has the profile's parameters as further parameters, named `<effect>.size`, `<eff
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 
@@ -94,7 +94,11 @@ class Effect(ABC):
 
     @abstractmethod
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """Apply the deviation; `size` is m(t) as an expression."""
+        """Apply the deviation; `size` is m(t) as an expression.
+
+        Raises:
+            ValueError: the model lacks what the effect acts on: a state, an input, an output, a parameter or a term.
+        """
 
     def extend(self, model: ProcessModel, profile: Profile = CONSTANT) -> ProcessModel:
         """Add this effect to a model.
@@ -175,14 +179,22 @@ class Effect(ABC):
 
 
 class ParameterEffect(Effect):
-    """An effect that multiplies one parameter of the balances by (1 + m)."""
+    """An effect that multiplies one parameter of the balances by (1 + m), and others that have it as a factor.
+
+    Attributes:
+        parameter: name of the parameter.
+        proportional: names of parameters in proportion to it.
+    """
 
     parameter: ClassVar[str]
+    proportional: ClassVar[tuple[str, ...]] = ()
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`."""
-        symbol = model.parameter(self.parameter).symbol
-        return model.substitute(symbol, symbol * (1 + size))
+        for name in (self.parameter, *self.proportional):
+            symbol = model.parameter(name).symbol
+            model = model.substitute(symbol, symbol * (1 + size))
+        return model
 
 
 class ParameterShift(Effect):
@@ -197,7 +209,11 @@ class ParameterShift(Effect):
 
 
 class SensorEffect(Effect):
-    """An effect on one sensor; the balances are unchanged."""
+    """An effect on one sensor; the balances are unchanged.
+
+    Attributes:
+        output: name of the output that the sensor measures.
+    """
 
     output: ClassVar[str]
 
@@ -206,11 +222,7 @@ class SensorEffect(Effect):
         """Return the model with the states that the sensor needs, and its reading of the true value."""
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no such output.
-        """
+        """See `Effect`."""
         if self.output not in model.output_names:
             raise ValueError(
                 f"{self.name} needs a model with the output {self.output!r}, {model.name} has {model.output_names}"
@@ -219,3 +231,17 @@ class SensorEffect(Effect):
         extended, reading = self.sense(model, value, size)
         outputs = (replace(item, expression=reading) if item.name == self.output else item for item in extended.outputs)
         return replace(extended, outputs=tuple(outputs))
+
+
+def make_effect(kind: type[Effect], name: str, meaning: str, module: str, **facts: Any) -> Effect:
+    """Make an effect of a kind without a class of its own.
+
+    Args:
+        kind: class of effects that lack some of the attributes.
+        name: name in the catalogue of causes.
+        meaning: what it does, as the docstring of a class would say it.
+        module: name of the module that makes it.
+        **facts: the other attributes.
+    """
+    effect: Effect = type(name, (kind,), {"name": name, "__doc__": meaning, "__module__": module, **facts})()
+    return effect

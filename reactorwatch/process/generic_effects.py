@@ -12,14 +12,14 @@ at a point inside the bounds. A process may have effects of its own instead, und
 generic ones that do the same to the model (`effect_twins`) it then has its own.
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.effect import Effect, EffectConstant, ParameterEffect, ParameterShift
+from reactorwatch.process.effect import Effect, EffectConstant, ParameterEffect, ParameterShift, make_effect
 from reactorwatch.process.input_effects import InputDelay, InputGain, InputLag, InputOffset, InputStiction
 from reactorwatch.process.model import Output, Parameter, ProcessModel, Variable
 from reactorwatch.process.output_effects import (
@@ -60,11 +60,7 @@ class Source(Effect):
     state: str
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no such state.
-        """
+        """See `Effect`."""
         return model.add_rate(self.state, size)
 
 
@@ -98,8 +94,6 @@ def exchanges(model: ProcessModel) -> tuple[Effect, ...]:
         for j in own[:i]:
             one, other = model.states[j], model.states[i]
             if one.unit == other.unit and slopes[i, j] > 0.0 and slopes[j, i] > 0.0:
-                reach = LARGEST_SCALES * one.scale
-                facts = {"unit": f"{one.unit}/min", "lower": -reach, "upper": reach}
                 result.append(
                     _make(
                         Exchange,
@@ -107,11 +101,10 @@ def exchanges(model: ProcessModel) -> tuple[Effect, ...]:
                         f"An unmodelled flow from {other.name} to {one.name}.",
                         label=f"unknown flow between {one.name} and {other.name}",
                         location=balance_of(one),
-                        typical=TYPICAL_SCALES * one.scale,
                         state=one.name,
                         other=other.name,
                         ratio=float(slopes[i, j] / slopes[j, i]),
-                        **facts,
+                        **_deviation(f"{one.unit}/min", one.scale),
                     )
                 )
     return tuple(result)
@@ -155,10 +148,13 @@ def output_scales(model: ProcessModel) -> list[float]:
     return [float(value) if np.isfinite(value) and value > 0.0 else 1.0 for value in moved]
 
 
-def _make(kind: type[Effect], name: str, meaning: str, **facts: Any) -> Effect:
-    """Instance of a kind of effect with the facts of one signal, parameter or state."""
-    effect: Effect = type(name, (kind,), {"name": name, "__doc__": meaning, "__module__": __name__, **facts})()
-    return effect
+_make = partial(make_effect, module=__name__)
+
+
+def _deviation(unit: str, scale: float) -> dict[str, Any]:
+    """Size of a bias, an offset or a rate, from a scale in its unit."""
+    reach = LARGEST_SCALES * scale
+    return {"unit": unit, "lower": -reach, "upper": reach, "typical": TYPICAL_SCALES * scale}
 
 
 def _of_output(model: ProcessModel, output: Output, scale: float) -> list[Effect]:
@@ -181,10 +177,7 @@ def _of_output(model: ProcessModel, output: Output, scale: float) -> list[Effect
             larger=f"{name} shows {{}}{in_unit} too much",
             smaller=f"{name} shows {{}}{in_unit} too little",
             labels={"ramp": f"drift of {name}"},
-            unit=unit,
-            lower=-reach,
-            upper=reach,
-            typical=TYPICAL_SCALES * scale,
+            **_deviation(unit, scale),
             **at,
         ),
         _make(
@@ -259,10 +252,7 @@ def _of_input(item: Variable) -> list[Effect]:
             label=f"offset of {name}",
             larger=f"{name} higher by {{}}{in_unit} than commanded",
             smaller=f"{name} lower by {{}}{in_unit} than commanded",
-            unit=unit,
-            lower=-LARGEST_SCALES * item.scale,
-            upper=LARGEST_SCALES * item.scale,
-            typical=TYPICAL_SCALES * item.scale,
+            **_deviation(unit, item.scale),
             **at,
         ),
         _make(
@@ -360,10 +350,7 @@ def _of_state(item: Variable) -> Effect:
         f"An unmodelled source adds m to the balance of {item.name}.",
         label=f"unknown source in the balance of {item.name}",
         location=balance_of(item),
-        unit=f"{item.unit}/min",
-        lower=-LARGEST_SCALES * item.scale,
-        upper=LARGEST_SCALES * item.scale,
-        typical=TYPICAL_SCALES * item.scale,
+        **_deviation(f"{item.unit}/min", item.scale),
         larger=f"{{}} {item.unit}/min more into the balance of {item.name}",
         smaller=f"{{}} {item.unit}/min less into the balance of {item.name}",
         state=item.name,

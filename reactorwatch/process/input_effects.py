@@ -48,7 +48,7 @@ class InputGain(InputEffect):
     typical = 0.02
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`; raises what `command` does."""
+        """See `Effect`."""
         command = self.command(model).symbol
         return model.substitute(command, command * (1 + size))
 
@@ -57,7 +57,7 @@ class InputOffset(InputEffect):
     """The real input is its command plus m."""
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`; raises what `command` does."""
+        """See `Effect`."""
         command = self.command(model).symbol
         return model.substitute(command, command + size)
 
@@ -72,7 +72,7 @@ class InputLag(InputEffect):
     start_values = (0.05, 0.5)
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`; raises what `command` does."""
+        """See `Effect`."""
         state, command = self.new_state(model), self.command(model).symbol
         _, real = add_lag(model, state, command, size)
         return add_lag(model.substitute(command, real), state, command, size)[0]
@@ -88,7 +88,7 @@ class InputDelay(InputEffect):
     start_values = (0.1, 0.5, 1.5)
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`; raises what `command` does."""
+        """See `Effect`."""
         command = self.command(model)
         reach = max(abs(command.lower), abs(command.upper))
         states = window_states(self.prefix(model), command.unit, reach, command.scale)
@@ -108,7 +108,7 @@ class InputStiction(InputEffect):
     is_discontinuous = True
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`; raises what `command` does."""
+        """See `Effect`."""
         state, command = replace(self.new_state(model), scale=self.typical), self.command(model).symbol
         free = ca.logic_or(ca.fabs(command - state.symbol) > size, size <= 0)
         moved = ca.if_else(free, command, state.symbol)

@@ -1,6 +1,5 @@
 """Effects on the sensor of one output of any model: bias, gain, lag, delay, a stuck reading, noise."""
 
-from abc import abstractmethod
 from dataclasses import replace
 from typing import ClassVar
 
@@ -11,27 +10,15 @@ from reactorwatch.process.effect_states import add_delay, add_lag, window_states
 from reactorwatch.process.model import Output, ProcessModel, variable
 
 
-class ReadingEffect(SensorEffect):
-    """An effect of a sensor without states: its reading is a function of the true value."""
-
-    @abstractmethod
-    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """Reading of the sensor at a true value."""
+class OutputBias(SensorEffect):
+    """The reading is the true value plus m."""
 
     def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
         """See `SensorEffect`."""
-        return model, self.reading(value, size)
+        return model, value + size
 
 
-class OutputBias(ReadingEffect):
-    """The reading is the true value plus m."""
-
-    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """See `ReadingEffect`."""
-        return value + size
-
-
-class OutputGain(ReadingEffect):
+class OutputGain(SensorEffect):
     """The reading is the true value times (1 + m)."""
 
     unit = "1"
@@ -39,9 +26,9 @@ class OutputGain(ReadingEffect):
     upper = 4.0
     typical = 0.1
 
-    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """See `ReadingEffect`."""
-        return value * (1 + size)
+    def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
+        """See `SensorEffect`."""
+        return model, value * (1 + size)
 
 
 class OutputLag(SensorEffect):

@@ -21,10 +21,6 @@ class LowerOutlet(Effect):
     typical = 0.05
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no state x2 or no parameter k3.
-        """
+        """See `Effect`."""
         level, k3 = model.states[model.state_index("x2")].symbol, model.parameter("k3").symbol
         return model.add_rate("x2", k3 * (root(level) - root(level, 0.5 + size)))

@@ -26,11 +26,7 @@ class LowerOverflow(Effect):
     )
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no state x2.
-        """
+        """See `Effect`."""
         extended, (brim,) = self.add_constants(model)
         above = model.states[model.state_index("x2")].symbol - brim
         return extended.add_rate("x2", -0.5 * size * (above + ca.sqrt(above**2 + SOFT_V**2)))

@@ -2,11 +2,11 @@
 
 import casadi as ca
 
-from reactorwatch.process.effect import Effect
+from reactorwatch.process.effect import ParameterEffect
 from reactorwatch.process.model import ProcessModel
 
 
-class OutletClogging(Effect):
+class OutletClogging(ParameterEffect):
     """The outlet of the upper tank lets (1 - m) of the water through: k1 (1 - m) and k2 (1 - m)."""
 
     name = "outlet_clogging"
@@ -17,14 +17,9 @@ class OutletClogging(Effect):
     lower = 0.0
     upper = 0.99
     typical = 0.03
+    parameter = "k1"
+    proportional = ("k2",)
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no parameter k1 or k2.
-        """
-        for name in ("k1", "k2"):
-            symbol = model.parameter(name).symbol
-            model = model.substitute(symbol, symbol * (1 - size))
-        return model
+        """See `Effect`."""
+        return super().apply(model, -size)

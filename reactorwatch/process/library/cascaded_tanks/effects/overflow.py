@@ -39,11 +39,7 @@ class Overflow(Effect):
     )
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model lacks a state x1 or x2, or a parameter k1 or k2.
-        """
+        """See `Effect`."""
         extended, (brim, caught) = self.add_constants(model)
         above = model.states[model.state_index("x1")].symbol - brim
         twice = above + ca.sqrt(above**2 + SOFT_V**2)

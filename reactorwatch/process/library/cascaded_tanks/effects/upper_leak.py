@@ -20,9 +20,5 @@ class UpperLeak(Effect):
     typical = 0.1
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no state x1, or no term of the outflow.
-        """
+        """See `Effect`."""
         return model.add_rate("x1", -size * model.term(UPPER_OUTLET))

@@ -26,11 +26,7 @@ class Bypass(Effect):
     is_traced = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no parameter q, or no feed term of an output.
-        """
+        """See `Effect`."""
         flow = model.parameter("q").symbol
         mixed = tuple(
             replace(item, expression=(1 - size) * item.expression + size * model.term(f"{FEED} {item.name}"))

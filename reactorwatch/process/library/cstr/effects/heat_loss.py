@@ -21,10 +21,6 @@ class HeatLoss(Effect):
     typical = 0.01
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no state T.
-        """
+        """See `Effect`."""
         T = model.states[model.state_index("T")].symbol
         return model.add_rate("T", -size * (T - SURROUNDINGS_K))

@@ -28,11 +28,7 @@ class JacketLag(Effect):
     is_traced = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no state T, or no term of the cooling.
-        """
+        """See `Effect`."""
         static = model.term(COOLING)
         state = variable(f"{self.prefix(model)}.duty", "K/min", (-1e4, 1e4), 10.0, "what the jacket takes up")
         extended, duty = add_lag(model, state, static, size)

@@ -27,11 +27,7 @@ class ReactionOrder(Effect):
     is_traced = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no state C, or no parameter k0 or K1.
-        """
+        """See `Effect`."""
         C = model.states[model.state_index("C")].symbol
         factor = (ca.fmax(C, LEAST_MOL_L) / REFERENCE_MOL_L) ** size
         for name in ("k0", "K1"):

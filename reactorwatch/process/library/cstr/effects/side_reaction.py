@@ -38,11 +38,7 @@ class SideReaction(Effect):
     )
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no state C or T.
-        """
+        """See `Effect`."""
         C, T = (model.states[model.state_index(name)].symbol for name in ("C", "T"))
         extended, (E2, heat) = self.add_constants(model)
         rate = size * ca.exp(-E2 * (1 / T - 1 / REFERENCE_K)) * C

@@ -24,11 +24,7 @@ class Volume(Effect):
     is_traced = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no parameter K2, or neither V nor V_set.
-        """
+        """See `Effect`."""
         volume = model.parameter("V_set" if "V_set" in model.parameter_names else "V").symbol
         cooling = model.parameter("K2").symbol
         return model.substitute(volume, volume * (1 + size)).substitute(cooling, cooling / (1 + size))

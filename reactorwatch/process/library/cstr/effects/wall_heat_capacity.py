@@ -30,11 +30,7 @@ class WallHeatCapacity(Effect):
     is_traced = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """See `Effect`.
-
-        Raises:
-            ValueError: the model has no state T.
-        """
+        """See `Effect`."""
         prefix = self.prefix(model)
         inside = model.states[model.state_index("T")]
         bounds = (inside.lower, inside.upper)

@@ -2,7 +2,7 @@
 
 import casadi as ca
 
-from reactorwatch.process.effect import ParameterEffect
+from reactorwatch.process.effect import ParameterEffect, make_effect
 from reactorwatch.process.model import ProcessModel
 
 
@@ -19,31 +19,20 @@ class Clogging(ParameterEffect):
         return super().apply(model, -size)
 
 
-class Clogging13(Clogging):
-    """Clogging of the pipe from tank 1 to tank 3."""
-
-    name = "clog13"
-    location = "pipe13"
-    label = "clogging of the pipe from tank 1 to tank 3"
-    larger = "{} % of the pipe from tank 1 to tank 3 clogged"
-    parameter = "a1"
-
-
-class Clogging20(Clogging):
-    """Clogging of the outlet of tank 2."""
-
-    name = "clog20"
-    location = "pipe20"
-    label = "clogging of the outlet of tank 2"
-    larger = "{} % of the outlet of tank 2 clogged"
-    parameter = "a2"
-
-
-class Clogging32(Clogging):
-    """Clogging of the pipe from tank 3 to tank 2."""
-
-    name = "clog32"
-    location = "pipe32"
-    label = "clogging of the pipe from tank 3 to tank 2"
-    larger = "{} % of the pipe from tank 3 to tank 2 clogged"
-    parameter = "a3"
+CLOGGINGS = tuple(
+    make_effect(
+        Clogging,
+        f"clog{pipe}",
+        f"Clogging of the {text}.",
+        __name__,
+        location=f"pipe{pipe}",
+        label=f"clogging of the {text}",
+        larger=f"{{}} % of the {text} clogged",
+        parameter=parameter,
+    )
+    for pipe, parameter, text in (
+        (13, "a1", "pipe from tank 1 to tank 3"),
+        (20, "a2", "outlet of tank 2"),
+        (32, "a3", "pipe from tank 3 to tank 2"),
+    )
+)
