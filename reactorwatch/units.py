@@ -32,20 +32,11 @@ class UnknownUnitError(InputError):
     """A text that is no unit."""
 
 
-def convert(value: float, unit: str, wanted: str, name: str) -> float:
-    """Convert a value from one unit to another; arguments and errors as for `conversion`.
-
-    >>> convert(60.0, "l/h", "l/min", "q")
-    1.0
-    >>> convert(25.0, "degC", "K", "T")
-    298.15
-    """
-    scale, offset = conversion(unit, wanted, name)
-    return scale * value + offset
-
-
 def conversion(unit: str, wanted: str, name: str) -> tuple[float, float]:
     """Scale and offset that convert values from one unit to another: `scale * value + offset`.
+
+    >>> conversion("degC", "K", "T")
+    (1.0, 273.15)
 
     Args:
         unit: unit of the values.

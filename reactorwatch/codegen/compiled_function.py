@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from ctypes.util import find_library
 from dataclasses import replace
 from functools import cache, cached_property
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import casadi as ca
 import llvmlite.binding as llvm
@@ -56,6 +56,7 @@ class CompiledFunction:
         self._shapes = [item.shape for item in results]
         counts = tuple(item.numel() for item in results)
         self._loop = RowLoop(tuple(kinds), tuple(item.numel() for item in symbols), counts, stops)
+        self._engines: list[llvm.ExecutionEngine] = []  # they own the code
 
     def allocate_results(self, rows: int) -> list[Array]:
         """Uninitialised arrays for `fill`, each of shape (rows, columns, rows of the matrix): CasADi's order."""
@@ -155,16 +156,11 @@ class CompiledFunction:
 
     def _compile(self, lanes: int) -> _Call:
         loop = replace(self._loop, lanes=lanes)
-        loaded = _Host.get().load(self._function, loop)
+        engine = _host().load(self._function, loop)
+        self._engines.append(engine)
         pointers = [ctypes.c_void_p] * (loop.chains * (len(loop.sizes) + len(loop.counts)))
-        call: _Call = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, *pointers)(loaded.address)
-        self._engines.append(loaded.engine)
+        call: _Call = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, *pointers)(engine.get_function_address("rows"))
         return call
-
-    @cached_property
-    def _engines(self) -> list[llvm.ExecutionEngine]:
-        """The engines that own the code."""
-        return []
 
 
 def _address(call: _Call) -> int:
@@ -174,13 +170,6 @@ def _address(call: _Call) -> int:
 def _check_array(array: Array, least: int) -> None:
     if array.dtype != np.float64 or not array.flags.c_contiguous or array.size < least:
         raise ValueError(f"an array of {least} float64 without gaps is needed, got {array.dtype} {array.shape}")
-
-
-class _Loaded(NamedTuple):
-    """Machine code in memory: its address, and the engine that owns it."""
-
-    engine: llvm.ExecutionEngine
-    address: int
 
 
 class _Host:
@@ -195,26 +184,23 @@ class _Host:
         self._cpu, self._features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
         self._cache = user_cache()
 
-    @classmethod
-    @cache
-    def get(cls) -> "_Host":
-        """The one of this process."""
-        return cls()
-
-    def load(self, function: ca.Function, loop: RowLoop) -> _Loaded:
-        """Machine code of a function, from the cache if it was compiled before."""
+    def load(self, function: ca.Function, loop: RowLoop) -> llvm.ExecutionEngine:
+        """Engine with the machine code of a function, from the cache if it was compiled before."""
         made_by = (llvm.llvm_version_info, self._triple, self._cpu, self._features, IR_VERSION)
         depends_on = repr((made_by, loop)) + function.serialize()
         name = hashlib.sha256(depends_on.encode()).hexdigest()
-        machine = self._target()
+        target = llvm.Target.from_triple(self._triple)
+        machine = target.create_target_machine(cpu=self._cpu, features=self._features, opt=0, jit=True)
         stored = self._cache.get_or_make(
             name, lambda: bytes(machine.emit_object(llvm.parse_assembly(write_ir(function, loop))))
         )
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
         engine.add_object_file(llvm.ObjectFileRef.from_data(stored))
         engine.finalize_object()
-        return _Loaded(engine, engine.get_function_address("rows"))
+        return engine
 
-    def _target(self) -> llvm.TargetMachine:
-        target = llvm.Target.from_triple(self._triple)
-        return target.create_target_machine(cpu=self._cpu, features=self._features, opt=0, jit=True)
+
+@cache
+def _host() -> _Host:
+    """The compiler of this process."""
+    return _Host()

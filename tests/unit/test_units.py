@@ -7,7 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reactorwatch.errors import InputError
-from reactorwatch.units import convert
+from reactorwatch.units import conversion
+
+
+def convert(value: float, unit: str, wanted: str, name: str) -> float:
+    scale, offset = conversion(unit, wanted, name)
+    return scale * value + offset
 
 
 @pytest.mark.parametrize(
