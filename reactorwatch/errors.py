@@ -35,9 +35,14 @@ def hint_at_closest(name: str, valid: Iterable[str]) -> str:
 
 
 @contextmanager
-def name_file(file: object) -> Iterator[None]:
-    """Start the text of an error about the contents of a file with its path."""
+def prefix_errors(what: object, kind: type[ValueError] = InputError) -> Iterator[None]:
+    """Start the text of an error with what it is about, such as the path of a file.
+
+    Args:
+        what: the start of the text.
+        kind: kind of the errors; `ValueError` includes those of code that does not know about the user's input.
+    """
     try:
         yield
-    except InputError as error:
-        raise InputError(f"{file}: {error}") from error
+    except kind as error:
+        raise InputError(f"{what}: {error}") from error

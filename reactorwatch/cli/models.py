@@ -93,7 +93,7 @@ def identify(
     from reactorwatch.cli.batch import write_remark
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.unit_remarks import unit_remark
-    from reactorwatch.errors import name_file
+    from reactorwatch.errors import prefix_errors
     from reactorwatch.identification.identify import ModelForm
 
     described, outputs = identification.choose_outputs(process, split_names(inputs), split_names(output))
@@ -116,7 +116,7 @@ def identify(
     assert measured is not None
     equations = described.model
     remark = "" if equations is None else unit_remark(equations, measured.columns, measured.time_min)
-    with task(f"identifying {file.name}"), name_file(file):
+    with task(f"identifying {file.name}"), prefix_errors(file):
         if compare:
             text = identification.compare(measured, described.inputs, outputs, form, neural=neural, as_json=as_json)
         else:
@@ -144,7 +144,7 @@ def linearise(
     from reactorwatch.cli.linear_models import describe
     from reactorwatch.description.choice import ProcessChoice
 
-    print_text(describe(ProcessChoice(process).load_model(), levels, step, as_json=as_json))
+    print_text(describe(ProcessChoice(process).load().require_model(), levels, step, as_json=as_json))
 
 
 def reproduce(

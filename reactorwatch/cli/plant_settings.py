@@ -9,7 +9,7 @@ from plant_node.process_settings import fit_settings
 from plant_node.record import load_process
 from reactorwatch.api.files import record
 from reactorwatch.cli.options import check_recording
-from reactorwatch.description.catalogue import Catalogue
+from reactorwatch.description.catalogue import catalogue
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS, FileFormat
@@ -193,7 +193,7 @@ def process_of_run(process: str | None, played: PlayedRecord | None, plant: str 
         plant, described = plant or recorded, recorded_process(played.path, recorded)
         if process is None and described is not None:
             process = described.name
-            if process not in Catalogue():
+            if process not in catalogue():
                 raise InputError(
                     f"--record {played.path}: is of process {process!r}, which is in no catalogue here; name its file "
                     "by --process"

@@ -6,7 +6,6 @@ from pathlib import Path
 from reactorwatch.description.find import DEFAULT_PROCESS, FILE_KINDS, find_process
 from reactorwatch.description.process import Process, Signal
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import ProcessModel
 
 UNDESCRIBED = "plant"
 """Name of a process that only its columns describe."""
@@ -35,13 +34,11 @@ class ProcessChoice:
         if self.process is not None and (self.inputs or self.outputs or self.modes):
             raise InputError(
                 "--input, --output and --mode describe a process without a file, got them beside --process "
-                f"{self.process}; "
-                "leave one of the two out"
+                f"{self.process}; leave one of the two out"
             )
-        if self.modes and not self.outputs:
-            raise InputError(f"--mode needs an --output, got only the mode {', '.join(self.modes)}")
-        if self.inputs and not self.outputs:
-            raise InputError(f"--input needs an --output, got only the input {', '.join(self.inputs)}")
+        for role, names in (("mode", self.modes), ("input", self.inputs)):
+            if names and not self.outputs:
+                raise InputError(f"--{role} needs an --output, got only the {role} {', '.join(names)}")
 
     @property
     def is_default(self) -> bool:
@@ -73,18 +70,6 @@ class ProcessChoice:
             signals = (Signal(name, role=role) for role, names in roles.items() for name in names)
             return Process(UNDESCRIBED, tuple(signals))
         return find_process(self.process or DEFAULT_PROCESS, zero_ns, on_bus=on_bus)
-
-    def load_model(self, zero_ns: int = 0) -> ProcessModel:
-        """Load the equations of the process.
-
-        Args:
-            zero_ns: time from which the minutes of an extended model count; 0: the one that its file states.
-
-        Raises:
-            InputError: as `find_process`; or the process has no equations.
-        """
-        process = self.load(zero_ns)
-        return process.require_model()
 
 
 DEFAULT_CHOICE = ProcessChoice()

@@ -4,10 +4,10 @@ import runpy
 from dataclasses import replace
 from pathlib import Path
 
-from reactorwatch.description.catalogue import Catalogue, check_process
+from reactorwatch.description.catalogue import catalogue, check_process
 from reactorwatch.description.process import Process, describe_model
 from reactorwatch.description.toml_file import parse_process, parse_tables
-from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.errors import InputError, describe_unknown, prefix_errors
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.input_file import wrap_read_errors
@@ -45,14 +45,10 @@ def find_process(
     path = Path(process)
     kind = path.suffix.lower()
     if kind not in FILE_KINDS:
-        catalogue = Catalogue()
-        if str(process) not in catalogue:
-            cure = ", or a path to a .toml, .py or .json file"
-            raise InputError(describe_unknown("process", str(process), catalogue) + cure)
-        return catalogue[str(process)]()
+        return _find_by_name(str(process), "process", "a path to a .toml, .py or .json file")
     with wrap_read_errors(path):
         content = path.read_bytes()
-    try:
+    with prefix_errors(f"process file {path}"):
         if kind == ".toml":
             return parse_process(content, lambda name: _find_equations(name, path.parent, zero_ns, on_bus=on_bus))
         if kind == ".py":
@@ -63,8 +59,6 @@ def find_process(
         elif zero_ns:
             extended = extended.rebase(zero_ns)
         return build_process(extended)
-    except InputError as error:
-        raise InputError(f"process file {path}: {error}") from error
 
 
 def build_process(extended: ExtendedModel) -> Process:
@@ -79,26 +73,23 @@ def build_process(extended: ExtendedModel) -> Process:
     return parse_tables({**extended.description, "equations": extended.name}, lambda _name: named)
 
 
-def _find_equations(name: str, folder: Path, zero_ns: int, *, on_bus: bool) -> Process:
-    """Process of the catalogue, or the extended model in a file; a relative path counts from a folder.
+def _find_by_name(name: str, what: str, otherwise: str) -> Process:
+    """Process of the catalogue; an error says what the name stands for, and what could be stated otherwise."""
+    processes = catalogue()
+    if name not in processes:
+        raise InputError(f"{describe_unknown(what, name, processes)}, or {otherwise}")
+    return processes[name]()
 
-    Raises:
-        InputError: there is none.
-    """
+
+def _find_equations(name: str, folder: Path, zero_ns: int, *, on_bus: bool) -> Process:
+    """Process of the catalogue, or the extended model in a file; a relative path counts from a folder."""
     if Path(name).suffix.lower() == ".json":
         return find_process(folder / name, zero_ns, on_bus=on_bus)
-    catalogue = Catalogue()
-    if name not in catalogue:
-        raise InputError(describe_unknown("equations", name, catalogue) + ", or the path of an extended.json")
-    return catalogue[name]()
+    return _find_by_name(name, "equations", "the path of an extended.json")
 
 
 def _call_function(path: Path) -> object:
-    """Run a file of the user, as `python FILE` would, and call its function.
-
-    Raises:
-        InputError: it raises an error, or has no such function.
-    """
+    """Run a file of the user, as `python FILE` would, and call its function."""
     try:
         return runpy.run_path(str(path))[FUNCTION]()
     except InputError:

@@ -5,8 +5,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, get_args
 
-from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.process import CONTROLLERS_OF, OPERATIONS, WATCH_DEFAULTS, own_effects
+import msgspec
+
+from reactorwatch.errors import InputError, describe_unknown, prefix_errors
+from reactorwatch.process import OPERATIONS, own_effects
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.effect_twins import add_generic
 from reactorwatch.process.generic_effects import generic_effects
@@ -62,8 +64,7 @@ class Signal:
             )
 
 
-@dataclass(frozen=True)
-class KnownParameter:
+class KnownParameter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A constant of the equations with its uncertainty.
 
     Attributes:
@@ -75,6 +76,11 @@ class KnownParameter:
     value: float
     sd: float = 0.0
     unit: str = ""
+
+    @classmethod
+    def of(cls, given: "KnownParameter | tuple[float, float, str]") -> "KnownParameter":
+        """Make one of a tuple (value, sd, unit), which is another way to write it."""
+        return given if isinstance(given, KnownParameter) else cls(*given)
 
 
 @dataclass(frozen=True)
@@ -208,18 +214,17 @@ class Process:
         """Given parameters in the units of the equations."""
         known = {}
         for name, given in self.parameters.items():
-            item = given if isinstance(given, KnownParameter) else KnownParameter(*given)
+            assert self.equations is not None
+            item, what = KnownParameter.of(given), f"process {self.name!r}, parameter {name!r}"
             if not item.sd >= 0:
-                raise InputError(f"{self._of_parameter(name)}: sd must be at least 0, got {item.sd:g}")
-            unit = _find_parameter(self, name)
+                raise InputError(f"{what}: sd must be at least 0, got {item.sd:g}")
+            with prefix_errors(f"process {self.name!r}", ValueError):
+                unit = self.equations.parameter(name).unit
             if item.unit and item.unit != unit:
-                scale, offset = _convert(item.unit, unit, self._of_parameter(name))
+                scale, offset = _convert(item.unit, unit, what)
                 item = KnownParameter(scale * item.value + offset, scale * item.sd, unit)
             known[name] = item
         return known
-
-    def _of_parameter(self, name: str) -> str:
-        return f"process {self.name!r}, parameter {name!r}"
 
     def _check_signals(self) -> None:
         names: list[str | int] = [signal.name for signal in self.signals]
@@ -278,11 +283,7 @@ def _convert(unit: str, wanted: str, name: str) -> tuple[float, float]:
 
 
 def _check_expressions(process: str, model: ProcessModel) -> None:
-    """Check that the equations are expressions of a model's own symbols.
-
-    Raises:
-        InputError: they are not.
-    """
+    """Check that the equations are expressions of a model's own symbols."""
     try:
         store_equations(model)
     except ValueError as error:
@@ -293,11 +294,7 @@ def _check_expressions(process: str, model: ProcessModel) -> None:
 
 
 def _check_effect(process: str, effect: Effect, model: ProcessModel) -> None:
-    """Check that an effect, which may be code of the user, fits a model.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Check that an effect, which may be code of the user, fits a model."""
     try:
         effect.extend(model)
     except Exception as error:
@@ -313,21 +310,13 @@ def describe_model(model: ProcessModel) -> Process:
         *(Signal(item.name, item.unit, "input") for item in model.inputs),
         *(Signal(item.name, item.unit, "output") for item in model.outputs),
     )
+    operation = OPERATIONS.get(model.name, Operation())
     return Process(
         model.name,
         signals,
         model,
         own_effects(model),
-        CONTROLLERS_OF.get(model.name, ()),
-        operation=OPERATIONS.get(model.name, Operation()),
-        watch=WATCH_DEFAULTS.get(model.name, WatchDefaults()),
+        operation.controllers,
+        operation=operation,
+        watch=operation.watch,
     )
-
-
-def _find_parameter(process: Process, name: str) -> str:
-    """Unit of a parameter of the equations."""
-    assert process.equations is not None
-    try:
-        return process.equations.parameter(name).unit
-    except ValueError as error:
-        raise InputError(f"process {process.name!r}: {error}") from error

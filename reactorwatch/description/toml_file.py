@@ -24,12 +24,6 @@ class _Signal(msgspec.Struct, forbid_unknown_fields=True):
     bounds: tuple[float, float] | None = None
 
 
-class _Parameter(msgspec.Struct, forbid_unknown_fields=True):
-    value: float
-    sd: float = 0.0
-    unit: str = ""
-
-
 class _Time(msgspec.Struct, forbid_unknown_fields=True):
     column: _Column | None = None
     period: str | None = None
@@ -50,7 +44,7 @@ class _Document(msgspec.Struct, forbid_unknown_fields=True):
     signals: tuple[_Signal, ...]
     equations: str | None = None
     generic: bool = False
-    parameters: dict[str, _Parameter] = {}  # msgspec copies the default
+    parameters: dict[str, KnownParameter] = {}  # msgspec copies the default
     missing: tuple[str | float, ...] = ()
     time: _Time = msgspec.field(default_factory=_Time)
     file: _File = msgspec.field(default_factory=_File)
@@ -74,7 +68,7 @@ _STRUCTS: Mapping[str, type[msgspec.Struct]] = {
     "signals": _Signal,
     "time": _Time,
     "file": _File,
-    "parameters": _Parameter,
+    "parameters": KnownParameter,
 }
 
 
@@ -108,7 +102,7 @@ def parse_tables(tables: Mapping[str, Any], find_equations: Callable[[str], Proc
     return Process(
         document.name,
         tuple(Signal(**msgspec.structs.asdict(item)) for item in document.signals),
-        parameters={name: KnownParameter(item.value, item.sd, item.unit) for name, item in document.parameters.items()},
+        parameters=document.parameters,
         file_format=_file_format(document),
         generic=document.generic,
         **described,
@@ -151,11 +145,7 @@ def add_description(extended: Mapping[str, Any], process: Process) -> dict[str, 
 
 
 def _file_format(document: _Document) -> FileFormat:
-    """Statements of a document about its files.
-
-    Raises:
-        InputError: a value breaks a rule.
-    """
+    """Statements of a document about its files."""
     time = document.time
     if time.column is not None and time.period is not None:
         raise InputError(
@@ -182,7 +172,7 @@ def _find_wrong_parameter(tables: Mapping[str, Any]) -> str:
     """Name of the first parameter of the wrong form."""
     for name, table in tables.items():
         try:
-            msgspec.convert(table, _Parameter)
+            msgspec.convert(table, KnownParameter)
         except msgspec.ValidationError:
             return name
     return ""

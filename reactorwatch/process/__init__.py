@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-from reactorwatch.process.controller import Controller
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.generic_effects import generic_effects
 from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
@@ -12,13 +11,11 @@ from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.locations import LOCATIONS as CSTR_LOCATIONS
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.library.cstr.operation import OPERATION as CSTR_OPERATION
-from reactorwatch.process.library.cstr.operation import WATCH_DEFAULTS as CSTR_WATCH_DEFAULTS
 from reactorwatch.process.library.three_tanks.effects import THREE_TANKS_EFFECTS
 from reactorwatch.process.library.three_tanks.model import three_tanks
-from reactorwatch.process.library.three_tanks.operation import CONTROLLERS
 from reactorwatch.process.library.three_tanks.operation import OPERATION as THREE_TANKS_OPERATION
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.operation import Operation, WatchDefaults
+from reactorwatch.process.operation import Operation
 
 MODELS = (cstr, tanks, three_tanks)
 """The catalogue of process models: functions that build them."""
@@ -37,14 +34,8 @@ OPERATIONS: Mapping[str, Operation] = {
 }
 """Operation in a simulation, by name of a model."""
 
-WATCH_DEFAULTS: Mapping[str, WatchDefaults] = {"cstr": CSTR_WATCH_DEFAULTS}
-"""Default settings of the watch, by name of a model; others have none of their own."""
-
 LOCATION_PHRASES: Mapping[str, str] = CSTR_LOCATIONS
 """Phrases of locations whose name is not enough, such as `on the side of the coolant`."""
-
-CONTROLLERS_OF: Mapping[str, tuple[Controller, ...]] = {"three_tanks": CONTROLLERS}
-"""Controllers in a simulation, by name of a model; others are simulated in open loop."""
 
 
 def own_effects(model: ProcessModel) -> tuple[Effect, ...]:

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import casadi as ca
 
 from reactorwatch.process.model import Clock, Parameter, ProcessModel, parameter
-from reactorwatch.process.profiles import CONSTANT, Profile
+from reactorwatch.process.profiles import CONSTANT, Profile, ProfileParameter
 
 TIMING = "timing"
 """Location of a deviation in the timestamps of a record, not in the plant."""
@@ -115,31 +115,16 @@ class Effect(ABC):
             ValueError: the model lacks what the effect acts on.
         """
         prefix = self.prefix(model)
-        size = Parameter(
-            f"{prefix}.size", self.neutral, self.unit, self.lower, self.upper, f"size of: {self.label}", ca.SX.sym("m")
-        )
-        shape = tuple(
-            Parameter(
-                f"{prefix}.{item.name}",
-                item.default if item.default is not None else 0.0,
-                item.unit,
-                item.lower,
-                item.upper,
-                item.meaning,
-                ca.SX.sym(item.name),
-            )
-            for item in profile.parameters
-        )
-        symbols = {"size": size.symbol}
-        symbols |= {item.name: new.symbol for item, new in zip(profile.parameters, shape, strict=True)}
+        bounds = (self.lower, self.upper)
+        size = Parameter(f"{prefix}.size", self.neutral, self.unit, *bounds, f"size of: {self.label}", ca.SX.sym("m"))
+        added = {"size": size} | {item.name: _shape_parameter(prefix, item) for item in profile.parameters}
+        symbols = {name: item.symbol for name, item in added.items()}
         extended = self.apply(model, self.size_signal(model.clock, profile, symbols))
+        jumps = (f"{prefix}.{item.name}" for item in profile.parameters if item.breakpoint)
         return replace(
             extended,
-            parameters=(*extended.parameters, size, *shape),
-            breakpoints=(
-                *extended.breakpoints,
-                *(f"{prefix}.{item.name}" for item in profile.parameters if item.breakpoint),
-            ),
+            parameters=(*extended.parameters, *added.values()),
+            breakpoints=(*extended.breakpoints, *jumps),
         )
 
     def add_constants(self, model: ProcessModel) -> tuple[ProcessModel, tuple[ca.SX, ...]]:
@@ -178,6 +163,11 @@ class Effect(ABC):
         return prefix
 
 
+def _shape_parameter(prefix: str, item: ProfileParameter) -> Parameter:
+    bounds, symbol = (item.lower, item.upper), ca.SX.sym(item.name)
+    return Parameter(f"{prefix}.{item.name}", item.default or 0.0, item.unit, *bounds, item.meaning, symbol)
+
+
 class ParameterEffect(Effect):
     """An effect that multiplies one parameter of the balances by (1 + m), and others that have it as a factor.
 
@@ -186,6 +176,9 @@ class ParameterEffect(Effect):
         proportional: names of parameters in proportion to it.
     """
 
+    unit = "1"
+    lower = -0.99
+    upper = 4.0
     parameter: ClassVar[str]
     proportional: ClassVar[tuple[str, ...]] = ()
 
@@ -227,10 +220,8 @@ class SensorEffect(Effect):
             raise ValueError(
                 f"{self.name} needs a model with the output {self.output!r}, {model.name} has {model.output_names}"
             )
-        value = model.outputs[model.output_names.index(self.output)].expression
-        extended, reading = self.sense(model, value, size)
-        outputs = (replace(item, expression=reading) if item.name == self.output else item for item in extended.outputs)
-        return replace(extended, outputs=tuple(outputs))
+        extended, reading = self.sense(model, model.output(self.output).expression, size)
+        return extended.with_output(replace(extended.output(self.output), expression=reading))
 
 
 def make_effect(kind: type[Effect], name: str, meaning: str, module: str, **facts: Any) -> Effect:

@@ -107,22 +107,16 @@ def add_delay(
 
 def rest_function(model: ProcessModel) -> ca.Function:
     """(states that are not in `at_rest`, u, p, t) -> x, with all others in equilibrium."""
-    symbols, results = _at_one_time(model, ca.vertcat(*model.rest_expressions()))
-    symbols[0] = ca.vertcat(*(state.symbol for state in model.states if state.name not in model.at_rest))
-    return ca.Function("rest", symbols, [ca.densify(results)])
+    _, u, p, t, x = model.at_one_time(ca.vertcat(*model.rest_expressions()))
+    core = ca.vertcat(*(state.symbol for state in model.states if state.name not in model.at_rest))
+    return ca.Function("rest", [core, u, p, t], [ca.densify(x)])
 
 
 def reset_function(model: ProcessModel) -> ca.Function:
     """(x, u, p, t) -> x after the jumps at a row at t, from which on u holds."""
     after = ca.vertcat(*(model.resets.get(state.name, state.symbol) for state in model.states))
-    symbols, result = _at_one_time(model, after)
+    *symbols, result = model.at_one_time(after)
     return ca.Function("reset", symbols, [ca.densify(result)])
-
-
-def _at_one_time(model: ProcessModel, expression: ca.SX) -> tuple[list[ca.SX], ca.SX]:
-    t = ca.SX.sym("t")
-    (result,) = ca.substitute([expression], [model.clock.now, model.clock.middle], [t, t])
-    return [*model.arguments(), t], result
 
 
 def with_jacobian(function: ca.Function) -> ca.Function:

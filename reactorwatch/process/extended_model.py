@@ -21,7 +21,7 @@ where they are not just those of the equations: its keys are those of a process 
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -44,21 +44,6 @@ _MINUTE_NS = 60_000_000_000
 _SIZE = re.compile(r"(.+?)(?:_\d+)?\.size")
 
 
-class _LawFile(msgspec.Struct, forbid_unknown_fields=True):
-    """A law, see `process.law`."""
-
-    place: str
-    form: str
-    variables: tuple[str, ...]
-    references: tuple[float, ...]
-    parameters: dict[str, float]
-    range: dict[str, tuple[float, float]]
-
-    def law(self) -> ExtendedLaw:
-        """Convert to a law."""
-        return ExtendedLaw(self.place, self.form, self.variables, self.references, self.parameters, self.range)
-
-
 class _ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     """The JSON object, before its texts are parsed."""
 
@@ -67,7 +52,7 @@ class _ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     effects: tuple[str, ...] = ()
     parameters: dict[str, float] = {}  # msgspec copies the default
     zero_ns: int = 0
-    laws: tuple[_LawFile, ...] = ()
+    laws: tuple[ExtendedLaw, ...] = ()
     equations: dict[str, Any] | None = None
     process: dict[str, Any] | None = None
     uncertain: tuple[str, ...] = ()
@@ -98,20 +83,17 @@ class ExtendedModel:
     description: Mapping[str, Any] | None = None
     uncertain: tuple[str, ...] = ()
 
-    def build(self, models: Sequence[Callable[[], ProcessModel]] = MODELS) -> ProcessModel:
+    def build(self) -> ProcessModel:
         """Build the model; its clock is that of the record.
-
-        Args:
-            models: the catalogue.
 
         Raises:
             InputError: there is no such model, or it cannot have these parameters or effects.
         """
-        model = self._build_from(models) if self.equations is None else self.equations
+        model = self._build_from_catalogue() if self.equations is None else self.equations
         return replace(model, uncertain=self.uncertain) if self.uncertain else model
 
-    def _build_from(self, models: Sequence[Callable[[], ProcessModel]]) -> ProcessModel:
-        nominal = {item.name: item for item in (make() for make in models)}
+    def _build_from_catalogue(self) -> ProcessModel:
+        nominal = {item.name: item for item in (make() for make in MODELS)}
         if self.name not in nominal:
             raise InputError(f"unknown model {self.name!r} (valid: {', '.join(nominal)})")
         try:
@@ -136,7 +118,7 @@ class ExtendedModel:
             "parameters": dict(self.parameters),
             "effects": [str(item) for item in self.effects],
             "zero_ns": self.zero_ns,
-            **({"laws": [_law_object(item) for item in self.laws]} if self.laws else {}),
+            **({"laws": [msgspec.to_builtins(item) for item in self.laws]} if self.laws else {}),
             **({} if self.equations is None else {"equations": store_equations(self.equations)}),
             **({} if self.description is None else {"process": dict(self.description)}),
             **({"uncertain": list(self.uncertain)} if self.uncertain else {}),
@@ -166,28 +148,8 @@ def _shift(model: ProcessModel, by_min: float) -> ProcessModel:
     return model.with_values({name: values[name] + by_min for name in times})
 
 
-def _law_object(law: ExtendedLaw) -> dict[str, Any]:
-    return {
-        "place": law.place,
-        "form": law.form,
-        "variables": list(law.variables),
-        "references": list(law.references),
-        "parameters": dict(law.parameters),
-        "range": {name: list(ends) for name, ends in law.range.items()},
-    }
-
-
-def parse_extended_model(
-    text: str | bytes,
-    models: Sequence[Callable[[], ProcessModel]] = MODELS,
-    effects: Sequence[Effect] | None = None,
-) -> ExtendedModel:
+def parse_extended_model(text: str | bytes) -> ExtendedModel:
     """Read the JSON that `ExtendedModel.to_object` gives.
-
-    Args:
-        text: content of the file.
-        models: catalogue of models.
-        effects: catalogue of effects; None: that of the model, and the generic ones.
 
     Raises:
         InputError: it is no such file, or a part of it is invalid.
@@ -205,25 +167,23 @@ def parse_extended_model(
         return ExtendedModel(
             file.model, zero_ns=file.zero_ns, equations=equations, description=file.process, uncertain=file.uncertain
         )
-    if effects is None:
-        effects = named_effects(ExtendedModel(file.model).build(models))
+    effects = named_effects(ExtendedModel(file.model).build())
     extended = ExtendedModel(
         file.model,
         tuple(parse_fault(item, effects).with_defaults() for item in file.effects),
         file.parameters,
         file.zero_ns,
-        tuple(item.law() for item in file.laws),
+        file.laws,
         description=file.process,
         uncertain=file.uncertain,
     )
-    extended.build(models)  # reports invalid combinations now
+    extended.build()  # reports invalid combinations now
     return extended
 
 
 def extended_model_of(
     model: ProcessModel,
     effects: Sequence[Effect] | None = None,
-    models: Sequence[Callable[[], ProcessModel]] = MODELS,
     zero_ns: int = 0,
 ) -> ExtendedModel:
     """Recognise the effects and changed parameters of a model by its parameters.
@@ -231,7 +191,6 @@ def extended_model_of(
     Args:
         model: with or without effects.
         effects: catalogue of effects; None: that of the model, and the generic ones.
-        models: catalogue of models; a model outside it counts as having nominal parameters.
         zero_ns: time from which the minutes of its effects are counted.
     """
     effects = named_effects(model) if effects is None else effects
@@ -242,7 +201,7 @@ def extended_model_of(
         effect = next((item for item in effects if match and item.name == match[1]), None)
         if effect is not None:
             found.append(_specification(effect, values, name.removesuffix("size")))
-    nominal = next((item for item in (make() for make in models) if item.name == model.name), None)
+    nominal = next((item for item in (make() for make in MODELS) if item.name == model.name), None)
     differing = {
         item.name: values[item.name]
         for item in (nominal.parameters if nominal else ())

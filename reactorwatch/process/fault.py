@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from math import inf, isfinite
 from typing import TypeVar
 
-from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.errors import InputError, describe_unknown, prefix_errors
 from reactorwatch.process.effect import Effect, EffectConstant
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.model import ProcessModel
@@ -71,7 +71,8 @@ class FaultSpecification:
                 )
             values[item.name] = value
         values |= {item.name: self.values[item.name] for item in self.effect.constants if item.name in self.values}
-        _check_order(str(self), values)
+        with prefix_errors(f"fault {str(self)!r}"):
+            _check_order(values)
         return FaultSpecification(self.effect, self.profile, values)
 
     def extend(self, model: ProcessModel, end_min: float | None = None) -> ProcessModel:
@@ -129,60 +130,61 @@ def parse_fault(text: str, effects: Sequence[Effect] = EFFECTS) -> FaultSpecific
     Raises:
         InputError: a part of it is invalid; the message names the part, the rule and the value.
     """
+    with prefix_errors(f"fault {text!r}"):
+        return _parse(text, effects)
+
+
+def _parse(text: str, effects: Sequence[Effect]) -> FaultSpecification:
     parts = [part.strip() for part in text.split(":")]
     if len(parts) != 3:
-        raise InputError(f"fault {text!r}: must be cause:profile:size[@onset][,name=value]..., like {EXAMPLE}")
-    effect = _look_up(text, "cause", parts[0], {item.name: item for item in effects})
-    profile = _look_up(text, "profile", parts[1], {item.name: item for item in PROFILES})
+        raise InputError(f"must be cause:profile:size[@onset][,name=value]..., like {EXAMPLE}")
+    effect = _look_up("cause", parts[0], {item.name: item for item in effects})
+    profile = _look_up("profile", parts[1], {item.name: item for item in PROFILES})
     first, *assignments = (part.strip() for part in parts[2].split(","))
     size, at, onset = (part.strip() for part in first.partition("@"))
     known: dict[str, ProfileParameter | EffectConstant] = {item.name: item for item in profile.parameters}
     constants = {item.name: item for item in effect.constants}
     if at and "onset" not in known:
-        raise InputError(f"fault {text!r}: the profile {profile.name} has no onset, got '@{onset}'; leave it out")
-    values = {"size": _parse_number(text, "size", size, effect.unit, (effect.lower, effect.upper))}
+        raise InputError(f"the profile {profile.name} has no onset, got '@{onset}'; leave it out")
+    values = {"size": _parse_number("size", size, effect.unit, (effect.lower, effect.upper))}
     if profile.name == FREE_NAME:
         named = [item for item in assignments if item.partition("=")[0].strip() in constants]
         assignments = [item for item in assignments if item not in named]
-        shape, values = _parse_curve(text, effect, values["size"], assignments)
+        shape, values = _parse_curve(effect, values["size"], assignments)
         assignments, profile, known = named, shape, {}
     known |= constants
+    what = f"parameter of the profile {profile.name}" + (f" or constant of {effect.name}" if constants else "")
     given = [("onset", onset)] if at else []
     for assignment in assignments:
         name, equals, value = (part.strip() for part in assignment.partition("="))
         if not equals:
-            raise InputError(f"fault {text!r}: after the size must come name=value, got {assignment!r}")
+            raise InputError(f"after the size must come name=value, got {assignment!r}")
         given.append((name, value))
     for name, value in given:
-        item = _look_up(text, f"parameter of the profile {profile.name}{_of_effect(effect)}", name, known)
+        item = _look_up(what, name, known)
         if name in values:
-            raise InputError(f"fault {text!r}: {name} must be given once, got it again as {value!r}")
-        values[name] = _parse_number(text, name, value, item.unit, (item.lower, item.upper))
-    _check_order(text, values)
+            raise InputError(f"{name} must be given once, got it again as {value!r}")
+        values[name] = _parse_number(name, value, item.unit, (item.lower, item.upper))
+    _check_order(values)
     return FaultSpecification(effect, profile, values)
 
 
-def _parse_curve(text: str, effect: Effect, size: float, assignments: list[str]) -> tuple[Profile, dict[str, float]]:
+def _parse_curve(effect: Effect, size: float, assignments: list[str]) -> tuple[Profile, dict[str, float]]:
     """Read the knots of a free profile."""
     knots: list[tuple[float, float]] = []
     for assignment in assignments:
-        time, _, share = (part.strip() for part in assignment.partition("="))
-        knot = (
-            _parse_number(text, "time", time, "min", (-inf, inf)),
-            _parse_number(text, "share", share, "1", (-inf, inf)),
-        )
-        if knots and not knots[-1][0] < knot[0]:
-            raise InputError(f"fault {text!r}: times must rise, got {knot[0]:g} min after {knots[-1][0]:g} min")
-        if not effect.lower <= size * knot[1] <= effect.upper:
-            raise InputError(
-                f"fault {text!r}: size times share must be in [{effect.lower:g}, {effect.upper:g}], "
-                f"got {size * knot[1]:g} at {knot[0]:g} min"
-            )
-        knots.append(knot)
+        written, _, fraction = (part.strip() for part in assignment.partition("="))
+        time = _parse_number("time", written, "min", (-inf, inf))
+        share = _parse_number("share", fraction, "1", (-inf, inf))
+        if knots and not knots[-1][0] < time:
+            raise InputError(f"times must rise, got {time:g} min after {knots[-1][0]:g} min")
+        value, reach = size * share, f"[{effect.lower:g}, {effect.upper:g}]"
+        if not effect.lower <= value <= effect.upper:
+            raise InputError(f"size times share must be in {reach}, got {value:g} at {time:g} min")
+        knots.append((time, share))
     if not 2 <= len(knots) <= MAX_KNOTS:
         raise InputError(
-            f"fault {text!r}: a curve must have 2 to {MAX_KNOTS} times with their shares, like ,0min=0,90min=1, "
-            f"got {len(knots)}"
+            f"a curve must have 2 to {MAX_KNOTS} times with their shares, like ,0min=0,90min=1, got {len(knots)}"
         )
     values = {"size": size}
     values |= {f"time_{number}": time for number, (time, _) in enumerate(knots, 1)}
@@ -196,17 +198,13 @@ def _curve(values: Mapping[str, float]) -> list[tuple[float, float]]:
     return [(values[f"time_{number}"], values[f"value_{number}"]) for number in range(1, count + 1)]
 
 
-def _of_effect(effect: Effect) -> str:
-    return f" or constant of {effect.name}" if effect.constants else ""
+def _look_up(what: str, name: str, valid: Mapping[str, _Item]) -> _Item:
+    if name not in valid:
+        raise InputError(describe_unknown(what, name, valid))
+    return valid[name]
 
 
-def _look_up(text: str, what: str, name: str, valid: Mapping[str, _Item]) -> _Item:
-    if name in valid:
-        return valid[name]
-    raise InputError(f"fault {text!r}: {describe_unknown(what, name, valid)}")
-
-
-def _parse_number(text: str, name: str, written: str, unit: str, bounds: tuple[float, float]) -> float:
+def _parse_number(name: str, written: str, unit: str, bounds: tuple[float, float]) -> float:
     """Parse a number with its unit and convert it to the stored unit."""
     in_unit = "" if unit == "1" else f" {unit}"
     if unit == "min":
@@ -217,18 +215,17 @@ def _parse_number(text: str, name: str, written: str, unit: str, bounds: tuple[f
         factors[""] = 1.0
     match = _NUMBER.fullmatch(written)
     if match is None or match[2] not in factors:
-        raise InputError(f"fault {text!r}: {name} must be {rule}, got {written!r}")
+        raise InputError(f"{name} must be {rule}, got {written!r}")
     value = float(match[1]) * factors[match[2]]
     if not (bounds[0] <= value <= bounds[1] and isfinite(value)):
-        raise InputError(f"fault {text!r}: {name} must be in [{bounds[0]:g}, {bounds[1]:g}]{in_unit}, got {value:g}")
+        raise InputError(f"{name} must be in [{bounds[0]:g}, {bounds[1]:g}]{in_unit}, got {value:g}")
     return value
 
 
-def _check_order(text: str, values: Mapping[str, float]) -> None:
+def _check_order(values: Mapping[str, float]) -> None:
     if "onset" in values and "end" in values and not values["onset"] < values["end"]:
         raise InputError(
-            f"fault {text!r}: end must come after the onset, got end {values['end']:g} min "
-            f"and onset {values['onset']:g} min"
+            f"end must come after the onset, got end {values['end']:g} min and onset {values['onset']:g} min"
         )
 
 

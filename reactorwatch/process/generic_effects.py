@@ -12,6 +12,7 @@ at a point inside the bounds. A process may have effects of its own instead, und
 generic ones that do the same to the model (`effect_twins`) it then has its own.
 """
 
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
 
@@ -84,11 +85,7 @@ class Exchange(Source):
 def exchanges(model: ProcessModel) -> tuple[Effect, ...]:
     """Unmodelled flows between each two states of one unit that the model joins in both directions."""
     own = [index for index, item in enumerate(model.states) if item.name not in model.at_rest]
-    x, u, p = model.arguments()
-    clock = [model.clock.now, model.clock.middle]
-    by = ca.Function("by", [x, u, p, *clock], [ca.jacobian(ca.vertcat(*model.rhs), x)])
-    start, inputs = reference_point(model)
-    slopes = np.array(by(start, inputs, model.values(), 0.0, 0.0))
+    slopes = _slopes(model, ca.vertcat(*model.rhs), model.arguments()[0])
     result = []
     for i in own:
         for j in own[:i]:
@@ -141,14 +138,20 @@ def reference_point(model: ProcessModel) -> tuple[Array, Array]:
 
 def output_scales(model: ProcessModel) -> list[float]:
     """Typical magnitudes of the changes of the outputs, from those of the states and inputs."""
-    x, u, p, t, y = model.output_expressions()
-    by = ca.Function("by", [x, u, p, t], [ca.jacobian(y, ca.vertcat(x, u))])
+    outputs = ca.vertcat(*(output.expression for output in model.outputs))
     scales = np.array([item.scale for item in (*model.states, *model.inputs)])
-    moved = np.abs(np.array(by(*reference_point(model), model.values(), 0.0))) @ scales
+    moved = np.abs(_slopes(model, outputs, ca.vertcat(*model.arguments()[:2]))) @ scales
     return [float(value) if np.isfinite(value) and value > 0.0 else 1.0 for value in moved]
 
 
-_make = partial(make_effect, module=__name__)
+def _slopes(model: ProcessModel, expressions: ca.SX, by: ca.SX) -> Array:
+    """Derivatives of expressions with respect to symbols at the reference point."""
+    symbols = [*model.arguments(), model.clock.now, model.clock.middle]
+    slopes = ca.Function("slopes", symbols, [ca.jacobian(expressions, by)])
+    return np.array(slopes(*reference_point(model), model.values(), 0.0, 0.0))
+
+
+_make: Callable[..., Effect] = partial(make_effect, module=__name__)
 
 
 def _deviation(unit: str, scale: float) -> dict[str, Any]:
@@ -162,11 +165,8 @@ def _of_output(model: ProcessModel, output: Output, scale: float) -> list[Effect
     at = {"output": name, "location": name}
     reach, in_unit = LARGEST_SCALES * scale, "" if unit == "1" else f" {unit}"
     times = {**at, "scale": scale, "upper": LONGEST_MIN, "start_values": TIMES_MIN}
-    middle = float(
-        np.array(model.function()(*reference_point(model), model.values(), 0.0, 0.0)[1])[
-            model.output_names.index(name)
-        ].item()
-    )
+    usual = model.function()(*reference_point(model), model.values(), 0.0, 0.0)[1]
+    middle = float(usual[model.output_names.index(name)])
     stuck_at = EffectConstant("value", middle, reach, unit, middle - 1e3 * reach, middle + 1e3 * reach, "stuck reading")
     return [
         _make(
@@ -287,49 +287,34 @@ def _of_input(item: Variable) -> list[Effect]:
 
 
 def _of_parameter(model: ProcessModel, item: Parameter) -> Effect:
-    value = abs(item.value)
-    facts = {
-        "label": f"other {item.name} ({item.meaning})" if item.meaning else f"other {item.name}",
-        "location": parameter_location(model, item),
-        "parameter": item.name,
-    }
-    name = f"{item.name}.deviation"
-    if not value:
-        width = item.upper - item.lower
-        return _make(
-            ParameterShift,
-            name,
-            f"{item.name} + m.",
-            unit=item.unit,
-            lower=item.lower,
-            upper=item.upper,
-            typical=1e-3 * width,
-            larger=f"{item.name} higher by {{}} {item.unit}",
-            smaller=f"{item.name} lower by {{}} {item.unit}",
-            **facts,
-        )
-    ends = sorted((end - item.value) / item.value for end in (item.lower, item.upper))
+    """Deviation as a share of the value, or in its unit where the value is 0."""
+    kind: type[Effect]
+    if item.value:
+        ends = sorted((end - item.value) / item.value for end in (item.lower, item.upper))
+        typical = min(TYPICAL_SHARE, 0.5 * ends[1]) or max(-TYPICAL_SHARE, 0.5 * ends[0])
+        facts = {"lower": max(ends[0], -0.99), "upper": min(ends[1], LARGEST_SHARE), "typical": typical}
+        kind, formula, unit = ParameterEffect, "(1 + m)", "%"
+    else:
+        facts = {"lower": item.lower, "upper": item.upper, "typical": 1e-3 * (item.upper - item.lower)}
+        kind, formula, unit = ParameterShift, "+ m", item.unit
     return _make(
-        ParameterEffect,
-        name,
-        f"{item.name} (1 + m).",
-        unit="1",
-        lower=max(ends[0], -0.99),
-        upper=min(ends[1], LARGEST_SHARE),
-        typical=min(TYPICAL_SHARE, 0.5 * ends[1]) or max(-TYPICAL_SHARE, 0.5 * ends[0]),
-        larger=f"{item.name} higher by {{}} %",
-        smaller=f"{item.name} lower by {{}} %",
+        kind,
+        f"{item.name}.deviation",
+        f"{item.name} {formula}.",
+        label=f"other {item.name} ({item.meaning})" if item.meaning else f"other {item.name}",
+        location=parameter_location(model, item),
+        parameter=item.name,
+        unit="1" if item.value else item.unit,
+        larger=f"{item.name} higher by {{}} {unit}",
+        smaller=f"{item.name} lower by {{}} {unit}",
         **facts,
     )
 
 
 def parameter_location(model: ProcessModel, item: Parameter) -> str:
     """Balance, or else output, that a parameter changes most, relative to the scales."""
-    x, u, p = model.arguments()
     expressions = ca.vertcat(*model.rhs, *(output.expression for output in model.outputs))
-    clock = [model.clock.now, model.clock.middle]
-    by = ca.Function("by", [x, u, p, *clock], [ca.jacobian(expressions, item.symbol)])
-    slopes = np.abs(np.array(by(*reference_point(model), model.values(), 0.0, 0.0))).ravel()
+    slopes = np.abs(_slopes(model, expressions, item.symbol)).ravel()
     scales = np.array([*(state.scale for state in model.states), *output_scales(model)])
     shares = np.nan_to_num(slopes / scales)
     states = len(model.states)

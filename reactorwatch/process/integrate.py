@@ -10,13 +10,11 @@ upset, an ignition: the reaction then has time constants below a second) the int
 A step never crosses a sample, where the input jumps, nor a breakpoint of the model.
 """
 
-from dataclasses import dataclass
 from itertools import pairwise
 from math import isfinite
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
@@ -91,9 +89,12 @@ def _weighted_sum(weights: tuple[float, ...], slopes: list[ca.SX]) -> ca.SX:
     return sum(terms, ca.SX(0))
 
 
-@dataclass(frozen=True, eq=False)
 class StepGrid:
-    """Consecutive integration steps of a run.
+    """Consecutive integration steps of a run, which end at every sample and every breakpoint.
+
+    Args:
+        time_min: shape (rows,), increasing.
+        breakpoints: shape (n,), times in minutes; those outside the record have no effect.
 
     Attributes:
         start_min: start of each step, shape (steps,).
@@ -103,37 +104,20 @@ class StepGrid:
         end_of_row: index of the step that ends at the following row, shape (rows - 1,).
     """
 
-    start_min: Array
-    length_min: Array
-    middle_min: Array
-    row: NDArray[np.int64]
-    end_of_row: NDArray[np.int64]
-
-
-def step_grid(time_min: Array, breakpoints: Array) -> StepGrid:
-    """Make steps that end at every sample and every breakpoint.
-
-    Args:
-        time_min: shape (rows,), increasing.
-        breakpoints: shape (n,), times in minutes; those outside the record have no effect.
-    """
-    inside = (breakpoints > time_min[0]) & (breakpoints < time_min[-1])
-    edges = np.union1d(time_min, breakpoints[inside])
-    interval = np.diff(edges)
-    middle = np.minimum(0.5 * (edges[:-1] + edges[1:]), np.nextafter(edges[1:], -np.inf))  # before the jump at its end
-    counts = np.maximum(np.ceil(interval / LONGEST_STEP_MIN - 1e-9).astype(np.int64), 1)
-    part = np.repeat(np.arange(interval.size), counts)
-    position = np.arange(part.size) - np.repeat(np.cumsum(counts) - counts, counts)
-    share = 1.0 / counts[part]
-    row = np.searchsorted(time_min, edges[:-1], side="right") - 1
-    ends = np.cumsum(counts) - 1
-    return StepGrid(
-        start_min=edges[part] + position * share * interval[part],
-        length_min=share * interval[part],
-        middle_min=middle[part],
-        row=row[part],
-        end_of_row=ends[np.searchsorted(edges[1:], time_min[1:], side="left")],
-    )
+    def __init__(self, time_min: Array, breakpoints: Array) -> None:
+        inside = (breakpoints > time_min[0]) & (breakpoints < time_min[-1])
+        edges = np.union1d(time_min, breakpoints[inside])
+        interval, before_jump = np.diff(edges), np.nextafter(edges[1:], -np.inf)
+        counts = np.maximum(np.ceil(interval / LONGEST_STEP_MIN - 1e-9).astype(np.int64), 1)
+        ends = np.cumsum(counts)
+        part = np.repeat(np.arange(interval.size), counts)
+        position = np.arange(part.size) - (ends - counts)[part]
+        share = 1.0 / counts[part]
+        self.start_min = edges[part] + position * share * interval[part]
+        self.length_min = share * interval[part]
+        self.middle_min = np.minimum(0.5 * (edges[:-1] + edges[1:]), before_jump)[part]
+        self.row = np.searchsorted(time_min, edges[part], side="right") - 1
+        self.end_of_row = ends[np.searchsorted(edges[1:], time_min[1:], side="left")] - 1
 
 
 class Stepper:

@@ -11,6 +11,7 @@ from math import inf
 from typing import Any, NamedTuple
 
 import casadi as ca
+import msgspec
 import numpy as np
 
 from reactorwatch.process.model import ProcessModel, parameter, variable
@@ -44,7 +45,6 @@ class Form:
     Attributes:
         key: name of the form, unique.
         form: family in a diagnosis.
-        variables: number of variables.
         parameters: parameters in order.
         expression: value from variables v, parameters p and references r, the variables' means.
         text: formula with `{v0}`, `{r0}` for variables and references, and the parameters' names.
@@ -55,13 +55,17 @@ class Form:
 
     key: str
     form: str
-    variables: int
     parameters: tuple[FormParameter, ...]
     expression: Callable[[Sequence[Any], Any, Sequence[float]], Any]
     text: str
     positive: bool = False
     symmetric: bool = False
     position: tuple[float, float] = (-inf, inf)
+
+    @property
+    def variables(self) -> int:
+        """Number of variables."""
+        return 2 if "{v1}" in self.text else 1
 
 
 def exponential(x: Any) -> Any:
@@ -82,113 +86,91 @@ def positive_part(x: Any) -> Any:
 
 
 _A, _B, _C = FormParameter("a", GAIN), FormParameter("b", SLOPE), FormParameter("c", POSITION)
-_N, _K = FormParameter("n", EXPONENT), FormParameter("k", RATE)
-_OFFSET = FormParameter("d", GAIN)
+_D, _CURVE, _K = FormParameter("d", GAIN), FormParameter("a", CURVATURE), FormParameter("k", RATE)
+_N, _M = FormParameter("n", EXPONENT), FormParameter("m", EXPONENT, 1)
+
+
+def _exponential(v: Sequence[Any], p: Any, r: Sequence[float]) -> Any:
+    return exponential(p[1] * (v[0] - r[0]))
+
+
+def _power(v: Sequence[Any], p: Any, r: Sequence[float], i: int = 0) -> Any:
+    return power(v[i] / r[i], p[i + 1])
+
 
 FORMS: tuple[Form, ...] = (
-    Form("constant", "constant", 1, (_A,), lambda v, p, r: p[0] + 0.0 * v[0], "a"),
-    Form("proportional", "linear", 1, (_B,), lambda v, p, r: p[0] * v[0], "b {v0}"),
-    Form("linear", "linear", 1, (_A, _B), lambda v, p, r: p[0] + p[1] * (v[0] - r[0]), "a + b ({v0} - {r0})"),
-    Form("difference", "difference", 1, (_B, _C), lambda v, p, r: p[0] * (v[0] - p[1]), "b ({v0} - c)"),
-    Form("power", "power", 1, (_A, _N), lambda v, p, r: p[0] * power(v[0] / r[0], p[1]), "a ({v0}/{r0})^n", True),
-    Form(
-        "square",
-        "power",
-        1,
-        (FormParameter("a", CURVATURE), _C),
-        lambda v, p, r: p[0] * (v[0] - p[1]) ** 2,
-        "a ({v0} - c)^2",
-    ),
+    Form("constant", "constant", (_A,), lambda v, p, r: p[0] + 0.0 * v[0], "a"),
+    Form("proportional", "linear", (_B,), lambda v, p, r: p[0] * v[0], "b {v0}"),
+    Form("linear", "linear", (_A, _B), lambda v, p, r: p[0] + p[1] * (v[0] - r[0]), "a + b ({v0} - {r0})"),
+    Form("difference", "difference", (_B, _C), lambda v, p, r: p[0] * (v[0] - p[1]), "b ({v0} - c)"),
+    Form("power", "power", (_A, _N), lambda v, p, r: p[0] * _power(v, p, r), "a ({v0}/{r0})^n", positive=True),
+    Form("square", "power", (_CURVE, _C), lambda v, p, r: p[0] * (v[0] - p[1]) ** 2, "a ({v0} - c)^2"),
     Form(
         "square and constant",
         "power",
-        1,
-        (FormParameter("a", CURVATURE), _C, _OFFSET),
+        (_CURVE, _C, _D),
         lambda v, p, r: p[0] * (v[0] - p[1]) ** 2 + p[2],
         "a ({v0} - c)^2 + d",
     ),
     Form(
         "power and constant",
         "power",
-        1,
-        (_A, _N, _OFFSET),
-        lambda v, p, r: p[0] * (power(v[0] / r[0], p[1]) - 1.0) + p[2],
+        (_A, _N, _D),
+        lambda v, p, r: p[0] * (_power(v, p, r) - 1.0) + p[2],
         "a (({v0}/{r0})^n - 1) + d",
-        True,
+        positive=True,
     ),
     Form(
-        "exponential",
-        "exponential",
-        1,
-        (_A, _K),
-        lambda v, p, r: p[0] * exponential(p[1] * (v[0] - r[0])),
-        "a exp(k ({v0} - {r0}))",
+        "exponential", "exponential", (_A, _K), lambda v, p, r: p[0] * _exponential(v, p, r), "a exp(k ({v0} - {r0}))"
     ),
     Form(
         "exponential and constant",
         "exponential",
-        1,
-        (_A, _K, _OFFSET),
-        lambda v, p, r: p[0] * (exponential(p[1] * (v[0] - r[0])) - 1.0) + p[2],
+        (_A, _K, _D),
+        lambda v, p, r: p[0] * (_exponential(v, p, r) - 1.0) + p[2],
         "a (exp(k ({v0} - {r0})) - 1) + d",
     ),
     Form(
         "saturation",
         "saturation",
-        1,
         (_A, _C),
         lambda v, p, r: p[0] * v[0] / (v[0] + positive_part(p[1])),
         "a {v0}/({v0} + c)",
-        True,
+        positive=True,
     ),
-    Form(
-        "threshold above",
-        "threshold",
-        1,
-        (_B, _C),
-        lambda v, p, r: p[0] * positive_part(v[0] - p[1]),
-        "b max({v0} - c, 0)",
-        position=(0.0, 1.0),
-    ),
-    Form(
-        "threshold below",
-        "threshold",
-        1,
-        (_B, _C),
-        lambda v, p, r: p[0] * positive_part(p[1] - v[0]),
-        "b max(c - {v0}, 0)",
-        position=(0.0, 1.0),
+    *(
+        Form(f"threshold {side}", "threshold", (_B, _C), expression, text, position=(0.0, 1.0))
+        for side, expression, text in (
+            ("above", lambda v, p, r: p[0] * positive_part(v[0] - p[1]), "b max({v0} - c, 0)"),
+            ("below", lambda v, p, r: p[0] * positive_part(p[1] - v[0]), "b max(c - {v0}, 0)"),
+        )
     ),
     Form(
         "product of powers",
         "product",
-        2,
-        (_A, _N, FormParameter("m", EXPONENT, 1)),
-        lambda v, p, r: p[0] * power(v[0] / r[0], p[1]) * power(v[1] / r[1], p[2]),
+        (_A, _N, _M),
+        lambda v, p, r: p[0] * _power(v, p, r) * _power(v, p, r, 1),
         "a ({v0}/{r0})^n ({v1}/{r1})^m",
-        True,
-        True,
+        positive=True,
+        symmetric=True,
     ),
     Form(
         "product with exponential",
         "product",
-        2,
         (_A, _K),
-        lambda v, p, r: p[0] * exponential(p[1] * (v[0] - r[0])) * v[1] / r[1],
+        lambda v, p, r: p[0] * _exponential(v, p, r) * v[1] / r[1],
         "a exp(k ({v0} - {r0})) {v1}/{r1}",
     ),
     Form(
         "product of exponential and power",
         "product",
-        2,
-        (_A, _K, FormParameter("m", EXPONENT, 1)),
-        lambda v, p, r: p[0] * exponential(p[1] * (v[0] - r[0])) * power(v[1] / r[1], p[2]),
+        (_A, _K, _M),
+        lambda v, p, r: p[0] * _exponential(v, p, r) * _power(v, p, r, 1),
         "a exp(k ({v0} - {r0})) ({v1}/{r1})^m",
     ),
     Form(
         "product with difference",
         "product",
-        2,
         (_B, _C),
         lambda v, p, r: p[0] * (v[0] - p[1]) * v[1] / r[1],
         "b ({v0} - c) {v1}/{r1}",
@@ -209,9 +191,8 @@ def find_form(key: str) -> Form:
     raise ValueError(f"unknown form of a law {key!r} (valid: {', '.join(item.key for item in FORMS)})")
 
 
-@dataclass(frozen=True)
-class ExtendedLaw:
-    """A law in a place of a process.
+class ExtendedLaw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A law in a place of a process, as it is stored.
 
     Attributes:
         place: name of the place.
@@ -226,8 +207,8 @@ class ExtendedLaw:
     form: str
     variables: tuple[str, ...]
     references: tuple[float, ...]
-    parameters: Mapping[str, float]
-    range: Mapping[str, tuple[float, float]]
+    parameters: dict[str, float]
+    range: dict[str, tuple[float, float]]
 
     def extend(self, model: ProcessModel) -> ProcessModel:
         """Add the law to a model; its parameters are named `law.a` and so on.

@@ -24,16 +24,12 @@ class Linearization:
         B: shape (n_x, n_u).
         C: shape (n_y, n_x).
         D: shape (n_y, n_u).
-        state: the point, shape (n_x,).
-        input: the point, shape (n_u,).
     """
 
     A: Array
     B: Array
     C: Array
     D: Array
-    state: Array
-    input: Array
 
     @property
     def eigenvalues(self) -> NDArray[np.complex128]:
@@ -59,8 +55,7 @@ def linearise(
         changes: parameters that differ from the model's values.
     """
     matrices = _derivatives(model)(state, inputs, model.values(changes), time_min, time_min)
-    A, B, C, D = (np.array(matrix) for matrix in matrices)
-    return Linearization(A, B, C, D, np.array(state, dtype=float), np.array(inputs, dtype=float))
+    return Linearization(*map(np.array, matrices))
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)

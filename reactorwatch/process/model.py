@@ -13,7 +13,7 @@ the model computes it from the other states and the inputs (`at_rest`). Some sta
 may have changed, such as a valve that sticks (`resets`).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -288,28 +288,48 @@ class ProcessModel:
             raise ValueError(f"{self.name} has no state {name!r} (it has {', '.join(self.state_names)})")
         return self.state_names.index(name)
 
-    def _map_expressions(self, change: Callable[[list[ca.SX]], list[ca.SX]]) -> "ProcessModel":
-        """Copy with all expressions changed."""
-        shown = [output.expression for output in self.outputs]
-        noisy = {item.name: item.noise_variance for item in self.outputs if item.noise_variance is not None}
-        named = (noisy, self.terms, self.at_rest, self.resets)
-        others = (item for items in named for item in items.values())
-        changed = iter(change([*self.rhs, *shown, self.time_offset, *others]))
-        rhs = tuple(next(changed) for _ in self.rhs)
-        expressions, time_offset = [next(changed) for _ in self.outputs], next(changed)
-        noisy = {name: next(changed) for name in noisy}
+    def output(self, name: str) -> Output:
+        """Look an output up by name.
+
+        Raises:
+            ValueError: there is no such output.
+        """
+        if name not in self.output_names:
+            raise ValueError(f"{self.name} has no output {name!r} (it has {', '.join(self.output_names)})")
+        return self.outputs[self.output_names.index(name)]
+
+    def with_output(self, output: Output) -> "ProcessModel":
+        """Copy with another output in place of that of its name."""
+        return replace(self, outputs=tuple(output if item.name == output.name else item for item in self.outputs))
+
+    def expressions(self) -> list[ca.SX]:
+        """Rates, outputs, `time_offset`, then the terms, equilibria and new values, each in their order."""
+        named = (*self.terms.values(), *self.at_rest.values(), *self.resets.values())
+        return [*self.rhs, *(output.expression for output in self.outputs), self.time_offset, *named]
+
+    def with_expressions(self, expressions: Iterable[ca.SX]) -> "ProcessModel":
+        """Copy with other expressions, in the order of `expressions`."""
+        items = iter(expressions)
         return replace(
             self,
-            rhs=rhs,
-            outputs=tuple(
-                replace(output, expression=expression, noise_variance=noisy.get(output.name))
-                for output, expression in zip(self.outputs, expressions, strict=True)
-            ),
-            time_offset=time_offset,
-            terms={name: next(changed) for name in self.terms},
-            at_rest={name: next(changed) for name in self.at_rest},
-            resets={name: next(changed) for name in self.resets},
+            rhs=tuple(next(items) for _ in self.rhs),
+            outputs=tuple(replace(output, expression=next(items)) for output in self.outputs),
+            time_offset=next(items),
+            terms={name: next(items) for name in self.terms},
+            at_rest={name: next(items) for name in self.at_rest},
+            resets={name: next(items) for name in self.resets},
         )
+
+    def _map_expressions(self, change: Callable[[list[ca.SX]], list[ca.SX]]) -> "ProcessModel":
+        """Copy with all expressions changed."""
+        noisy = [item.noise_variance for item in self.outputs if item.noise_variance is not None]
+        changed = iter(change([*self.expressions(), *noisy]))
+        model = self.with_expressions(changed)
+        outputs = (
+            item if item.noise_variance is None else replace(item, noise_variance=next(changed))
+            for item in model.outputs
+        )
+        return replace(model, outputs=tuple(outputs))
 
     def with_state(self, state: Variable, rate: ca.SX, at_rest: ca.SX, reset: ca.SX | None = None) -> "ProcessModel":
         """Copy with a further state.
@@ -368,10 +388,9 @@ class ProcessModel:
         """Variances of the sensors' noise beyond the usual, (u, p, t) -> (n_y,); None: there are none."""
         if all(output.noise_variance is None for output in self.outputs):
             return None
-        _, u, p = self.arguments()
         beyond = [ca.SX(0) if item.noise_variance is None else item.noise_variance for item in self.outputs]
-        (variances,) = ca.substitute([ca.vertcat(*beyond)], [self.clock.middle], [self.clock.now])
-        return ca.Function("noise", [u, p, self.clock.now], [ca.densify(variances)])
+        _, u, p, t, variances = self.at_one_time(ca.vertcat(*beyond))
+        return ca.Function("noise", [u, p, t], [ca.densify(variances)])
 
     def arguments(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Symbols of states, inputs and parameters as three column vectors."""
@@ -381,11 +400,15 @@ class ProcessModel:
             ca.vertcat(*(item.symbol for item in self.parameters)),
         )
 
+    def at_one_time(self, expression: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Symbols x, u, p and t, and an expression in terms of them: at t, for both symbols of the clock."""
+        t = ca.SX.sym("t")
+        (result,) = ca.substitute([expression], [self.clock.now, self.clock.middle], [t, t])
+        return *self.arguments(), t, result
+
     def output_expressions(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
         """Symbols x, u, p and t, and the outputs in terms of them."""
-        x, u, p = self.arguments()
-        t, y = ca.SX.sym("t"), ca.vertcat(*(output.expression for output in self.outputs))
-        return x, u, p, t, ca.substitute(ca.substitute(y, self.clock.now, t), self.clock.middle, t)
+        return self.at_one_time(ca.vertcat(*(output.expression for output in self.outputs)))
 
 
 def _check_bounds(name: str, value: float, lower: float, upper: float) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from reactorwatch.process.controller import Controller
 from reactorwatch.process.model import ProcessModel, Variable
 
 
@@ -111,6 +112,8 @@ class Operation:
         fault: fault of a demonstration, as `cause:profile:size`; empty: a step of the first effect.
         presets: named runs.
         examples: sample records by name.
+        controllers: controllers of its inputs; empty: it is simulated in open loop.
+        watch: settings of its watch where none are stated.
     """
 
     inputs: Mapping[str, InputLevels] = field(default_factory=dict)
@@ -118,3 +121,5 @@ class Operation:
     fault: str = ""
     presets: tuple[Preset, ...] = ()
     examples: Mapping[str, Example] = field(default_factory=dict)
+    controllers: tuple[Controller, ...] = ()
+    watch: WatchDefaults = field(default_factory=WatchDefaults)

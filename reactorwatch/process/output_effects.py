@@ -7,7 +7,7 @@ import casadi as ca
 
 from reactorwatch.process.effect import SensorEffect
 from reactorwatch.process.effect_states import add_delay, add_lag, window_states
-from reactorwatch.process.model import Output, ProcessModel, variable
+from reactorwatch.process.model import ProcessModel, variable
 
 
 class OutputBias(SensorEffect):
@@ -99,12 +99,9 @@ class OutputNoise(SensorEffect):
 
     def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
         """See `SensorEffect`."""
-
-        def add(item: Output) -> Output:
-            before = ca.SX(0) if item.noise_variance is None else item.noise_variance
-            return replace(item, noise_variance=before + size**2) if item.name == self.output else item
-
-        return replace(model, outputs=tuple(add(item) for item in model.outputs)), value
+        output = model.output(self.output)
+        before = ca.SX(0) if output.noise_variance is None else output.noise_variance
+        return model.with_output(replace(output, noise_variance=before + size**2)), value
 
 
 UNBOUNDED = 1e6

@@ -86,11 +86,8 @@ def correct(model: "ProcessModel", place: Place, correction: ca.SX) -> "ProcessM
         symbols = {item.name: item.symbol for item in model.inputs}
         symbol = symbols[place.of] if place.of in symbols else model.parameter(place.of).symbol
         return model.substitute(symbol, symbol + correction)
-    outputs = (
-        replace(item, expression=item.expression + correction) if item.name == place.of else item
-        for item in model.outputs
-    )
-    return replace(model, outputs=tuple(outputs))
+    output = model.output(place.of)
+    return model.with_output(replace(output, expression=output.expression + correction))
 
 
 def unit_of(model: "ProcessModel", place: Place) -> str:

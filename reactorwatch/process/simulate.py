@@ -16,7 +16,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.process.effect_states import reset_function, rest_function
-from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, step_grid, symbolic_step
+from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, symbolic_step
 from reactorwatch.process.model import ProcessModel
 
 
@@ -71,7 +71,7 @@ class Simulator:
         if start.size < len(self.model.states):
             start = self._complete.call(start, inputs[0], p, time_min[0])[0][0]
         start = self._stepper.start_row(start, inputs[0], p, float(time_min[0]))
-        grid = step_grid(time_min, self._stepper.breakpoints(p))
+        grid = StepGrid(time_min, self._stepper.breakpoints(p))
         states = np.vstack([start, self._run_steps(grid, inputs, start, p)[grid.end_of_row]])
         (y,) = self._outputs.map(states, inputs, p, time_min)
         return Trajectory(time_min, states, y[:, :, 0])

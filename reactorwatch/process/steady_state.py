@@ -132,10 +132,7 @@ class SteadyStates:
 
 def _search_step(model: ProcessModel) -> ca.Function:
     """(x, u, p, t) -> x after a damped step of Newton's method, and dx/dt before it."""
-    x, u, p = model.arguments()
-    t = ca.SX.sym("t")
-    rhs = ca.substitute(ca.vertcat(*model.rhs), model.clock.now, t)
-    rhs = ca.substitute(rhs, model.clock.middle, t)
+    x, u, p, t, rhs = model.at_one_time(ca.vertcat(*model.rhs))
     lower, upper = (ca.DM([getattr(state, name) for state in model.states]) for name in ("lower", "upper"))
     step = ca.solve(ca.jacobian(rhs, x), rhs)
     step = ca.if_else(ca.fabs(step) < inf, step, 0)

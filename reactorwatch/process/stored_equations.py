@@ -87,19 +87,11 @@ def store_equations(model: ProcessModel) -> dict[str, Any]:
     Raises:
         ValueError: an expression has a symbol that is none of the model's, or an operation on matrices.
     """
-    expressions = [
-        *model.rhs,
-        *(output.expression for output in model.outputs),
-        model.time_offset,
-        *model.terms.values(),
-        *model.at_rest.values(),
-        *model.resets.values(),
-    ]
-    steps, results = _to_steps(_symbols(model), expressions)
+    steps, results = _to_steps(_symbols(model), model.expressions())
     stored = StoredEquations(
-        states=tuple(_of_variable(item) for item in model.states),
-        inputs=tuple(_of_variable(item) for item in model.inputs),
-        parameters=tuple(_of_parameter(item) for item in model.parameters),
+        states=tuple(map(_store, model.states)),
+        inputs=tuple(map(_store, model.inputs)),
+        parameters=tuple(map(_store, model.parameters)),
         outputs=tuple(StoredOutput(item.name, item.unit) for item in model.outputs),
         steps=steps,
         results=results,
@@ -126,30 +118,26 @@ def build_equations(name: str, stored: Mapping[str, Any]) -> ProcessModel:
 
 
 def _build(name: str, stored: StoredEquations) -> ProcessModel:
-    states, inputs = ([_to_variable(item) for item in items] for items in (stored.states, stored.inputs))
-    parameters = [_to_parameter(item) for item in stored.parameters]
-    clock = new_clock()
-    symbols = [item.symbol for item in (*states, *inputs)] + [item.symbol for item in parameters]
-    expressions = iter(_from_steps([*symbols, clock.now, clock.middle], stored.steps, stored.results))
-    needed = len(states) + len(stored.outputs) + 1 + len(stored.terms) + len(stored.at_rest) + len(stored.resets)
-    if len(stored.results) != needed:
-        raise ValueError(f"results must be {needed} indices, got {len(stored.results)}")
-    return ProcessModel(
+    unknown = ca.SX()
+    model = ProcessModel(
         name,
-        tuple(states),
-        tuple(inputs),
-        tuple(parameters),
-        rhs=tuple(next(expressions) for _ in states),
-        outputs=tuple(Output(item.name, item.unit, next(expressions)) for item in stored.outputs),
-        clock=clock,
-        time_offset=next(expressions),
-        terms={name: next(expressions) for name in stored.terms},
-        at_rest={name: next(expressions) for name in stored.at_rest},
-        resets={name: next(expressions) for name in stored.resets},
+        tuple(map(_to_variable, stored.states)),
+        tuple(map(_to_variable, stored.inputs)),
+        tuple(map(_to_parameter, stored.parameters)),
+        rhs=(unknown,) * len(stored.states),
+        outputs=tuple(Output(item.name, item.unit, unknown) for item in stored.outputs),
+        clock=new_clock(),
+        terms=dict.fromkeys(stored.terms, unknown),
+        at_rest=dict.fromkeys(stored.at_rest, unknown),
+        resets=dict.fromkeys(stored.resets, unknown),
         breakpoints=stored.breakpoints,
         places=stored.places,
         effects=(),
     )
+    needed = len(model.expressions())
+    if len(stored.results) != needed:
+        raise ValueError(f"results must be {needed} indices, got {len(stored.results)}")
+    return model.with_expressions(_from_steps(_symbols(model), stored.steps, stored.results))
 
 
 def _symbols(model: ProcessModel) -> list[ca.SX]:
@@ -190,12 +178,7 @@ def _to_steps(symbols: Iterable[ca.SX], expressions: Iterable[ca.SX]) -> tuple[t
 
 
 def _from_steps(symbols: list[ca.SX], steps: Iterable[Step], results: Iterable[int]) -> list[ca.SX]:
-    """Expressions that steps compute.
-
-    Raises:
-        ValueError: a step is none.
-        IndexError: it refers to what is not there.
-    """
+    """Expressions that steps compute; an index beyond them is an IndexError."""
     values: list[ca.SX] = []
     for operation, *of in steps:
         if operation == "const":
@@ -215,21 +198,11 @@ def _from_steps(symbols: list[ca.SX], steps: Iterable[Step], results: Iterable[i
     return [values[index] for index in results]
 
 
-def _of_variable(item: Variable) -> StoredVariable:
-    return StoredVariable(
-        item.name,
-        item.unit,
-        item.meaning,
-        _finite(item.lower),
-        _finite(item.upper),
-        scale=item.scale,
-        balance=item.balance,
-        usual=item.usual,
-    )
-
-
-def _of_parameter(item: Parameter) -> StoredVariable:
-    return StoredVariable(item.name, item.unit, item.meaning, _finite(item.lower), _finite(item.upper), item.value)
+def _store(item: Variable | Parameter) -> StoredVariable:
+    facts: dict[str, Any] = {name: getattr(item, name, None) for name in ("value", "scale", "usual")}
+    lower, upper = (float(bound) if isfinite(bound) else None for bound in (item.lower, item.upper))
+    balance = item.balance if isinstance(item, Variable) else ""
+    return StoredVariable(item.name, item.unit, item.meaning, lower, upper, balance=balance, **facts)
 
 
 def _to_variable(item: StoredVariable) -> Variable:
@@ -241,10 +214,6 @@ def _to_variable(item: StoredVariable) -> Variable:
 def _to_parameter(item: StoredVariable) -> Parameter:
     value = 0.0 if item.value is None else item.value
     return Parameter(item.name, value, item.unit, *_bounds(item), item.meaning, ca.SX.sym(item.name))
-
-
-def _finite(bound: float) -> float | None:
-    return float(bound) if isfinite(bound) else None
 
 
 def _bounds(item: StoredVariable) -> tuple[float, float]:

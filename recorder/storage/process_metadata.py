@@ -13,7 +13,7 @@ import msgspec
 
 from reactorwatch.description.process import KnownParameter, Process, Signal, describe_model
 from reactorwatch.errors import InputError
-from reactorwatch.process import EFFECTS_OF, MODELS
+from reactorwatch.process import EFFECTS_OF
 from reactorwatch.process.extended_model import ExtendedModel, extended_model_of, is_complete, parse_extended_model
 from reactorwatch.records.record import Record
 from recorder.storage.mcap_types import Metadata
@@ -73,10 +73,7 @@ def _equations_metadata(process: Process) -> dict[str, str]:
         if process.effects:
             return {}
         extended = ExtendedModel(model.name, equations=model, uncertain=model.uncertain)
-    given = {
-        name: item if isinstance(item, KnownParameter) else KnownParameter(*item)
-        for name, item in process.parameters.items()
-    }
+    given = {name: KnownParameter.of(item) for name, item in process.parameters.items()}
     return {
         "equations": msgspec.json.encode(extended.to_object()).decode(),
         "parameters": msgspec.json.encode(given).decode(),
@@ -91,7 +88,7 @@ def _with_equations(process: Process, metadata: dict[str, str]) -> Process:
         InputError: they cannot be built.
         msgspec.MsgspecError: they are no such JSON.
     """
-    named = describe_model(parse_extended_model(metadata["equations"], MODELS).build())
+    named = describe_model(parse_extended_model(metadata["equations"]).build())
     parameters = msgspec.json.decode(metadata["parameters"], type=dict[str, KnownParameter])
     return replace(
         named, name=process.name, signals=process.signals, parameters=parameters, file_format=process.file_format

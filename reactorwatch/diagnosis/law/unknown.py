@@ -9,6 +9,7 @@ formulas are sought (`formula`). A location's evidence is the best BIC of its co
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
 from reactorwatch.arrays import Array
@@ -275,6 +276,6 @@ def _find_laws(model: ProcessModel, item: PlaceFit, run: Run, noise: Noise) -> l
         fit = fitter.fit(np.zeros(len(candidate.law.parameters)), noise, STEPS, select=False)
         values = dict(zip(candidate.law.parameters, fit.coefficients.tolist(), strict=True))
         moved = {name: value + values[name] for name, value in candidate.law.parameters.items()}
-        law = replace(candidate.law, parameters=moved)
+        law = msgspec.structs.replace(candidate.law, parameters=moved)
         result.append(FittedLaw(law, fit, fitter, item.place, _log_p(fit, run)))
     return sorted(result, key=lambda item: item.bic)

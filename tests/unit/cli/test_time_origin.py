@@ -90,7 +90,7 @@ def test_a_model_with_a_deviation_at_a_minute_of_the_file_has_it_there(leaking: 
     for path in (csv, mcap):
         assert watched(path, model)["alarms"] == []
         measured = record(path)
-        simulated = simulate_along(measured, ProcessChoice(str(model)).load_model(measured.zero_ns), [])
+        simulated = simulate_along(measured, ProcessChoice(str(model)).load(measured.zero_ns).require_model(), [])
         assert np.sqrt(np.mean((simulated.columns["T"] - measured.columns["T"]) ** 2)) < 0.5
 
 

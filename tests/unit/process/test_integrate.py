@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.process.integrate import SimulationError, Stepper, step_grid, symbolic_step
+from reactorwatch.process.integrate import SimulationError, StepGrid, Stepper, symbolic_step
 from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.library.cstr.effects.heat_transfer import HeatTransfer
 from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
@@ -82,7 +82,7 @@ def test_equations_too_stiff_for_it_are_told_and_do_not_hang() -> None:
 
 def test_grid_ends_a_step_at_every_sample_and_breakpoint() -> None:
     time_min = np.array([0.0, 0.1, 0.37, 0.4])
-    grid = step_grid(time_min, np.array([0.2123, -1.0, 9.0]))
+    grid = StepGrid(time_min, np.array([0.2123, -1.0, 9.0]))
     ends = grid.start_min + grid.length_min
     np.testing.assert_allclose(ends[grid.end_of_row], time_min[1:], rtol=0, atol=1e-15)
     assert np.min(np.abs(ends - 0.2123)) < 1e-15

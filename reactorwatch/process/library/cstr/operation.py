@@ -46,11 +46,10 @@ OPERATION = Operation(
         _preset("reaction-rate", "the reaction is a tenth slower", "reaction_rate:step:-0.1"),
     ),
     examples=EXAMPLES,
-)
-
-WATCH_DEFAULTS = WatchDefaults(
-    training_min=100.0,
-    smallest_sd={"C": 2e-4, "T": 0.05},
-    priorities={"T": "high"},
-    identified=("T",),
+    watch=WatchDefaults(
+        training_min=100.0,
+        smallest_sd={"C": 2e-4, "T": 0.05},
+        priorities={"T": "high"},
+        identified=("T",),
+    ),
 )

@@ -12,19 +12,6 @@ from reactorwatch.process.operation import Example, InputLevels, Operation
 SET_POINTS_CM = {"h1": 40.0, "h2": 20.0}
 BASE_FLOWS_CM3_S = {"Q1": 31.86, "Q2": 27.56}
 
-CONTROLLERS = tuple(
-    Controller(
-        input=pump,
-        output=level,
-        set_point=SET_POINTS_CM[level],
-        gain=-5.0,
-        base=BASE_FLOWS_CM3_S[pump],
-        integral_time_min=2.0,
-        dither=True,
-    )
-    for pump, level in zip(BASE_FLOWS_CM3_S, SET_POINTS_CM, strict=True)
-)
-
 OPERATION = Operation(
     inputs={
         pump: InputLevels(level=flow, low=flow - 8.0, high=flow + 8.0, swing=4.0, hold_min=2.0)
@@ -37,4 +24,16 @@ OPERATION = Operation(
             "the pipe between tanks 1 and 3 is clogged by 20 % from minute 150 on", ("clog13:step:0.2@150min",)
         )
     },
+    controllers=tuple(
+        Controller(
+            input=pump,
+            output=level,
+            set_point=SET_POINTS_CM[level],
+            gain=-5.0,
+            base=BASE_FLOWS_CM3_S[pump],
+            integral_time_min=2.0,
+            dither=True,
+        )
+        for pump, level in zip(BASE_FLOWS_CM3_S, SET_POINTS_CM, strict=True)
+    ),
 )

@@ -12,7 +12,6 @@ class OutletClogging(ParameterEffect):
     name = "outlet_clogging"
     label = "clogged outlet of the upper tank"
     location = "upper_tank"
-    unit = "1"
     larger = "{} % of the outlet of the upper tank clogged"
     lower = 0.0
     upper = 0.99

@@ -9,7 +9,6 @@ class ActivationEnergy(ParameterEffect):
     name = "activation_energy"
     label = "wrong activation energy"
     location = "reaction"
-    unit = "1"
     larger = "activation energy higher by {} %"
     smaller = "activation energy lower by {} %"
     lower = -0.5

@@ -9,10 +9,7 @@ class FeedFlow(ParameterEffect):
     name = "feed_flow"
     label = "wrong feed flow"
     location = "feed"
-    unit = "1"
     larger = "{} % more feed"
     smaller = "{} % less feed"
-    lower = -0.99
-    upper = 4.0
     typical = 0.03
     parameter = "q"

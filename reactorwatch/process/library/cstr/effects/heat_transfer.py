@@ -11,11 +11,8 @@ class HeatTransfer(ParameterEffect):
     name = "heat_transfer"
     label = "changed heat transfer"
     location = "coolant"
-    unit = "1"
     larger = "{} % more heat transfer to the coolant"
     smaller = "{} % of the heat transfer to the coolant lost"
-    lower = -0.99
-    upper = 4.0
     typical = -0.3
     parameter = "K3"
     labels: ClassVar[dict[str, str]] = {"ramp": "fouling of the jacket", "decay": "fouling of the jacket"}

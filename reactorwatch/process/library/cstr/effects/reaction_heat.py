@@ -9,10 +9,7 @@ class ReactionHeat(ParameterEffect):
     name = "reaction_heat"
     label = "wrong heat of reaction"
     location = "reaction"
-    unit = "1"
     larger = "{} % more heat of reaction"
     smaller = "{} % less heat of reaction"
-    lower = -0.99
-    upper = 4.0
     typical = 0.01
     parameter = "K1"

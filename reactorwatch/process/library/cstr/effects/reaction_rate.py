@@ -11,11 +11,8 @@ class ReactionRate(ParameterEffect):
     name = "reaction_rate"
     label = "changed reaction rate"
     location = "reaction"
-    unit = "1"
     larger = "reaction faster by {} %"
     smaller = "reaction slower by {} %"
-    lower = -0.99
-    upper = 4.0
     typical = 0.05
     parameter = "k0"
     proportional = ("K1",)

@@ -9,7 +9,6 @@ from reactorwatch.process.model import ProcessModel
 class Clogging(ParameterEffect):
     """A pipe lets less through: its outflow coefficient is a (1 - m)."""
 
-    unit = "1"
     lower = 0.0
     upper = 0.99
     typical = 0.05
