@@ -17,6 +17,7 @@ from monitor_node.ingest.sampling import missing_in_intervals
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
+from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.kalman.noise_estimation import NoiseFit, fit_noise
 from reactorwatch.kalman.uncertain_model import is_disturbance, learned_parameters, noise_starts, widen_model
 from reactorwatch.process.model import ProcessModel
@@ -247,13 +248,13 @@ class ProcessReference:
         until the next row with all inputs. After one such row the prediction includes the uncertainty of the inputs:
         they were as before or as after, one of them plus or minus its largest pulse of one row in the training.
         """
-        time_min, between = time_ns / MINUTE_NS, None
+        time_min, changes = time_ns / MINUTE_NS, list[tuple[float, tuple[float, ...]]]()
         unknown = any(self._guessed) + self._held_rows + missing
         if all(map(isfinite, inputs)):
             if unknown > MOST_UNKNOWN:
                 self._filter.interrupt()
             elif unknown:
-                between = self._unknown_inputs(time_min, tuple(inputs))
+                changes = self._possible_changes(time_min, tuple(inputs))
             self.last_inputs, self._guessed, self._held_rows = tuple(inputs), self._all_known, 0
         elif unknown or not all(map(isfinite, self.last_inputs)):
             pairs = zip(inputs, self.last_inputs, strict=True)
@@ -267,13 +268,13 @@ class ProcessReference:
             self._guessed = tuple(not isfinite(value) for value in inputs)
             self.last_inputs = tuple(value if isfinite(value) else last for value, last in pairs)
         if self._accept_all:
-            step = self._filter.update(time_min, self.last_inputs, values, gate=GATE, accept=accept, between=between)
+            step = self._filter.update(time_min, self.last_inputs, values, gate=GATE, accept=accept, changes=changes)
             return RowPrediction(step.prediction, step.sd)
         measured, accepted = [nan] * self._count, [False] * self._count
         for i, value, is_accepted in zip(self._indices, values, accept, strict=True):
             measured[i], accepted[i] = value, is_accepted
         step = self._filter.update(
-            time_min, self.last_inputs, measured, gate=GATE, accept=tuple(accepted), between=between
+            time_min, self.last_inputs, measured, gate=GATE, accept=tuple(accepted), changes=changes
         )
         return RowPrediction([step.prediction[i] for i in self._indices], [step.sd[i] for i in self._indices])
 
@@ -293,12 +294,10 @@ class ProcessReference:
         self.last_inputs = inputs
         self._filter.accept_row(time_min, inputs)
 
-    def _unknown_inputs(
-        self, time_min: float, inputs: tuple[float, ...]
-    ) -> tuple[float, list[tuple[float, ...]]] | None:
-        """Start of the time in which inputs are unknown, and their possible values.
+    def _possible_changes(self, time_min: float, inputs: tuple[float, ...]) -> list[tuple[float, tuple[float, ...]]]:
+        """Start of the time in which inputs are unknown, with each of their possible values.
 
-        A row, or inputs of it, are missing. None: they were as before and after, or the filter starts with this row.
+        A row, or inputs of it, are missing. Empty: they were as before and after, or the filter starts with this row.
         """
         before_min, last, guessed = self._filter.state.time_min, self.last_inputs, any(self._guessed)
         unknown = self._guessed if guessed else (True,) * len(inputs)
@@ -306,14 +305,15 @@ class ProcessReference:
         ends = {last, after}
         moving = [i for i, reach in enumerate(self._reach) if reach and unknown[i]]
         if before_min is None or (len(ends) == 1 and not moving):
-            return None
+            return []
         possible = [
             self._within_bounds(end, i, by)
             for end in sorted(ends)
             for i in moving
             for by in (-self._reach[i], self._reach[i])
         ] or [self._within_bounds(end, None, 0.0) for end in sorted(ends)]
-        return (before_min if guessed else 0.5 * (before_min + time_min)), possible
+        since_min = before_min if guessed else 0.5 * (before_min + time_min)
+        return [(since_min, other) for other in possible]
 
     def _within_bounds(self, inputs: tuple[float, ...], moved: int | None, by: float) -> tuple[float, ...]:
         """Inputs, one of them moved by a pulse, within their bounds."""
@@ -341,7 +341,7 @@ class ProcessReference:
         self._reach = [input_reach(time_min, column) for column in inputs.T]
         if self._accept_all and np.isfinite(inputs).all():
             times = np.round(time_min * MINUTE_NS) / MINUTE_NS
-            steps = self._filter.run(times, _mask_before_missing(time_min, inputs), measured, gate=GATE)
+            steps = self._filter.run(FilterRecord(times, _mask_before_missing(time_min, inputs), measured, GATE))
             z = steps.residual / steps.sd
             if not np.any(np.abs(z) > GATE):  # no acceptance depended on the row before
                 self.last_inputs, self._guessed, self._held_rows = tuple(inputs[-1].tolist()), self._all_known, 0
@@ -485,10 +485,8 @@ def fit_training_noise(
     inputs = _mask_before_missing(time_min, inputs)
     return fit_noise(
         widen_model(model, model.uncertain),
-        time_min,
-        inputs,
-        columns,
+        FilterRecord(time_min, inputs, columns),
         smallest,
         learned_parameters(model.uncertain),
-        noise_starts(model, columns, smallest),
+        nearby=noise_starts(model, columns, smallest),
     )

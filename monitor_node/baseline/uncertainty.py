@@ -19,6 +19,7 @@ from monitor_node.baseline.references import GATE, fit_training_noise, output_in
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.whiteness import minus_log10_p
 from reactorwatch.kalman.ekf import Filter, FilterState
+from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.kalman.noise_estimation import NoiseFit
 from reactorwatch.kalman.uncertain_model import (
@@ -156,7 +157,7 @@ class _Rows:
         """Filter the rows; the filter then stands at the last."""
         columns = np.full((self._time_min.size, len(self._model.outputs)), nan)
         columns[:, output_indices(self._model, self._outputs)] = self._measured
-        return item.filter.run(self._time_min, self._inputs, columns, gate=GATE)
+        return item.filter.run(FilterRecord(self._time_min, self._inputs, columns, GATE))
 
     def are_coloured(self, item: _Fit) -> bool:
         """True if the innovations are not white."""

@@ -142,14 +142,14 @@ def _run_filter(
         part = slice(row, row + 1 if accept.any() else min(row + chunk, rows))
         later = None if uncertainty is None else uncertainty.select(part)
         if accept.any():
-            other = None if later is None or not later.rows[0] else (inputs[row].tolist(), later.change_times_min(0))
+            changes = [] if later is None else later.changes(0)
             values = inputs[row].tolist(), measured[row].tolist()
-            one = kalman.update(times[row], *values, gate=GATE, accept=accept.tolist(), uncertainty=other)
+            one = kalman.update(times[row], *values, gate=GATE, accept=accept.tolist(), changes=changes)
             run.residual[row], run.sd[row] = one.residual, one.sd
             run.x[row], run.covariance[row] = kalman.state.x, np.reshape(kalman.state.P, (n_x, n_x))
         else:
-            record = FilterRecord.of(times[part], inputs[part], measured[part], GATE, None, later)
-            result = kalman.run_record(record, kalman.state if row else None)
+            record = FilterRecord(times[part], inputs[part], measured[part], GATE, None, later)
+            result = kalman.run(record, kalman.state if row else None)
             run.residual[part], run.sd[part] = result.residual, result.sd
             run.x[part], run.covariance[part] = result.x, result.P
             for index in (row + np.flatnonzero(np.isnan(result.x).any(axis=1))).tolist():  # the filter has not started

@@ -49,11 +49,6 @@ BatchedRun: TypeAlias = Generator[RowBatch, int, FilterResult]
 """A filter's run: yields batches, and is sent how many rows of each succeeded."""
 
 
-def run_single(run: BatchedRun) -> FilterResult:
-    """Run one filter."""
-    return run_together([run])[0]
-
-
 def run_together(runs: Sequence[BatchedRun]) -> list[FilterResult]:
     """Run different filters of the same model."""
     results: dict[int, FilterResult] = {}

@@ -37,17 +37,15 @@ from math import ceil, inf, isfinite, nan
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.codegen.compiled_function import CompiledFunction
-from reactorwatch.kalman.batch_runner import BatchedRun, RowBatch, run_single
+from reactorwatch.kalman.batch_runner import BatchedRun, RowBatch, run_together
 from reactorwatch.kalman.ekf_step import compiled_row, predict_function, row_function
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.kalman.initial_state import InitialState
 from reactorwatch.kalman.innovations import FilterResult, Innovation
-from reactorwatch.kalman.input_uncertainty import InputUncertainty
 from reactorwatch.kalman.step_budget import (
     STEPS_PER_PREDICTION,
     STEPS_PER_ROW,
@@ -208,8 +206,8 @@ class Filter:
         return noise
 
     def accept_row(self, time_min: float, inputs: Sequence[float]) -> None:
-        """Note a row that a kernel has filtered in `belief`."""
-        self._set_row(time_min, inputs)
+        """Note a row that was filtered in `belief`; restart after it if its inputs are unknown."""
+        self._time_min, self._inputs = time_min if isfinite(sum(inputs)) else None, tuple(inputs)
 
     def update(
         self,
@@ -219,8 +217,7 @@ class Filter:
         *,
         gate: float = inf,
         accept: Sequence[bool] = (),
-        uncertainty: tuple[Sequence[float], Sequence[float]] | None = None,
-        between: tuple[float, Sequence[Sequence[float]]] | None = None,
+        changes: Sequence[tuple[float, Sequence[float]]] = (),
     ) -> Innovation:
         """Filter a row.
 
@@ -230,13 +227,11 @@ class Filter:
             measured: one value an output; NaN: missing.
             gate: standard deviations beyond which a measurement does not correct the state.
             accept: outputs whose measurement corrects the state whatever the gate; empty: none.
-            uncertainty: inputs that may have held before the row already, and the times from which on, increasing and
-                each as likely (see `input_uncertainty`); None: the inputs of the row before held.
-            between: a time since the row before from which on the inputs are unknown, and the inputs that may have held
-                from then until this row, each as likely; None: they are known. Not together with `uncertainty`.
+            changes: possible changes of the inputs since the row before, each as likely: a time, not decreasing, and
+                the inputs from then until this row (see `input_uncertainty`); empty: the inputs of the row before held.
 
         Raises:
-            BudgetExceededError: the budget is spent; also raised by `run`, `run_record` and `run_batched`.
+            BudgetExceededError: the budget is spent; also raised by `run` and `run_batched`.
         """
         n, before = self._n_y, self._time_min
         if self.budget is not None:
@@ -245,11 +240,8 @@ class Filter:
             return self._start(time_min, inputs, measured)
         step = 0.5 * (time_min - before)
         steps = (step, step)
-        if uncertainty is not None:
-            self._predict_uncertain(before, time_min, inputs, *uncertainty)
-            steps = (0.0, 0.0)
-        elif between is not None:
-            self._predict_between(before, time_min, inputs, *between)
+        if changes:
+            self._predict_uncertain(before, time_min, inputs, changes)
             steps = (0.0, 0.0)
         elif 2.0 * step > LONGEST_ROW_MIN or self._breaks:
             steps = self._steps(before, time_min, step)
@@ -260,43 +252,20 @@ class Filter:
         if not outputs[-1]:
             return self._start(time_min, inputs, measured)
         self._belief_view[:] = self._after
-        self._set_row(time_min, inputs)
+        self.accept_row(time_min, inputs)
         return Innovation(outputs[:n], outputs[n : 2 * n], outputs[2 * n : 3 * n], outputs[3 * n : 4 * n])
 
-    def _set_row(self, time_min: float, inputs: Sequence[float]) -> None:
-        """Record time and inputs of the row; restart after it if its inputs are unknown."""
-        self._time_min, self._inputs = time_min if isfinite(sum(inputs)) else None, tuple(inputs)
-
-    def run(
-        self,
-        time_min: Array,
-        inputs: Array,
-        measured: Array,
-        *,
-        gate: float = inf,
-        accept: NDArray[np.bool_] | None = None,
-        start: FilterState | None = None,
-        uncertainty: InputUncertainty | None = None,
-    ) -> FilterResult:
+    def run(self, record: FilterRecord, start: FilterState | None = None) -> FilterResult:
         """Filter a record; the numbers are those of `update`, several times faster.
 
         Args:
-            time_min: shape (rows,).
-            inputs: shape (rows, n_u) or (rows,) for one input.
-            measured: shape (rows, n_y); NaN where missing.
-            gate: standard deviations beyond which a measurement does not correct the state.
-            accept: measurements that correct the state whatever the gate, shape (rows, n_y); None: none.
+            record: the rows.
             start: state after the row before the first; None: the filter starts with the first row.
-            uncertainty: intervals in which inputs changed at an unknown time; None: there are none.
         """
-        return self.run_record(FilterRecord.of(time_min, inputs, measured, gate, accept, uncertainty), start)
-
-    def run_record(self, record: FilterRecord, start: FilterState | None = None) -> FilterResult:
-        """Filter a prepared record."""
-        return run_single(self.run_batched(record, start))
+        return run_together([self.run_batched(record, start)])[0]
 
     def run_batched(self, record: FilterRecord, start: FilterState | None = None) -> BatchedRun:
-        """Filter a prepared record, yielding batches of rows, so that several filters can run together."""
+        """Filter a record as `run` does, yielding batches of rows, so that several filters can run together."""
         if start is None:
             self.restart()
         else:
@@ -320,7 +289,7 @@ class Filter:
             if done:
                 self._belief[:] = beliefs[row + done - 1]
                 row += done
-                self._set_row(float(record.time_min[row - 1]), record.inputs[row - 1].tolist())
+                self.accept_row(float(record.time_min[row - 1]), record.inputs[row - 1].tolist())
             elif divergences > self.most_divergences or (
                 self.stops_at_restart and self._started and self._time_min is None
             ):
@@ -336,10 +305,9 @@ class Filter:
     def _run_row(self, record: FilterRecord, row: int, outputs: Array, beliefs: Array) -> None:
         """Filter a row by `update` and store its results."""
         time_min, inputs, values = record.time_min[row], record.inputs[row].tolist(), record.measured[row].tolist()
-        uncertain, accept, other = record.uncertainty, record.accept[row].tolist(), None
-        if uncertain is not None and uncertain.rows[row]:
-            other = uncertain.inputs[row].tolist(), uncertain.change_times_min(row)
-        result = self.update(float(time_min), inputs, values, gate=record.gate, accept=accept, uncertainty=other)
+        accept = record.accept[row].tolist()
+        changes = [] if record.uncertainty is None else record.uncertainty.changes(row)
+        result = self.update(float(time_min), inputs, values, gate=record.gate, accept=accept, changes=changes)
         predicted, started = result is not self._nothing, self._time_min is not None
         outputs[row], beliefs[row] = self._outputs if predicted else nan, self._belief if predicted or started else nan
 
@@ -394,11 +362,15 @@ class Filter:
         return belief
 
     def _predict_uncertain(
-        self, before: float, time_min: float, inputs: Sequence[float], other: Sequence[float], times: Sequence[float]
+        self,
+        before: float,
+        time_min: float,
+        inputs: Sequence[float],
+        changes: Sequence[tuple[float, Sequence[float]]],
     ) -> None:
-        """Predict an interval in which the inputs changed at one of several times."""
+        """Predict an interval with one of several changes of the inputs, by the moments of the mixture."""
         held, now, ends = self._belief.copy(), before, []
-        for time in times:
+        for time, other in changes:
             changed = min(max(time, before), time_min)
             if changed > now:
                 held, now = self._predict(held, self._inputs, self._edges(now, changed)), changed
@@ -406,26 +378,6 @@ class Filter:
             if changed < time_min:
                 end = self._predict(self._reset(held, other, changed), other, self._edges(changed, time_min))
             ends.append(self._reset(end, inputs, time_min))
-        self._mix(ends, inputs)
-
-    def _predict_between(
-        self,
-        before: float,
-        time_min: float,
-        inputs: Sequence[float],
-        since: float,
-        others: Sequence[Sequence[float]],
-    ) -> None:
-        """Predict an interval in which the inputs were one of several from some time on."""
-        held = self._belief.copy()
-        if since > before:
-            held = self._predict(held, self._inputs, self._edges(before, since))
-        edges = self._edges(since, time_min)
-        ends = [self._predict(self._reset(held, other, since), other, edges) for other in others]
-        self._mix([self._reset(end, inputs, time_min) for end in ends], inputs)
-
-    def _mix(self, ends: Sequence[Array], inputs: Sequence[float]) -> None:
-        """Set the belief to the moment-matched mixture of equally likely ones."""
         mean = np.mean(ends, axis=0)
         deviation = np.array(ends)[:, : self._n_x] - mean[: self._n_x]
         self._belief[:] = mean
@@ -463,7 +415,7 @@ class Filter:
                 self._restore_constant_states(x, P)
             self._learned = True
             self._belief[:] = [*x, *P.ravel()]
-            self._set_row(time_min, inputs)
+            self.accept_row(time_min, inputs)
             self._started = True
         return self._nothing
 

@@ -24,9 +24,9 @@ from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES, CompiledFunction
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.ekf_step import exponential
+from reactorwatch.kalman.ekf_step import transition
 from reactorwatch.kalman.input_uncertainty import InputUncertainty
-from reactorwatch.process.integrate import LONGEST_STEP_MIN, state_time_step, symbolic_step
+from reactorwatch.process.integrate import LONGEST_STEP_MIN
 from reactorwatch.process.model import ProcessModel
 
 _LEAST_PIVOT = 1e-12
@@ -341,29 +341,12 @@ def _normalize(
 
 
 def piece_function(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
-    """(x, u, p, t, h) -> x after two steps, and its derivatives with respect to x and the sizes.
-
-    With A and B the Jacobians of the right-hand side at the ends of a step, the derivative with respect to x is the
-    exponential of the mean of A, as in the filter, and that with respect to the sizes follows from the trapezoidal
-    rule. It neglects that a size that shifts the clock shortens the time step of the states.
-    """
-    size = ca.vertcat(*sizes)
+    """(x, u, p, t, h) -> x after two steps, and its derivatives with respect to x and the sizes."""
     x, u, p = model.arguments()
     t, h = ca.SX.sym("t"), ca.SX.sym("h")
-    symbols = [x, u, p, model.clock.now, model.clock.middle]
-    rhs = ca.vertcat(*model.rhs)
-    slope = ca.Function("slope", symbols, [ca.densify(ca.jacobian(rhs, x)), ca.densify(ca.jacobian(rhs, size))])
-    step = symbolic_step(model)
-    F, G, point, half = ca.SX.eye(x.numel()), ca.SX.zeros(x.numel(), size.numel()), x, 0.5 * h
-    for begin in (t, t + half):
-        middle = begin + 0.5 * half
-        end = step(point, u, p, begin, middle, half)[0]
-        A, B = slope(point, u, p, begin, middle)
-        A_end, B_end = slope(end, u, p, begin + half, middle)
-        passed = state_time_step(model, u, p, begin, middle, half)
-        E = exponential(0.5 * passed * (A + A_end))
-        F, G, point = E @ F, E @ (G + 0.5 * passed * B) + 0.5 * passed * B_end, end
-    return ca.Function("piece", [x, u, p, t, h], [ca.densify(item) for item in ca.cse([point, F, G])])
+    half = 0.5 * h
+    results = transition(model, (x, u, p), ((t, half), (t + half, half)), ca.vertcat(*sizes))
+    return ca.Function("piece", [x, u, p, t, h], [ca.densify(item) for item in ca.cse(list(results))])
 
 
 def output_derivatives(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:

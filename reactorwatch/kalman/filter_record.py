@@ -1,7 +1,6 @@
 """A record in the layout of the compiled filter, prepared once for many runs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import inf
 
 import numpy as np
@@ -14,77 +13,47 @@ from reactorwatch.process.integrate import LONGEST_STEP_MIN
 LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are rounded
 
 
-@dataclass(frozen=True, eq=False)
 class FilterRecord:
-    """The rows of a record, for `Filter.run_record`.
+    """The rows of a record, for `Filter.run`.
 
-    Attributes:
+    Args:
         time_min: shape (rows,).
-        inputs: shape (rows, n_u); NaN where unknown.
+        inputs: shape (rows, n_u) or (rows,) for one input; NaN where unknown.
         measured: shape (rows, n_y); NaN where missing.
         gate: standard deviations beyond which a measurement does not correct the state.
-        accept: measurements that correct the state whatever the gate, shape (rows, n_y).
+        accept: measurements that correct the state whatever the gate, shape (rows, n_y); None: none.
+        uncertainty: intervals in which inputs changed at an unknown time; None: there are none.
+
+    Attributes:
         rows: the arguments `new` of the compiled rows, see `ekf_step`; the first row lacks what comes from the row
             before.
         near: True for rows at most two integration steps after the one before, shape (rows,); undecided for the first.
-        uncertainty: intervals in which inputs changed at an unknown time; None: there are none.
     """
 
-    time_min: Array
-    inputs: Array
-    measured: Array
-    gate: float
-    accept: NDArray[np.bool_]
-    rows: Array
-    near: NDArray[np.bool_]
-    uncertainty: InputUncertainty | None = None
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         time_min: Array,
         inputs: Array,
         measured: Array,
         gate: float = inf,
         accept: NDArray[np.bool_] | None = None,
         uncertainty: InputUncertainty | None = None,
-    ) -> "FilterRecord":
-        """Prepare a record.
-
-        Args:
-            time_min: shape (rows,).
-            inputs: shape (rows, n_u) or (rows,) for one input.
-            measured: shape (rows, n_y); NaN where missing.
-            gate: see the attributes.
-            accept: see the attributes; None: no measurement.
-            uncertainty: see the attributes.
-        """
+    ) -> None:
         count, n_y = measured.shape
         inputs = inputs.reshape(count, -1)
         n_u = inputs.shape[1]
-        accept = np.zeros(measured.shape, dtype=np.bool_) if accept is None else accept
-        rows, near = np.zeros((count, 2 * n_u + 3 + 2 * n_y)), np.zeros(count, dtype=np.bool_)
+        self.time_min, self.inputs, self.measured = time_min, inputs, measured
+        self.gate, self.uncertainty = gate, uncertainty
+        self.accept = np.zeros(measured.shape, dtype=np.bool_) if accept is None else accept
+        self.rows = rows = np.zeros((count, 2 * n_u + 3 + 2 * n_y))
+        self.near = near = np.zeros(count, dtype=np.bool_)
         half = 0.5 * np.diff(time_min)
         near[1:] = (half > 0.0) & (2.0 * half <= LONGEST_ROW_MIN) & np.all(np.isfinite(inputs[:-1]), axis=1)
         if uncertainty is not None:
             near &= ~uncertainty.rows
         rows[1:, :n_u], rows[:, n_u : 2 * n_u], rows[:, 2 * n_u] = inputs[:-1], inputs, time_min
         rows[1:, 2 * n_u + 1], rows[1:, 2 * n_u + 2] = half, half
-        rows[:, -2 * n_y : -n_y], rows[:, -n_y:] = measured, np.where(accept, inf, gate)
-        return cls(time_min, inputs, measured, gate, accept, rows, near, uncertainty)
-
-    def after(self, row: int) -> "FilterRecord":
-        """Drop the rows before a row."""
-        return FilterRecord(
-            self.time_min[row:],
-            self.inputs[row:],
-            self.measured[row:],
-            self.gate,
-            self.accept[row:],
-            self.rows[row:],
-            self.near[row:],
-            None if self.uncertainty is None else self.uncertainty.select(slice(row, None)),
-        )
+        rows[:, -2 * n_y : -n_y], rows[:, -n_y:] = measured, np.where(self.accept, inf, gate)
 
     def following(
         self, before_min: float | None, inputs: Sequence[float], breaks: Sequence[float]

@@ -52,7 +52,8 @@ class InputUncertainty(NamedTuple):
         """True for rows at the end of an uncertain interval, shape (rows,)."""
         return np.asarray(self.n_times > 0)
 
-    def change_times_min(self, row: int) -> list[float]:
-        """Possible times of the change before a row, increasing."""
+    def changes(self, row: int) -> list[tuple[float, list[float]]]:
+        """Possible changes before a row, at increasing times, each with the inputs from then on; empty: none."""
         times: list[float] = np.linspace(self.first_min[row], self.last_min[row], self.n_times[row]).tolist()
-        return times
+        inputs: list[float] = self.inputs[row].tolist()
+        return [(time, inputs) for time in times]

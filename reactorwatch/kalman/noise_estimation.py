@@ -34,7 +34,6 @@ from reactorwatch.kalman.batch_runner import run_together
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.kalman.innovations import FilterResult
-from reactorwatch.kalman.input_uncertainty import InputUncertainty
 from reactorwatch.process.model import ProcessModel
 
 INITIAL_SHARES = (0.3, 0.03, 0.003)
@@ -94,14 +93,7 @@ class NoiseFit(NamedTuple):
 
 
 class _Trial(NamedTuple):
-    """Noise levels, and the innovations that they give.
-
-    Attributes:
-        theta: logarithms of the sensors' noise, of the noise of states that are not constant, and of the parameters.
-        loss: minus the log likelihood.
-        w: normalised innovations, shape (rows, n_y); 0 where there are none.
-        d: logarithms of the innovations' scales, shape (rows, n_y).
-    """
+    """Logarithms of all noise levels and parameters, and the loss, w and d that they give (see the module)."""
 
     theta: Array
     loss: float
@@ -109,72 +101,31 @@ class _Trial(NamedTuple):
     d: Array
 
 
-def estimate_noise(
-    model: ProcessModel, time_min: Array, inputs: Array, measured: Array, smallest_sd: Sequence[float]
-) -> NoiseLevels:
-    """Maximum-likelihood noise levels of a record.
-
-    Args:
-        model: model of the plant.
-        time_min: shape (rows,), increasing.
-        inputs: shape (rows,) or (rows, n_u).
-        measured: shape (rows, n_y); NaN where missing or to be ignored.
-        smallest_sd: lower bounds of the sensors' noise, one an output, in its unit; at least `LEAST_RELATIVE_SD` of the
-            largest value.
-    """
-    return estimate_noise_and_parameters(model, time_min, inputs, measured, smallest_sd, (), {})[0]
-
-
-def estimate_noise_and_parameters(
+def fit_noise(
     model: ProcessModel,
-    time_min: Array,
-    inputs: Array,
-    measured: Array,
+    record: FilterRecord,
     smallest_sd: Sequence[float],
-    learned: Sequence[str],
-    first_sd: Mapping[str, float],
-    uncertainty: InputUncertainty | None = None,
+    learned: Sequence[str] = (),
+    first_sd: Mapping[str, float] | None = None,
     nearby: Sequence[NoiseLevels] = (),
     *,
     lacking: bool = False,
-) -> tuple[NoiseLevels, dict[str, float]]:
-    """Maximum-likelihood noise levels and positive parameters of the model.
+) -> NoiseFit:
+    """Maximum-likelihood noise levels of a record, and positive parameters of the model.
 
     Args:
         model: model of the plant.
-        time_min: shape (rows,), increasing.
-        inputs: shape (rows,) or (rows, n_u).
-        measured: shape (rows, n_y); NaN where missing or to be ignored.
-        smallest_sd: lower bounds of the sensors' noise, see `estimate_noise`.
+        record: the record, at increasing times; measurements that are missing or to be ignored are NaN.
+        smallest_sd: lower bounds of the sensors' noise, one an output, in its unit; at least `LEAST_RELATIVE_SD` of the
+            largest value.
         learned: names of the parameters; the search starts at their values.
         first_sd: initial process noise by name of a state, where it differs from the noise that moves all states alike.
-        uncertainty: intervals in which inputs changed at an unknown time; None: there are none.
         nearby: further starts of the search, at most three, used where they are likelier than the first rows' result.
         lacking: whether the model may lack an effect that sets in later and then passes for process noise, so that the
             search also starts from noisier processes. Else a temporary disturbance is not learned as noise.
     """
     smallest = np.asarray(smallest_sd, dtype=float)
-    search = _NoiseSearch(model, time_min, inputs, measured, smallest, learned, first_sd, uncertainty)
-    found = search.run(nearby, lacking)
-    return found.levels, found.parameters
-
-
-def fit_noise(
-    model: ProcessModel,
-    time_min: Array,
-    inputs: Array,
-    measured: Array,
-    smallest_sd: Sequence[float],
-    learned: Sequence[str] = (),
-    nearby: Sequence[NoiseLevels] = (),
-) -> NoiseFit:
-    """Maximum-likelihood noise levels and positive parameters, with their likelihood.
-
-    Arguments as for `estimate_noise_and_parameters`.
-    """
-    smallest = np.asarray(smallest_sd, dtype=float)
-    search = _NoiseSearch(model, time_min, inputs, measured, smallest, learned, {}, None)
-    return search.run(nearby, lacking=False)
+    return _NoiseSearch(model, record, smallest, learned, first_sd or {}).run(nearby, lacking)
 
 
 class _NoiseSearch:
@@ -183,16 +134,12 @@ class _NoiseSearch:
     def __init__(
         self,
         model: ProcessModel,
-        time_min: Array,
-        inputs: Array,
-        measured: Array,
+        record: FilterRecord,
         smallest_sd: Array,
         learned: Sequence[str],
         first_sd: Mapping[str, float],
-        uncertainty: InputUncertainty | None,
     ) -> None:
-        self._doubt = uncertainty
-        self._full, self._rows = (time_min, inputs, measured), time_min.size
+        self._full, measured = record, record.measured
         self._use_rows(FIRST_ROWS)
         self._n_y = len(model.outputs)
         self._states = [i for i in range(len(model.states)) if i not in model.constant_states]
@@ -214,8 +161,9 @@ class _NoiseSearch:
     def run(self, nearby: Sequence[NoiseLevels], lacking: bool) -> NoiseFit:
         """Best noise levels and parameter values."""
         best = self._climb(self._drop_outliers(self._start()))
-        if self._rows > FIRST_ROWS:
-            self._use_rows(self._rows)
+        rows = self._full.time_min.size
+        if rows > FIRST_ROWS:
+            self._use_rows(rows)
             starts = [best.theta, *(self._with_noise(levels) for levels in nearby)]
             starts += self._noisier_starts(best.theta) if lacking else []
             best = min(self._evaluate(starts[:LANES]), key=lambda trial: trial.loss)
@@ -246,9 +194,11 @@ class _NoiseSearch:
 
     def _use_rows(self, rows: int) -> None:
         """Use the first rows of the record from here on."""
-        time_min, inputs, measured = self._full
-        uncertainty = None if self._doubt is None else self._doubt.select(slice(rows))
-        self._record = FilterRecord.of(time_min[:rows], inputs[:rows], measured[:rows], GATE, uncertainty=uncertainty)
+        full, first = self._full, slice(rows)
+        uncertainty = None if full.uncertainty is None else full.uncertainty.select(first)
+        self._record = FilterRecord(
+            full.time_min[first], full.inputs[first], full.measured[first], GATE, uncertainty=uncertainty
+        )
 
     def _drop_outliers(self, best: _Trial) -> _Trial:
         """Drop outliers: that of one sensor enters the normalised innovations of all."""
@@ -256,7 +206,7 @@ class _NoiseSearch:
         (run,) = self._run_filters([best.theta])
         with np.errstate(invalid="ignore"):
             measured = np.where(np.abs(run.residual) > GATE * run.sd, np.nan, record.measured)
-        self._record = FilterRecord.of(record.time_min, record.inputs, measured, GATE, uncertainty=record.uncertainty)
+        self._record = FilterRecord(record.time_min, record.inputs, measured, GATE, uncertainty=record.uncertainty)
         return self._evaluate([best.theta])[0]
 
     def _climb(self, best: _Trial) -> _Trial:

@@ -57,9 +57,6 @@ def insert_rows(
         measured: shape (rows, n_y).
         uncertainty: intervals in which inputs changed at an unknown time; None: there are none.
     """
-    step = np.diff(time_min)
-    if not np.any(step > LONGEST_ROW_MIN):
-        return ResampledRecord(time_min, inputs, measured, uncertainty, np.arange(time_min.size))
     pieces = count_pieces(time_min)
     if uncertainty is not None:
         pieces[uncertainty.rows[1:]] = 1.0
@@ -69,7 +66,7 @@ def insert_rows(
         return ResampledRecord(time_min, inputs, measured, uncertainty, index)
     source = np.repeat(np.arange(index.size), counts)
     share = (np.arange(source.size) - index[source]) / counts[source]
-    times = time_min[source] + share * np.append(step, 0.0)[source]
+    times = time_min[source] + share * np.append(np.diff(time_min), 0.0)[source]
     more = np.full((source.size, measured.shape[1]), np.nan)
     more[index] = measured
     if uncertainty is not None:

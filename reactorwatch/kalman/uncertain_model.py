@@ -138,18 +138,14 @@ def _add_wander(model: ProcessModel, name: str) -> ProcessModel:
 
 def _add_noise(model: ProcessModel, name: str) -> ProcessModel:
     """Add coloured noise to the reading of an output."""
-    index = model.output_names.index(name)
-    output, scale = (
-        model.outputs[index],
-        model.states[model.state_index(name)].scale if name in model.state_names else 1.0,
-    )
+    output = model.output(name)
+    scale = model.states[model.state_index(name)].scale if name in model.state_names else 1.0
     reach = 100.0 * scale
     state = variable(f"{name}.memory", output.unit, (-reach, reach), 0.1 * scale, "coloured noise")
     time = parameter(f"{name}.memory_min", 1.0, "min", (0.03, LONGEST_NOISE_MIN), "time constant of the noise")
     model = model.with_state(state, -state.symbol / time.symbol, ca.SX(0.0))
-    shown = replace(output, expression=output.expression + state.symbol)
-    outputs = (*model.outputs[:index], shown, *model.outputs[index + 1 :])
-    return replace(model, outputs=outputs, parameters=(*model.parameters, time))
+    shown = model.with_output(replace(output, expression=output.expression + state.symbol))
+    return replace(shown, parameters=(*shown.parameters, time))
 
 
 def select_effects(model: ProcessModel, x: Array, u: Array) -> tuple[str, ...]:

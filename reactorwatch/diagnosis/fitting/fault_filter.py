@@ -27,7 +27,7 @@ from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.kalman.innovations import FilterResult
-from reactorwatch.kalman.noise_estimation import estimate_noise_and_parameters
+from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.kalman.resampling import ResampledRecord, count_pieces, insert_rows
 from reactorwatch.kalman.step_budget import STEPS_PER_EVALUATION, STEPS_PER_LINEARISATION, StepBudget
 from reactorwatch.process.effect import Effect
@@ -260,7 +260,7 @@ class FaultFilter:
             if self.effects:  # the nominal model, with which all effects are compared, always runs to the end
                 filtering.most_divergences = max(MOST_DIVERGENCES, index.size // ROWS_PER_DIVERGENCE)
             later = None if uncertainty is None else uncertainty.select(remaining)
-            record = FilterRecord.of(time_min[remaining], inputs[remaining], measured[remaining], uncertainty=later)
+            record = FilterRecord(time_min[remaining], inputs[remaining], measured[remaining], uncertainty=later)
             runs.append(filtering.run_batched(record, start))
         innovations = []
         for rows, prefix, new in zip(several, shared, run_together(runs), strict=True):
@@ -285,18 +285,16 @@ class FaultFilter:
         first_sd = {
             f"{item.output}.noise": initial_driving_sd(item.scale, self._period_min) for item in self._noise.colored
         }
-        levels, times = estimate_noise_and_parameters(
+        found = fit_noise(
             self.model,
-            rows.time_min,
-            rows.inputs,
-            rows.measured,
+            FilterRecord(rows.time_min, rows.inputs, rows.measured, uncertainty=rows.uncertainty),
             smallest_sd,
             tuple(times),
             first_sd,
-            rows.uncertainty,
             [self._all_levels(item) for item in nearby if not item.colored],
             lacking=True,
         )
+        levels, times = found.levels, found.parameters
         of_sensors = len(levels.process_sd) - len(times)
         colored = update_colored_noise(self._noise.colored, levels.process_sd[of_sensors:], times, self._period_min)
         return Noise(levels.measurement_sd, levels.process_sd[: len(self._plant.states)], colored)

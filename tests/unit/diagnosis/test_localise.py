@@ -14,7 +14,8 @@ from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.unknown_input.forcing import Forcing
 from reactorwatch.diagnosis.unknown_input.localise import UnknownInput, has_feedback, locate
-from reactorwatch.kalman.noise_estimation import estimate_noise
+from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
@@ -38,7 +39,7 @@ def make_run(plant: ProcessModel, shown: Callable[[Array], Array] = lambda outpu
 
 
 def where(run: Run) -> UnknownInput:
-    tuned = estimate_noise(cstr(), run.time_min, run.inputs, run.measured, [1e-4, 1e-2])
+    tuned = fit_noise(cstr(), FilterRecord(run.time_min, run.inputs, run.measured), [1e-4, 1e-2]).levels
     noise = Noise(tuned.measurement_sd, tuned.process_sd)
     nominal = Hypothesis(FaultFilter(cstr(), (), noise), ()).evaluate(run, ())
     found = locate(cstr(), EFFECTS, run, nominal, noise)

@@ -13,6 +13,7 @@ from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.page import as_page
 from reactorwatch.diagnosis.result import NAMED, NOMINAL, Diagnosis
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.process import effects_of
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.generic_effects import generic_effects
@@ -47,7 +48,7 @@ def test_a_noisier_sensor_is_named_with_its_further_noise_and_onset(noisier: Dia
     for name, truth, widest in (("size", 0.3, 0.05), ("onset", ONSET_MIN, 2.0)):
         said = cause.parameters[name]
         assert abs(said.value - truth) < 4.0 * said.sd < 4.0 * widest, name
-    extended = parse_extended_model(json.dumps(noisier.extended_model), (tank,), generic_effects(tank())).build((tank,))
+    extended = parse_extended_model(json.dumps(noisier.extended_model)).build()
     assert extended.parameter("h.noise.size").value == cause.parameters["size"].value
 
 
@@ -86,8 +87,8 @@ def test_a_filter_of_the_extended_model_expects_the_noise_from_the_onset_on() ->
     time_min, inputs = 0.1 * np.arange(30.0), np.tile([30.0, 20.0], (30, 1))
     noise = NoiseLevels((0.3, 0.3, 0.3), (0.0, 0.0, 0.0))
     measured = np.tile([40.0, 20.0, 30.0], (30, 1))
-    sd = Filter(model, noise).run(time_min, inputs, measured).sd
-    without = Filter(three_tanks(), noise).run(time_min, inputs, measured).sd
+    sd = Filter(model, noise).run(FilterRecord(time_min, inputs, measured)).sd
+    without = Filter(three_tanks(), noise).run(FilterRecord(time_min, inputs, measured)).sd
     np.testing.assert_array_equal(sd[1:10], without[1:10])
     np.testing.assert_allclose(sd[10], np.sqrt(without[10] ** 2 + [0.0, 0.16, 0.0]), rtol=1e-9)
 

@@ -14,6 +14,7 @@ from reactorwatch.diagnosis.result import NAMED, NOMINAL
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf import Filter
+from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import make_run, record_of
@@ -32,12 +33,12 @@ def estimate_offset(run: Run, sds: dict[str, float]) -> tuple[float, float]:
 def test_the_likelihood_is_that_of_all_offsets_weighed_by_what_was_stated() -> None:
     run, sd = make_run(WARMER, rows=400), 0.5
     noise = Noise(SENSORS.measurement_sd, (0.0, 0.0, 0.0))
-    uncertain = Filter(add_priors(cstr(), {"Tf": sd}), noise).run(run.time_min, run.inputs, run.measured)
+    uncertain = Filter(add_priors(cstr(), {"Tf": sd}), noise).run(FilterRecord(run.time_min, run.inputs, run.measured))
     grid = np.linspace(0.0, 1.0, 101)
     given = []
     for offset in grid:
         known = Filter(cstr().with_values({"Tf": 350.0 + offset}), SENSORS)
-        given.append(float(np.sum(known.run(run.time_min, run.inputs, run.measured).log_likelihood)))
+        given.append(float(np.sum(known.run(FilterRecord(run.time_min, run.inputs, run.measured)).log_likelihood)))
     weighed = np.array(given) - 0.5 * (grid / sd) ** 2 - np.log(np.sqrt(2.0 * np.pi) * sd)
     marginal = weighed.max() + np.log(np.sum(np.exp(weighed - weighed.max())) * (grid[1] - grid[0]))
     assert float(np.sum(uncertain.log_likelihood)) == pytest.approx(marginal, abs=0.5)

@@ -22,7 +22,7 @@ def record(seed: int, rows: int = ROWS) -> FilterRecord:
     measured: Array = np.array([0.1, 438.5]) + rng.normal(size=(rows, 2)) * [1e-3, 0.2]
     measured[rng.random(rows) < 0.05] = np.nan
     qc: Array = 103.4 + np.cumsum(rng.normal(size=rows)) * 0.02
-    return FilterRecord.of(np.arange(rows) / 10.0, qc[:, None], measured, gate=6.0)
+    return FilterRecord(np.arange(rows) / 10.0, qc[:, None], measured, gate=6.0)
 
 
 def same(found: Sequence[FilterResult], expected: Sequence[FilterResult]) -> bool:
@@ -31,7 +31,7 @@ def same(found: Sequence[FilterResult], expected: Sequence[FilterResult]) -> boo
 
 
 def alone(records: Sequence[FilterRecord]) -> list[FilterResult]:
-    return [Filter(cstr(), noise).run_record(item) for noise, item in zip(LEVELS, records, strict=False)]
+    return [Filter(cstr(), noise).run(item) for noise, item in zip(LEVELS, records, strict=False)]
 
 
 def at_once(records: Sequence[FilterRecord]) -> list[FilterResult]:
@@ -49,7 +49,7 @@ def test_records_of_different_lengths_and_with_gaps_go_together() -> None:
     records = [record(1), record(2, LEAST_ROWS + 200), record(3), record(4)]
     times = records[2].time_min.copy()
     times[700:] += 2.0
-    records[2] = FilterRecord.of(times, records[2].inputs, records[2].measured, gate=6.0)
+    records[2] = FilterRecord(times, records[2].inputs, records[2].measured, gate=6.0)
     assert same(at_once(records), alone(records))
 
 
@@ -58,7 +58,7 @@ def test_one_that_loses_the_plant_does_not_disturb_the_others() -> None:
     records = [record(seed) for seed in range(4)]
     measured: Array = records[1].measured.copy()
     measured[1000] = 1e308
-    records[1] = FilterRecord.of(records[1].time_min, records[1].inputs, measured)
+    records[1] = FilterRecord(records[1].time_min, records[1].inputs, measured)
     found, expected = at_once(records), alone(records)
     assert np.all(np.isnan(expected[1].prediction[1000]))
     assert same(found, expected)

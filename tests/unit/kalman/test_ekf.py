@@ -100,7 +100,7 @@ def first_state(model: ProcessModel, noise: NoiseLevels = NOISE) -> FilterState:
 def test_on_a_linear_model_it_is_the_kalman_filter_exactly_sampled() -> None:
     time_min, inputs, measured = linear_record()
     start = first_state(linear_model())
-    found = Filter(linear_model(), NOISE).run(time_min[1:], inputs[1:], measured[1:], start=start)
+    found = Filter(linear_model(), NOISE).run(FilterRecord(time_min[1:], inputs[1:], measured[1:]), start=start)
     for row, (x, P, off, S) in enumerate(textbook(start, time_min[1:], inputs[1:], measured[1:])):
         np.testing.assert_allclose(found.x[row], x, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(found.P[row], P, rtol=1e-6, atol=1e-9)
@@ -111,7 +111,7 @@ def test_on_a_linear_model_it_is_the_kalman_filter_exactly_sampled() -> None:
 def test_its_likelihood_is_that_of_the_innovations_and_whitening_takes_their_correlation_out() -> None:
     time_min, inputs, measured = linear_record()
     start = first_state(linear_model())
-    found = Filter(linear_model(), NOISE).run(time_min[1:], inputs[1:], measured[1:], start=start)
+    found = Filter(linear_model(), NOISE).run(FilterRecord(time_min[1:], inputs[1:], measured[1:]), start=start)
     expected = 0.0
     for row, (_, _, off, S) in enumerate(textbook(start, time_min[1:], inputs[1:], measured[1:])):
         known = np.isfinite(off)
@@ -126,7 +126,7 @@ def test_its_likelihood_is_that_of_the_innovations_and_whitening_takes_their_cor
 
 def test_its_covariance_settles_at_the_solution_of_the_riccati_equation() -> None:
     time_min = np.arange(500, dtype=np.float64) * 0.1
-    P = Filter(linear_model(), NOISE).run(time_min, np.zeros(500), np.ones((500, 2))).P[-1]
+    P = Filter(linear_model(), NOISE).run(FilterRecord(time_min, np.zeros(500), np.ones((500, 2)))).P[-1]
     Q, R = np.diag(np.square(NOISE.process_sd)) * 0.1, np.diag(np.square(NOISE.measurement_sd))
     prior = solve_discrete_are(expm(A * 0.1).T, C.T, Q, R)
     gain = prior @ C.T @ np.linalg.inv(C @ prior @ C.T + R)
@@ -154,7 +154,7 @@ def assert_white(normalized: Array) -> None:
 def test_on_the_plant_its_innovations_are_white(process_sd: dict[str, float]) -> None:
     noise = NoiseLevels((0.002, 0.3), (process_sd.get("C", 0.0), process_sd.get("T", 0.0)))
     record = record_of(PlantConfig(seed=5, process_noise_sd=process_sd), 3000)
-    assert_white(Filter(cstr(), noise).run(*record).normalized[BURN_IN:])
+    assert_white(Filter(cstr(), noise).run(FilterRecord(*record)).normalized[BURN_IN:])
 
 
 @pytest.mark.parametrize(
@@ -169,8 +169,8 @@ def test_on_the_plant_its_innovations_are_white(process_sd: dict[str, float]) ->
 def test_with_the_true_fault_in_the_model_the_innovations_of_a_faulty_plant_are_white(fault: str) -> None:
     config = PlantConfig(seed=6, scenario={"kind": "random-steps", "low": 85.0, "high": 105.0}, faults=(fault,))
     record = record_of(config, 2000)
-    assert_white(Filter(parse_fault(fault).extend(cstr()), SENSORS).run(*record).normalized[BURN_IN:])
-    nominal = Filter(cstr(), SENSORS).run(*record).normalized[BURN_IN:]
+    assert_white(Filter(parse_fault(fault).extend(cstr()), SENSORS).run(FilterRecord(*record)).normalized[BURN_IN:])
+    nominal = Filter(cstr(), SENSORS).run(FilterRecord(*record)).normalized[BURN_IN:]
     assert np.sum(nominal**2) > chi2.isf(1e-4, nominal.size)
 
 
@@ -182,7 +182,7 @@ def test_without_noise_it_predicts_what_the_simulator_runs(onset: str) -> None:
     inputs = np.where(np.arange(42) % 20 < 10, 95.0, 103.0)
     expected = Simulator(model).run(time_min, inputs, np.array(OPERATING_STATE))
     start = FilterState(0.0, (95.0,), OPERATING_STATE, (0.0,) * 4)
-    found = Filter(model, SENSORS).run(time_min[1:], inputs[1:], expected.outputs[1:], start=start)
+    found = Filter(model, SENSORS).run(FilterRecord(time_min[1:], inputs[1:], expected.outputs[1:]), start=start)
     assert np.all(np.abs(found.prediction - expected.outputs[1:]) < [1e-6, 2e-4])
 
 
@@ -214,7 +214,7 @@ def test_a_record_at_once_and_row_by_row_are_the_same_to_the_last_bit() -> None:
     accept[80:90, 1] = True
     measured[80:90, 1] += 20.0
     one, other = Filter(model, SENSORS), Filter(model, SENSORS)
-    whole = one.run(time_min, inputs, measured, gate=6.0, accept=accept)
+    whole = one.run(FilterRecord(time_min, inputs, measured, gate=6.0, accept=accept))
     rows = [
         other.update(t, (u,), y, gate=6.0, accept=follow)
         for t, u, y, follow in zip(time_min.tolist(), inputs.tolist(), measured.tolist(), accept.tolist(), strict=True)
@@ -229,10 +229,10 @@ def test_over_the_rest_of_a_record_it_goes_on_bit_for_bit(since: int) -> None:
     time_min, inputs, measured = record_of(PlantConfig(seed=7), 300)
     time_min = time_min + np.where(np.arange(300) > 200, 2.0, 0.0)
     model = parse_fault("coolant_flow:step:-0.2@12.37min").extend(cstr())
-    record = FilterRecord.of(time_min, inputs, measured, 6.0)
-    whole, kalman = Filter(model, SENSORS).run_record(record), Filter(model, SENSORS)
-    kalman.run(time_min[:since], inputs[:since], measured[:since], gate=6.0)
-    rest = kalman.run_record(record.after(since), kalman.state)
+    record = FilterRecord(time_min, inputs, measured, 6.0)
+    whole, kalman = Filter(model, SENSORS).run(record), Filter(model, SENSORS)
+    kalman.run(FilterRecord(time_min[:since], inputs[:since], measured[:since], gate=6.0))
+    rest = kalman.run(FilterRecord(time_min[since:], inputs[since:], measured[since:], 6.0), kalman.state)
     for field in Innovation._fields:
         np.testing.assert_array_equal(getattr(rest, field), getattr(whole, field)[since:])
 
@@ -240,7 +240,7 @@ def test_over_the_rest_of_a_record_it_goes_on_bit_for_bit(since: int) -> None:
 def test_from_a_stored_state_it_goes_on_bit_for_bit() -> None:
     time_min, inputs, measured = record_of(PlantConfig(seed=8), 100)
     one, other = Filter(cstr(), SENSORS), Filter(cstr(), SENSORS)
-    one.run(time_min[:60], inputs[:60], measured[:60])
+    one.run(FilterRecord(time_min[:60], inputs[:60], measured[:60]))
     stored = msgspec.msgpack.encode(one.state)
     other.state = msgspec.msgpack.decode(stored, type=FilterState)
     for row in range(60, 100):
@@ -255,13 +255,14 @@ def test_a_value_beyond_the_gate_is_treated_as_missing_until_it_is_accepted() ->
     outlier[50, 1], missing[50, 1] = outlier[50, 1] + 10.0, np.nan
     accept = np.zeros((60, 2), dtype=bool)
     gated, without, plain = (
-        Filter(cstr(), SENSORS).run(time_min, inputs, item, gate=6.0) for item in (outlier, missing, measured)
+        Filter(cstr(), SENSORS).run(FilterRecord(time_min, inputs, item, gate=6.0))
+        for item in (outlier, missing, measured)
     )
     np.testing.assert_array_equal(gated.x, without.x)
     assert gated.residual[50, 1] == pytest.approx(plain.residual[50, 1] + 10.0)
     accept[50, 1] = True
-    followed = Filter(cstr(), SENSORS).run(time_min, inputs, outlier, gate=6.0, accept=accept)
-    ungated = Filter(cstr(), SENSORS).run(time_min, inputs, outlier)
+    followed = Filter(cstr(), SENSORS).run(FilterRecord(time_min, inputs, outlier, gate=6.0, accept=accept))
+    ungated = Filter(cstr(), SENSORS).run(FilterRecord(time_min, inputs, outlier))
     np.testing.assert_array_equal(followed.x, ungated.x)
     assert np.any(followed.x != without.x)
 
@@ -303,7 +304,7 @@ def test_over_rows_without_any_measurement_it_predicts_alone() -> None:
     time_min = np.arange(1, 31, dtype=np.float64) * 0.1
     nothing = np.full((30, 2), np.nan)
     flows = np.linspace(95.0, 105.0, 30)
-    found = Filter(cstr(), SENSORS).run(time_min, flows, nothing, start=start)
+    found = Filter(cstr(), SENSORS).run(FilterRecord(time_min, flows, nothing), start=start)
     grid, held = np.append(0.0, time_min), np.append(OPERATING_COOLANT_FLOW, flows)
     expected = Simulator(cstr()).run(grid, held, np.array([0.08, 440.0])).outputs[1:]
     assert np.all(np.abs(found.prediction - expected) < [1e-7, 1e-5])
@@ -342,10 +343,10 @@ def test_a_run_may_end_where_the_filter_diverges_instead_of_restarting() -> None
     model = linear_model(bound=50.0)
     time_min, inputs, measured = linear_record(rows=60)
     inputs[30:] = 1e6  # leads out of the bounds
-    record = FilterRecord.of(time_min, inputs, measured)
+    record = FilterRecord(time_min, inputs, measured)
     kalman, stopping = Filter(model, NOISE), Filter(model, NOISE)
     stopping.stops_at_restart = True
-    restarted, stopped = kalman.run_record(record), stopping.run_record(record)
+    restarted, stopped = kalman.run(record), stopping.run(record)
     end = int(np.argmax(np.isnan(restarted.prediction[1:, 0]))) + 1
     assert 30 <= end < 60
     for one, other in zip(restarted, stopped, strict=True):
@@ -358,12 +359,12 @@ def test_a_run_that_diverges_often_ends_after_the_divergences_that_it_may_have()
     model = linear_model(bound=50.0)
     time_min, inputs, measured = linear_record(rows=60)
     inputs[30:] = 1e6  # leads out of the bounds
-    record = FilterRecord.of(time_min, inputs, measured)
+    record = FilterRecord(time_min, inputs, measured)
     results = []
     for most in (3, np.inf):
         kalman = Filter(model, NOISE)
         kalman.most_divergences = most
-        results.append(kalman.clone().run_record(record))
+        results.append(kalman.clone().run(record))
     stopped, restarted = results
     started = np.isnan(restarted.prediction[:, 0]) & np.isfinite(restarted.x[:, 0])
     end = int(np.flatnonzero(started)[4])  # after the first row and three divergences
@@ -385,7 +386,7 @@ def test_without_process_noise_the_covariance_stays_positive_for_a_week() -> Non
     time_min = 2e7 + np.arange(rows, dtype=np.float64) * 0.1
     inputs = 98.0 + 6.0 * np.sin(np.arange(rows) / 20)
     kalman = Filter(cstr(), SENSORS)
-    P = kalman.run(time_min, inputs, np.full((rows, 2), OPERATING_STATE), gate=1e9).P[1:]
+    P = kalman.run(FilterRecord(time_min, inputs, np.full((rows, 2), OPERATING_STATE), gate=1e9)).P[1:]
     assert np.array_equal(P[:, 0, 1], P[:, 1, 0])
     correlation = P[:, 0, 1] / np.sqrt(P[:, 0, 0] * P[:, 1, 1])
     assert np.all(np.isfinite(correlation))

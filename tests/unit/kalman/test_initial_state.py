@@ -9,6 +9,7 @@ import pytest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
@@ -42,7 +43,7 @@ def test_from_the_temperature_alone_it_finds_the_concentration() -> None:
     time_min, inputs = record.time_min, record.columns["qc"]
     clean = truth.run(time_min, inputs, np.array([0.11, 436.0])).states[:, 0]
     measured = np.column_stack([np.full(1500, np.nan), record.columns["T"]])
-    found = Filter(cstr(), SENSORS).run(time_min, inputs, measured)
+    found = Filter(cstr(), SENSORS).run(FilterRecord(time_min, inputs, measured))
     error = found.x[600:, 0] - clean[600:]
     assert np.all(np.abs(error) < 4 * np.sqrt(found.P[600:, 0, 0]) + 1e-5)
     assert np.max(np.abs(error)) < 0.002
@@ -58,7 +59,9 @@ def test_it_begins_right_with_a_sensor_that_the_model_knows_to_be_off() -> None:
 def test_it_begins_where_outputs_grow_without_bound_with_a_state_all_the_same() -> None:
     # Half a minute later than a state amid its bounds, the reaction has run away by more than a number can hold.
     model = EFFECTS[-1].extend(cstr()).with_values({"sample_timing.size": 0.45})
-    run = Filter(model, SENSORS).run(np.array([0.0, 0.1]), np.full((2, 1), 90.0), np.array([[0.1, 438.0]] * 2))
+    run = Filter(model, SENSORS).run(
+        FilterRecord(np.array([0.0, 0.1]), np.full((2, 1), 90.0), np.array([[0.1, 438.0]] * 2))
+    )
     assert np.all(np.isfinite(run.x))
 
 
@@ -67,7 +70,7 @@ def test_it_begins_anew_after_a_row_whose_input_nobody_knows() -> None:
     time_min, inputs = record.time_min, record.columns["qc"].copy()
     measured = np.column_stack([record.columns["C"], record.columns["T"]])
     inputs[30] = np.nan
-    found = Filter(cstr(), SENSORS).run(time_min, inputs, measured)
+    found = Filter(cstr(), SENSORS).run(FilterRecord(time_min, inputs, measured))
     assert np.flatnonzero(np.all(np.isnan(found.prediction), axis=1)).tolist() == [0, 31]
     kalman = Filter(cstr(), SENSORS)
     told = [
@@ -93,5 +96,5 @@ def test_a_valve_that_sticks_is_taken_to_begin_near_what_is_asked_of_it(seed: in
     record = simulate_record(PlantConfig(seed=seed, faults=("valve_stiction:constant:6.0",)), 10)
     measured = np.column_stack([record.columns["C"], record.columns["T"]])
     sensors = NoiseLevels(SENSORS.measurement_sd, (0.0, 0.0, 0.0))
-    found = Filter(fault.extend(cstr()), sensors).run(record.time_min, record.columns["qc"], measured)
+    found = Filter(fault.extend(cstr()), sensors).run(FilterRecord(record.time_min, record.columns["qc"], measured))
     assert np.all(np.abs(found.x[:, 2] - record.columns["qc"][0]) < 3.0)

@@ -12,9 +12,10 @@ from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorLinearization
+from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.kalman.input_uncertainty import InputUncertainty
-from reactorwatch.kalman.noise_estimation import estimate_noise_and_parameters
+from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.kalman.resampling import insert_rows
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
@@ -29,7 +30,8 @@ def test_inputs_may_have_changed_with_each_missing_row_and_the_one_after_them(mi
     uncertainty = InputUncertainty.for_missing_rows(
         time_min, np.zeros((time_min.size, 1)), missing * (np.arange(time_min.size) == 7)
     )
-    np.testing.assert_allclose(uncertainty.change_times_min(7), 0.1 * np.arange(7, 8 + missing), rtol=1e-12)
+    times = [time for time, _ in uncertainty.changes(7)]
+    np.testing.assert_allclose(times, 0.1 * np.arange(7, 8 + missing), rtol=1e-12)
     assert np.flatnonzero(uncertainty.rows).tolist() == [7]
 
 
@@ -42,7 +44,7 @@ def test_a_tank_that_fills_is_as_uncertain_as_when_its_valve_opened(missing: int
         for row in range(50):
             tank.update(0.1 * row, (0.0,), (5.0,))
     moments, now = (4.9 + 0.1 * np.arange(1, missing + 2)).tolist(), 5.0 + 0.1 * missing
-    kalman.update(now, (3.0,), (np.nan,), uncertainty=((3.0,), moments))
+    kalman.update(now, (3.0,), (np.nan,), changes=[(moment, (3.0,)) for moment in moments])
     sure.update(now, (3.0,), (np.nan,))
     by = 3.0 * (now - np.array(moments))
     assert kalman.state.x[0] == pytest.approx(sure.state.x[0] + np.mean(by), rel=1e-9)
@@ -58,7 +60,7 @@ def test_what_follows_a_level_goes_with_the_square_of_the_time_for_which_the_val
         for row in range(50):
             tanks.update(0.1 * row, (0.0,), (5.0,))
     moments, now = (4.9 + 0.1 * np.arange(1, missing + 2)).tolist(), 5.0 + 0.1 * missing
-    kalman.update(now, (3.0,), (np.nan,), uncertainty=((3.0,), moments))
+    kalman.update(now, (3.0,), (np.nan,), changes=[(moment, (3.0,)) for moment in moments])
     sure.update(now, (3.0,), (np.nan,))
     open_min = now - np.array(moments)
     by = np.array([3.0 * open_min, 1.5 * open_min**2])
@@ -78,7 +80,7 @@ def test_behind_holes_anywhere_innovations_do_not_go_with_the_way_in_which_the_i
         missing = missing_of(time_min[there], qc[there])
         uncertainty = InputUncertainty.for_missing_rows(time_min[there], qc[there][:, None], missing)
         found = Filter(cstr(), SENSORS).run(
-            time_min[there], qc[there][:, None], measured[there], uncertainty=uncertainty
+            FilterRecord(time_min[there], qc[there][:, None], measured[there], uncertainty=uncertainty)
         )
         behind = np.flatnonzero(missing)
         way = np.sign(qc[there][behind] - qc[there][behind - 1])[:, None]
@@ -96,7 +98,7 @@ def test_the_equations_of_the_errors_expect_of_a_way_in_doubt_what_the_filter_ex
         measured[there],
     )
     levels = NoiseLevels(SENSORS.measurement_sd, (1e-4, 0.05))
-    found = Filter(cstr(), levels).run(times, inputs, seen, uncertainty=uncertainty)
+    found = Filter(cstr(), levels).run(FilterRecord(times, inputs, seen, uncertainty=uncertainty))
     later = slice(1, None)  # the filter begins with the first row
     x, P, residual = (item[later] for item in (found.x, found.P, found.residual))
     errors = ErrorLinearization(cstr(), levels, (), ())
@@ -112,12 +114,14 @@ def test_innovations_behind_holes_are_as_large_as_the_filter_says() -> None:
     time_min, qc, measured, there = with_holes(seed=3)
     inputs, missing = qc[there][:, None], missing_of(time_min[there], qc[there])
     uncertainty = InputUncertainty.for_missing_rows(time_min[there], inputs, missing)
-    doubted = Filter(cstr(), SENSORS).run(time_min[there], inputs, measured[there], uncertainty=uncertainty)
+    doubted = Filter(cstr(), SENSORS).run(
+        FilterRecord(time_min[there], inputs, measured[there], uncertainty=uncertainty)
+    )
     behind = np.flatnonzero(missing)
     assert behind.size > 300
     assert np.mean(doubted.normalized[behind] ** 2) == pytest.approx(1.0, abs=0.25)
     assert np.mean(doubted.normalized[behind + 1] ** 2) == pytest.approx(1.0, abs=0.25)
-    taken_as_held = Filter(cstr(), SENSORS).run(time_min[there], inputs, measured[there])
+    taken_as_held = Filter(cstr(), SENSORS).run(FilterRecord(time_min[there], inputs, measured[there]))
     assert np.mean(taken_as_held.normalized[behind] ** 2) > 2.0
 
 
@@ -125,10 +129,8 @@ def test_what_a_noise_search_learns_does_not_take_holes_for_noise() -> None:
     time_min, qc, measured, there = with_holes(seed=4)
     inputs = qc[there][:, None]
     uncertainty = InputUncertainty.for_missing_rows(time_min[there], inputs, missing_of(time_min[there], qc[there]))
-    with_doubt, without = (
-        estimate_noise_and_parameters(cstr(), time_min[there], inputs, measured[there], (1e-4, 0.01), (), {}, item)[0]
-        for item in (uncertainty, None)
-    )
+    records = (FilterRecord(time_min[there], inputs, measured[there], uncertainty=item) for item in (uncertainty, None))
+    with_doubt, without = (fit_noise(cstr(), record, (1e-4, 0.01)).levels for record in records)
     assert with_doubt.process_sd[1] < 0.02
     assert without.process_sd[1] > 0.05
 
@@ -144,7 +146,7 @@ def test_a_sticking_valve_keeps_its_place_behind_a_hole() -> None:
         record.time_min[there], qc[there][:, None], missing_of(record.time_min[there], qc[there])
     )
     kalman = Filter(fault.extend(cstr()), NoiseLevels(SENSORS.measurement_sd, (0.0,) * 3))
-    found = kalman.run(record.time_min[there], qc[there], measured[there], uncertainty=uncertainty)
+    found = kalman.run(FilterRecord(record.time_min[there], qc[there], measured[there], uncertainty=uncertainty))
     stands = np.empty(3000)
     stands[0] = qc[0]
     for row in range(1, 3000):
@@ -159,8 +161,10 @@ def test_with_rows_put_in_a_filter_says_what_it_says_row_by_row() -> None:
     kalman = Filter(cstr(), NoiseLevels(SENSORS.measurement_sd, (1e-4, 0.05)))
     rows = insert_rows(time_min[there], inputs, measured[there], uncertainty)
     assert rows.original_index.size == np.count_nonzero(there) < rows.time_min.size
-    found = rows.at_original_rows(kalman.run(rows.time_min, rows.inputs, rows.measured, uncertainty=rows.uncertainty))
-    expected = kalman.run(time_min[there], inputs, measured[there], uncertainty=uncertainty)
+    found = rows.at_original_rows(
+        kalman.run(FilterRecord(rows.time_min, rows.inputs, rows.measured, uncertainty=rows.uncertainty))
+    )
+    expected = kalman.run(FilterRecord(time_min[there], inputs, measured[there], uncertainty=uncertainty))
     for name in FilterResult._fields:
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-9, err_msg=name)
 

@@ -7,7 +7,8 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.noise_estimation import estimate_noise
+from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.process.library.cstr.model import cstr
 
 SMALLEST = (2e-4, 0.05)
@@ -22,7 +23,7 @@ def record_of(rows: int = ROWS, **settings: object) -> tuple[Array, Array, Array
 
 
 def estimate(time_min: Array, inputs: Array, measured: Array) -> NoiseLevels:
-    return estimate_noise(cstr(), time_min, inputs, measured, SMALLEST)
+    return fit_noise(cstr(), FilterRecord(time_min, inputs, measured), SMALLEST).levels
 
 
 @pytest.mark.parametrize("noise_sd", [{}, {"C": 0.005, "T": 1.0}])
@@ -101,7 +102,7 @@ def test_it_is_the_same_every_time() -> None:
 def test_a_sensor_without_noise_needs_no_smallest_level(
     smallest: tuple[float, float], noise_sd: dict[str, float]
 ) -> None:
-    found = estimate_noise(cstr(), *record_of(rows=400, seed=5, noise_sd=noise_sd), smallest)
+    found = fit_noise(cstr(), FilterRecord(*record_of(rows=400, seed=5, noise_sd=noise_sd)), smallest).levels
     for sd, least, true in zip(
         found.measurement_sd, smallest, (noise_sd.get("C", 0.002), noise_sd.get("T", 0.3)), strict=True
     ):
@@ -115,5 +116,5 @@ def test_a_sensor_without_noise_needs_no_smallest_level(
 def test_an_output_that_is_always_zero_has_a_level_too() -> None:
     time_min, inputs, measured = record_of(rows=400, seed=5)
     measured[:, 0] = 0.0
-    found = estimate_noise(cstr(), time_min, inputs, measured, (0.0, 0.0))
+    found = fit_noise(cstr(), FilterRecord(time_min, inputs, measured), (0.0, 0.0)).levels
     assert np.all(np.isfinite([*found.measurement_sd, *found.process_sd]))

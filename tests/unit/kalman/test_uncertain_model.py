@@ -5,6 +5,7 @@ import pytest
 
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.kalman.uncertain_model import learned_parameters, select_effects, widen_model
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
@@ -33,8 +34,8 @@ def record(*faults: str) -> tuple[Array, Array, Array]:
 
 def test_a_move_to_where_the_plant_has_not_been_is_predicted_with_a_larger_variance_which_rows_narrow() -> None:
     time_min, inputs, measured = record()
-    sd = kalman(widen_model(cstr(), CONSTANTS)).run(time_min, inputs, measured).sd[:, 1]
-    plain = kalman(cstr()).run(time_min, inputs, measured).sd[:, 1]
+    sd = kalman(widen_model(cstr(), CONSTANTS)).run(FilterRecord(time_min, inputs, measured)).sd[:, 1]
+    plain = kalman(cstr()).run(FilterRecord(time_min, inputs, measured)).sd[:, 1]
     assert sd[299] < 1.05 * plain[299]
     assert np.max(sd[300:310]) > 1.5 * plain[299]
     assert sd[-1] < 1.05 * plain[-1]
@@ -43,7 +44,7 @@ def test_a_move_to_where_the_plant_has_not_been_is_predicted_with_a_larger_varia
 def test_the_first_move_teaches_the_lag_of_the_valve() -> None:
     time_min, inputs, measured = record("valve_lag:constant:0.12")
     model = widen_model(cstr(), CONSTANTS)
-    result = kalman(model).run(time_min, inputs, measured)
+    result = kalman(model).run(FilterRecord(time_min, inputs, measured))
     lag = model.state_names.index("valve_lag.constant")
     assert result.x[-1, lag] == pytest.approx(0.12, abs=0.03)
     assert result.P[-1, lag, lag] < 0.2 * result.P[299, lag, lag]
@@ -54,7 +55,7 @@ def test_a_filter_that_is_interrupted_keeps_what_it_knows_about_the_constants() 
     time_min, inputs, measured = record("temperature_bias:constant:1.5")
     model = widen_model(cstr(), CONSTANTS)
     one = kalman(model)
-    before = one.run(time_min, inputs, measured)
+    before = one.run(FilterRecord(time_min, inputs, measured))
     one.interrupt()
     one.update(100.0, inputs[-1].tolist(), measured[-1].tolist())
     assert np.array(one.state.x)[list(model.constant_states)] == pytest.approx(

@@ -174,7 +174,7 @@ def test_where_nothing_is_lost_no_prediction_is_any_less_certain(
     def refuse(*_: object) -> None:
         raise AssertionError("the input is known")
 
-    monkeypatch.setattr(Filter, "_predict_between", refuse)
+    monkeypatch.setattr(Filter, "_predict_uncertain", refuse)
     for name, qc in INPUTS.items():
         messages = sound(qc, seed=5)[3 * TRAINED :]
         raised(trained["process", name], "process", messages)

@@ -5,6 +5,7 @@ import pytest
 
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
+from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
@@ -54,7 +55,7 @@ def test_these_effects_bring_memory_along() -> None:
 @of_every_effect
 def test_at_its_neutral_size_its_filter_is_that_of_the_base_model(effect: Effect) -> None:
     model = effect.extend(cstr())
-    expected, found = (Filter(item, noise_of(item)).run(*record()) for item in (cstr(), model))
+    expected, found = (Filter(item, noise_of(item)).run(FilterRecord(*record())) for item in (cstr(), model))
     np.testing.assert_allclose(found.residual, expected.residual, rtol=0, atol=1e-6)
     np.testing.assert_allclose(found.normalized, expected.normalized, rtol=0, atol=1e-6)
     np.testing.assert_allclose(found.P[:, :2, :2], expected.P, rtol=1e-6, atol=1e-12)
@@ -67,7 +68,9 @@ def test_without_noise_a_filter_of_it_predicts_what_the_simulator_runs(effect: E
     expected = Simulator(model).run(time_min, flows, START)
     x = tuple(expected.states[0].tolist())
     start = FilterState(0.0, (float(flows[0]),), x, (0.0,) * len(x) ** 2)
-    found = Filter(model, noise_of(model)).run(time_min[1:], flows[1:], np.full((99, 2), np.nan), start=start)
+    found = Filter(model, noise_of(model)).run(
+        FilterRecord(time_min[1:], flows[1:], np.full((99, 2), np.nan)), start=start
+    )
     assert np.all(np.abs(found.prediction - expected.outputs[1:]) < SMALL)
 
 
@@ -125,7 +128,9 @@ def test_with_the_true_cause_in_its_model_a_filter_leaves_less_than_the_nominal_
     time_min, flows, measured = record(1000)
     clean = [Simulator(item).run(time_min, flows, START).outputs for item in (cstr(), model)]
     noise = NoiseLevels((0.002, 0.3), (0.0,) * len(model.states))
-    found = Filter(model, noise).run(time_min, flows, measured - clean[0] + clean[1]).normalized[100:]
-    nominal = Filter(cstr(), NoiseLevels((0.002, 0.3), (0.0, 0.0))).run(time_min, flows, measured - clean[0] + clean[1])
+    found = Filter(model, noise).run(FilterRecord(time_min, flows, measured - clean[0] + clean[1])).normalized[100:]
+    nominal = Filter(cstr(), NoiseLevels((0.002, 0.3), (0.0, 0.0))).run(
+        FilterRecord(time_min, flows, measured - clean[0] + clean[1])
+    )
     assert np.mean(found**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 / found.size))
     assert np.mean(nominal.normalized[100:] ** 2) > 1.2

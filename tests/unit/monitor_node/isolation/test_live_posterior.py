@@ -95,7 +95,7 @@ def test_a_bank_of_a_sound_plant_is_its_filter(leak: list[Row]) -> None:
         time_min, inputs, measured = leak[row]
         lost = row == ALARM + LOOK + 42 and inputs != leak[row - 3][1]
         between = np.linspace(leak[row - 3][0], time_min, 4)[1:].tolist()
-        own.update(time_min, inputs, measured, uncertainty=(inputs, between) if lost else None)
+        own.update(time_min, inputs, measured, changes=[(time, inputs) for time in between] if lost else [])
         assert live.update(time_min, inputs, measured)
     x = live._filters["belief"][-1][: len(model.states)]
     assert x == pytest.approx(own.state.x, rel=1e-6)
