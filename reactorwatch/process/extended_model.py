@@ -118,7 +118,7 @@ class ExtendedModel:
             "parameters": dict(self.parameters),
             "effects": [str(item) for item in self.effects],
             "zero_ns": self.zero_ns,
-            **({"laws": [msgspec.to_builtins(item) for item in self.laws]} if self.laws else {}),
+            **({"laws": [msgspec.structs.asdict(item) for item in self.laws]} if self.laws else {}),
             **({} if self.equations is None else {"equations": store_equations(self.equations)}),
             **({} if self.description is None else {"process": dict(self.description)}),
             **({"uncertain": list(self.uncertain)} if self.uncertain else {}),
