@@ -15,7 +15,7 @@ from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.process.controller import ContinuousController, Controller
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.process.library.cstr.controllers import TemperatureControl
-from reactorwatch.process.model import ProcessModel, Variable
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.operation import InputLevels
 from reactorwatch.units import conversion
 
@@ -65,7 +65,7 @@ def fit_settings(config: PlantConfig, process: Process) -> ProcessSettings:
     try:
         controllers, model = _controllers(config, process, model)
         return ProcessSettings(
-            {item.name: settings for item, settings in _scenarios(config, process, model)},
+            _scenarios(config, process, model),
             controllers,
             model,
             tuple(parse_fault(text, process.faults).with_defaults(0.0, config.duration_min) for text in config.faults),
@@ -83,15 +83,14 @@ def to_model_unit(signal: Signal, model: ProcessModel) -> tuple[float, float]:
     return (1.0, 0.0) if signal.unit in ("", unit) else conversion(signal.unit, unit, f"signal {signal.name!r}")
 
 
-def _scenarios(config: PlantConfig, process: Process, model: ProcessModel) -> list[tuple[Variable, Settings]]:
+def _scenarios(config: PlantConfig, process: Process, model: ProcessModel) -> dict[str, Settings]:
     given = split_scenarios(config.scenario, model.input_names)
     bounds = _bounds(process, model)
-    found = []
+    found = {}
     for item in model.inputs:
         levels = process.operation.inputs.get(item.name) or InputLevels.of(item, bounds[item.name])
-        settings = scenario_settings(given[item.name], levels)
-        check_levels(settings, item)
-        found.append((item, settings))
+        found[item.name] = scenario_settings(given[item.name], levels)
+        check_levels(found[item.name], item)
     return found
 
 

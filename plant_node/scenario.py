@@ -41,23 +41,15 @@ class Scenario(Protocol):
         """Command at a plant time, a deterministic function of the arguments."""
 
 
-class RandomSteps(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A new level, uniformly distributed, at regular times.
+class _Between(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A scenario between a lowest and a highest level, with their middle as its mean."""
 
-    Attributes:
-        low: lowest level.
-        high: highest level.
-        hold_min: length of a hold.
-    """
-
-    kind: ClassVar[str] = "random-steps"
     low: float
     high: float
-    hold_min: float
 
     def __post_init__(self) -> None:
-        _check_order(self.low, self.high)
-        _check_positive("hold_min", self.hold_min)
+        if not self.low <= self.high:
+            raise ValueError(f"low must not exceed high, got {self.low:g} and {self.high:g}")
 
     @property
     def mean(self) -> float:
@@ -68,6 +60,23 @@ class RandomSteps(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def extremes(self) -> Mapping[str, float]:
         """Lowest and highest level, by name of what sets them."""
         return {"low": self.low, "high": self.high}
+
+
+class RandomSteps(_Between, frozen=True, forbid_unknown_fields=True):
+    """A new level, uniformly distributed, at regular times.
+
+    Attributes:
+        low: lowest level.
+        high: highest level.
+        hold_min: length of a hold.
+    """
+
+    kind: ClassVar[str] = "random-steps"
+    hold_min: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_positive("hold_min", self.hold_min)
 
     def level(self, time_min: float, seed: int) -> float:
         """See `Scenario`."""
@@ -114,7 +123,7 @@ class Sines(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
 
 
-class Square(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Square(_Between, frozen=True, forbid_unknown_fields=True):
     """Half a period low, half a period high.
 
     Attributes:
@@ -124,23 +133,11 @@ class Square(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     kind: ClassVar[str] = "square"
-    low: float
-    high: float
     period_min: float
 
     def __post_init__(self) -> None:
-        _check_order(self.low, self.high)
+        super().__post_init__()
         _check_positive("period_min", self.period_min)
-
-    @property
-    def mean(self) -> float:
-        """See `Scenario`."""
-        return 0.5 * (self.low + self.high)
-
-    @property
-    def extremes(self) -> Mapping[str, float]:
-        """Lowest and highest level, by name of what sets them."""
-        return {"low": self.low, "high": self.high}
 
     def level(self, time_min: float, seed: int) -> float:
         """See `Scenario`."""
@@ -311,11 +308,6 @@ def seed_of_input(seed: int, index: int) -> int:
 def _uniform(seed: int, index: int) -> float:
     """Draw a uniform number in [0, 1), a deterministic function of the arguments."""
     return float(np.random.default_rng(np.random.SeedSequence([seed, _STREAM, index])).random())
-
-
-def _check_order(low: float, high: float) -> None:
-    if not low <= high:
-        raise ValueError(f"low must not exceed high, got {low:g} and {high:g}")
 
 
 def _check_positive(name: str, value: float) -> None:

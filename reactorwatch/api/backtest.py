@@ -1,5 +1,6 @@
 """Run the monitor over a record from Python."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,18 +12,26 @@ from monitor_node.replay.record_checks import check_training_record
 from monitor_node.watched_process import WatchedProcess, limit_training, watch_process
 from reactorwatch.api.backtest_report import backtest_object, backtest_text
 from reactorwatch.api.monitor import Suspect, monitor_settings
+from reactorwatch.api.page import write_page
+from reactorwatch.api.record_view import signal_panels, time_title
 from reactorwatch.api.records import ProcessLike
-from reactorwatch.api.views import backtest as view
-from reactorwatch.api.views.page import write_page
 from reactorwatch.contract.codec import encode
 from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
+from reactorwatch.notebook import html
+from reactorwatch.notebook.figures import ALARM, Mark, draw_panels
+from reactorwatch.notebook.frames import frame_of_rows
 from reactorwatch.records.record import Record
 from recorder.tools.player import samples_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+COLUMNS = ("alarm", "priority", "raised_min", "cleared_min", "signals", "cause", "probability")
+"""Columns of the data frame."""
+
+TRAINING = "#7f7f7f"
 
 
 class RaisedAlarm(msgspec.Struct, frozen=True):
@@ -88,10 +97,35 @@ class BacktestResult(msgspec.Struct, frozen=True):
         return self.text
 
     def __repr__(self) -> str:
-        return f"<{view.summarise_alarms(self)}>"
+        return f"<{self._summary()}>"
 
     def _repr_html_(self) -> str:
-        return view.backtest_html(self)
+        rows = []
+        for alarm, cause in zip(self.alarms, _new_causes(self.alarms), strict=True):
+            cleared = "" if alarm.cleared_min is None else f"{alarm.cleared_min:g}"
+            rows.append((f"{alarm.raised_min:g}", cleared, alarm.alarm, alarm.priority, cause))
+        trained = self.trained_until_min
+        parts = [
+            html.headline(self._summary()),
+            html.sentence(
+                "All of it went into the training."
+                if trained is None
+                else f"Trained until {trained:g} min; {self.expected_false_alarms:.2g} false alarms are expected later."
+            ),
+            html.table(("raised, min", "cleared, min", "alarm", "priority", "likely cause"), rows),
+        ]
+        parts += [html.sentence(f"{item['signal']} is not watched: {item['why']}") for item in self.signals["left_out"]]
+        return "".join(parts)
+
+    def _summary(self) -> str:
+        """Number of alarms, the first of them, and the likeliest cause of the last that has suspects."""
+        if not self.alarms:
+            return "No alarms." if self.trained_until_min is not None else "Nothing was watched."
+        first = self.alarms[0]
+        suspects = [alarm.suspect[0] for alarm in self.alarms if alarm.suspect]
+        count = "1 alarm" if len(self.alarms) == 1 else f"{len(self.alarms)} alarms"
+        named = f"; likely cause: {suspects[-1]}" if suspects else ""
+        return f"{count}, the first at {first.raised_min:g} min ({first.alarm}){named}."
 
     def to_frame(self) -> "DataFrame":
         """A row for each alarm, with its likeliest cause.
@@ -99,7 +133,7 @@ class BacktestResult(msgspec.Struct, frozen=True):
         Raises:
             InputError: pandas is not installed.
         """
-        return view.backtest_frame(self)
+        return frame_of_rows([_row(alarm) for alarm in self.alarms], COLUMNS)
 
     def plot(self) -> "Figure":
         """Plot the watched signals with the training and the spans in which an alarm was active.
@@ -107,7 +141,17 @@ class BacktestResult(msgspec.Struct, frozen=True):
         Raises:
             InputError: matplotlib is not installed.
         """
-        return view.plot_backtest(self, self.record)
+        record: Record = self.record
+        inputs, outputs = tuple(self.signals["inputs"]), tuple(self.signals["outputs"])
+        end_min = float(record.continuous_min[-1])
+        marks = []
+        if self.runs == 1:
+            if self.trained_until_min is not None:
+                marks.append(Mark(float(record.time_min[0]), "training", TRAINING, end=self.trained_until_min))
+            spans = _merge_spans([(item.raised_min, item.cleared_min or end_min) for item in self.alarms])
+            marks += [Mark(start, "alarm" if not n else "", ALARM, end=end) for n, (start, end) in enumerate(spans)]
+        panels = signal_panels(record, inputs, names=(*outputs, *inputs))
+        return draw_panels(panels, marks, time_title(record))
 
     def to_html(self, file: str | Path) -> None:
         """Write the alarms and the plots as one page.
@@ -116,7 +160,7 @@ class BacktestResult(msgspec.Struct, frozen=True):
             InputError: the file cannot be written.
         """
         name = self.record.name
-        write_page(file, f"Back-test of {name}", view.backtest_html(self), self.plot, name)
+        write_page(file, f"Back-test of {name}", self._repr_html_(), self.plot, name)
 
 
 def backtest(record: Record, process: ProcessLike | None = None, **settings: Any) -> BacktestResult:
@@ -148,3 +192,33 @@ def backtest(record: Record, process: ProcessLike | None = None, **settings: Any
     found = backtest_object(result, zero_ns, record.zero)
     text = backtest_text(result, zero_ns, Path(record.name), record.zero_ns or None)
     return msgspec.convert(found | {"text": text, "record": record}, BacktestResult)
+
+
+def _merge_spans(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Union of spans, in order.
+
+    >>> _merge_spans([(5, 7), (1, 2), (6, 9)])
+    [(1, 2), (5, 9)]
+    """
+    merged: list[tuple[float, float]] = []
+    for start, end in sorted(spans):
+        if merged and start <= merged[-1][1]:
+            merged[-1] = (merged[-1][0], max(merged[-1][1], end))
+        else:
+            merged.append((start, end))
+    return merged
+
+
+def _new_causes(alarms: Sequence[RaisedAlarm]) -> list[str]:
+    """The likeliest cause of each alarm; empty where it is that of the alarm before."""
+    causes = [str(alarm.suspect[0]) if alarm.suspect else "" for alarm in alarms]
+    return [cause if i == 0 or cause != causes[i - 1] else "" for i, cause in enumerate(causes)]
+
+
+def _row(alarm: RaisedAlarm) -> dict[str, Any]:
+    likeliest = alarm.suspect[0] if alarm.suspect else None
+    values = (
+        *(alarm.alarm, alarm.priority, alarm.raised_min, alarm.cleared_min, ", ".join(alarm.signals)),
+        *((None, None) if likeliest is None else (likeliest.cause, likeliest.probability)),
+    )
+    return dict(zip(COLUMNS, values, strict=True))

@@ -4,19 +4,23 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
 from reactorwatch.api.records import ProcessLike, check_signals, process_of
 from reactorwatch.api.report_origin import report_origin
-from reactorwatch.api.views import diagnosis as view
 from reactorwatch.description.find import find_process
+from reactorwatch.description.process import Process
 from reactorwatch.description.toml_file import add_description
 from reactorwatch.diagnosis.diagnose import diagnose as find_causes
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import report_object
+from reactorwatch.diagnosis.report.words import describe_causes, describe_size, describe_timing, describe_verdict
 from reactorwatch.diagnosis.result import Diagnosis
+from reactorwatch.notebook import html
+from reactorwatch.notebook.figures import MEASURED, MODEL, Line, Mark, Panel, draw_panels
+from reactorwatch.notebook.frames import frame_of_rows
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
@@ -26,6 +30,27 @@ from reactorwatch.records.record import Record
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+COLUMNS = ("explanation", "delta_bic", "cause", "profile", "label", "location", "size", "size_sd", "unit", "onset_min")
+"""Columns of the data frame."""
+
+AFTER = "#2ca02c"
+
+
+class Case(NamedTuple):
+    """A record to be diagnosed.
+
+    Attributes:
+        record: the measured record.
+        process: the process, on the clock of the record, with the equations of the simulation.
+        effects: possible causes.
+        uncertain: standard deviations of uncertain parameters, by name.
+    """
+
+    record: Record
+    process: Process
+    effects: tuple[Effect, ...]
+    uncertain: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -64,7 +89,24 @@ class DiagnosisResult(Diagnosis):
         return report_object(self, self.file, self.seconds, self.zero)
 
     def _repr_html_(self) -> str:
-        return view.diagnosis_html(self, self.effects)
+        causes = [
+            (cause.label, cause.cause, cause.location, describe_size(cause, self.effects), describe_timing(cause))
+            for cause in self.causes
+        ]
+        others = [(describe_causes(item.causes, self.effects), f"{item.delta_bic:.1f}") for item in self.alternatives]
+        errors = [
+            (f"{name}, {item.unit}", f"{item.rmse_before:.3g}", f"{item.rmse_after:.3g}", f"{item.noise_sd:.3g}")
+            for name, item in self.gain.held_out.items()
+        ]
+        return "".join(
+            [
+                html.headline(describe_verdict(self)),
+                html.table(("cause", "name", "where", "size (95 %)", "when"), causes),
+                html.table(("or", "worse by, in BIC"), others),
+                html.table(("error of the simulation", "as it was", "extended", "noise"), errors),
+                *map(html.sentence, self.remarks),
+            ]
+        )
 
     def to_frame(self) -> "DataFrame":
         """A row for each cause of each explanation; explanation 0 is the named one, the others are alternatives.
@@ -72,16 +114,38 @@ class DiagnosisResult(Diagnosis):
         Raises:
             InputError: pandas is not installed.
         """
-        return view.diagnosis_frame(self)
+        explanations = [(self.causes, 0.0), *((item.explanation, item.delta_bic) for item in self.alternatives)]
+        rows: list[dict[str, Any]] = []
+        for number, (causes, worse) in enumerate(explanations):
+            for cause in causes:
+                size, onset = cause.parameters["size"], cause.parameters.get("onset")
+                values = (number, worse, cause.cause, cause.profile, cause.label, cause.location)
+                sizes = (size.value, size.sd, size.unit, None if onset is None else onset.value)
+                rows.append(dict(zip(COLUMNS, (*values, *sizes), strict=True)))
+        return frame_of_rows(rows, COLUMNS)
 
     def plot(self) -> "Figure":
-        """Plot the measured outputs with the simulation as it was and the extended one.
+        """Plot the measured outputs with the simulation as it was and the extended one, and the onsets of causes.
 
         Raises:
             InputError: matplotlib is not installed.
         """
-        assert self.curves is not None, "a diagnosis of a record has curves"
-        return view.plot_diagnosis(self, self.curves, self.model.units)
+        curves, panels = self.curves, []
+        assert curves is not None, "a diagnosis of a record has curves"
+        for name, measured in curves.measured.items():
+            lines = [
+                Line("measured", curves.time_min, measured, MEASURED),
+                Line("simulation as it was", curves.time_min, curves.simulated_before[name], MODEL),
+            ]
+            if self.causes:
+                lines.append(Line("extended simulation", curves.time_min, curves.simulated_after[name], AFTER))
+            panels.append(Panel(f"{name}, {self.model.units[name]}", tuple(lines)))
+        marks = [
+            Mark(item.parameters["onset"].value + item.run_shift_min, item.label)
+            for item in self.causes
+            if "onset" in item.parameters
+        ]
+        return draw_panels(panels, marks)
 
     def to_html(self, file: str | Path) -> None:
         """Write the report as one page.
@@ -121,15 +185,24 @@ def diagnose(
     Raises:
         InputError: the record cannot be diagnosed, or an argument is outside its range.
     """
-    started = time.monotonic()
     described = find_process(process_of(record, process), record.zero_ns)
     model = described.require_model()
     check_signals(record, model)
     make_run(record, model)
     causes = described.select_causes(without) if effects is None else effects
-    known = described.uncertain | dict(uncertain or {})
-    found = find_causes(record, model, causes, dict(tolerance or {}) or None, known, dict(limits or {}) or None)
+    case = Case(record, described, causes, described.uncertain | dict(uncertain or {}))
+    return diagnose_case(case, dict(tolerance or {}), dict(limits or {}))
+
+
+def diagnose_case(case: Case, tolerance: dict[str, float], limits: dict[str, tuple[float, float]]) -> DiagnosisResult:
+    """Diagnose a record whose rows are checked; arguments as for `diagnose`.
+
+    Raises:
+        InputError: invalid tolerances or limits.
+    """
+    started, model = time.monotonic(), case.process.require_model()
+    found = find_causes(case.record, model, case.effects, tolerance or None, case.uncertain, limits or None)
     values = {item.name: getattr(found, item.name) for item in fields(found)}
-    values["extended_model"] = add_description(found.extended_model, described)
+    values["extended_model"] = add_description(found.extended_model, case.process)
     seconds = time.monotonic() - started
-    return DiagnosisResult(**values, record=record, model=model, effects=causes, seconds=seconds)
+    return DiagnosisResult(**values, record=case.record, model=model, effects=case.effects, seconds=seconds)

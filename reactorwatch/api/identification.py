@@ -7,18 +7,22 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from reactorwatch.api.page import write_page
 from reactorwatch.api.records import ProcessLike, process_of
-from reactorwatch.api.views import identification as view
-from reactorwatch.api.views.page import write_page
 from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.identify import HeldOutRun, Identification, ModelForm, identify_and_run
+from reactorwatch.notebook import html
+from reactorwatch.notebook.figures import MEASURED, MODEL, Line, Panel, draw_panels
+from reactorwatch.notebook.frames import make_frame
 from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+STEP = "#2ca02c"
 
 
 class IdentificationResult(Identification, frozen=True, kw_only=True):
@@ -36,7 +40,17 @@ class IdentificationResult(Identification, frozen=True, kw_only=True):
         return f"<{self.model} of order {self.order} for {self.output}: free run {self.fit.free_run:.2f} %>"
 
     def _repr_html_(self) -> str:
-        return view.identification_html(self)
+        fit = self.fit_percent
+        return "".join(
+            [
+                html.headline(
+                    f"{self.model} of order {self.order}, delay {self.delay}, for {self.output}: "
+                    f"free run {fit.free_run:.2f} %, one step {fit.one_step:.2f} %"
+                ),
+                html.sentence(f"{self.rows} rows were fitted; the fits are of rows that were not."),
+                html.table(("check", "result"), self.checks.items()),
+            ]
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The object that `reactorwatch identify --json` prints."""
@@ -50,15 +64,28 @@ class IdentificationResult(Identification, frozen=True, kw_only=True):
         Raises:
             InputError: pandas is not installed.
         """
-        return view.held_out_frame(self, self.run)
+        run, name = self.run, self.output
+        values = {name: run.measured, f"{name}.one_step": run.one_step, f"{name}.free_run": run.free}
+        return make_frame({"time_min": run.time, **values}, "time_min")
 
     def plot(self) -> "Figure":
-        """Plot the held-out rows with the simulation and the one-step-ahead prediction.
+        """Plot the held-out rows with the simulation and the one-step-ahead prediction, and their errors.
 
         Raises:
             InputError: matplotlib is not installed.
         """
-        return view.plot_identification(self, self.run, self.record.units.get(self.output, ""))
+        run, unit = self.run, self.record.units.get(self.output, "")
+        lines = (
+            Line("measured", run.time, run.measured, MEASURED),
+            Line("free run", run.time, run.free, MODEL),
+            Line("one step", run.time, run.one_step, STEP),
+        )
+        errors = (
+            Line("free run", run.time, run.measured - run.free, MODEL),
+            Line("one step", run.time, run.measured - run.one_step, STEP),
+        )
+        in_unit = f", {unit}" if unit else ""
+        return draw_panels([Panel(f"{self.output}{in_unit}", lines), Panel(f"error{in_unit}", errors)])
 
     def to_html(self, file: str | Path) -> None:
         """Write the result with its figure as one page.
@@ -67,7 +94,7 @@ class IdentificationResult(Identification, frozen=True, kw_only=True):
             InputError: the file cannot be written.
         """
         title = f"{self.model.upper()} model of {self.output}: {self.record.name}"
-        write_page(file, title, view.identification_html(self), self.plot, self.record.name)
+        write_page(file, title, self._repr_html_(), self.plot, self.record.name)
 
 
 def identify(

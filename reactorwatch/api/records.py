@@ -10,8 +10,8 @@ import numpy as np
 
 from reactorwatch.api.files import described_process
 from reactorwatch.api.files import record as read_file
-from reactorwatch.api.views.page import write_page
-from reactorwatch.api.views.record import plot_record, record_frame, record_html
+from reactorwatch.api.page import write_page
+from reactorwatch.api.record_view import plot_record, record_frame, record_html
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import convert_to_process

@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 
 from plant_node.initial_state import complete_state
+from reactorwatch.api.record_view import plot_record, record_html
 from reactorwatch.api.records import ProcessLike, Record, measured_fields, model_of, process_of
-from reactorwatch.api.views.record import plot_record, record_html
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.impossible_values import check_values
 from reactorwatch.diagnosis.units import find_wrong_unit

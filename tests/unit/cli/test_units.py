@@ -50,7 +50,7 @@ def remarks_of(record: Record, folder: Path) -> dict[str, str]:
     """What each command says of the units."""
     path, found = folder / "a.csv", {}
     write_table(path, record)
-    job = backtest_jobs.Job(path, path, backtest_jobs.BacktestOptions(LEARNING, as_json=True), among=False)
+    job = backtest_jobs.Job(path, path, backtest_jobs.BacktestOptions(settings=LEARNING, as_json=True))
     found["backtest"] = backtest_jobs.run_job(job).remark
     for command in (["identify"], ["simulate", "-o", str(folder / "out.csv")], ["diagnose"]):
         result = CliRunner().invoke(app, [*command, str(path)])

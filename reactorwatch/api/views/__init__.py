@@ -1,1 +1,0 @@
-"""Results as HTML, figures and data frames: one file for each kind of result."""
