@@ -10,9 +10,9 @@ that are replaced as a whole. A node of many plants has one page for all (`Fleet
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import structlog
 
@@ -52,11 +52,6 @@ _STATES = {
 }
 
 
-def page_port(config: MetricsConfig, node: str) -> int | None:
-    """Port of a node's page; None: it has none."""
-    return None if config.port is None else config.port + PORT_OFFSET[node]
-
-
 class Metrics:
     """The page of a node, a collector of Prometheus' library.
 
@@ -94,60 +89,44 @@ class Metrics:
 
     def collect(self) -> "Iterator[Metric]":
         """Yield the metrics; those not known yet are left out."""
-        from prometheus_client.metrics_core import GaugeMetricFamily
+        from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 
-        if self._health is not None:
-            yield from self._of_health(self._health)
+        gauge, counter, health = GaugeMetricFamily, CounterMetricFamily, self._health
+        if health is not None:
+            yield self._family(InfoMetricFamily, "node", "The node", {"": {"version": health.version}})
+            yield self._family(gauge, "phase", "1 for what the node does now", {health.phase: 1}, "phase")
+            for name, meaning, value in (
+                ("uptime_seconds", "Since the node was started", health.uptime_s),
+                ("lag_seconds", "The longest from receipt to the end of the work on it", health.lag_ms / 1e3),
+                ("reported_timestamp_seconds", "When the node counted this", health.time_ns / 1e9),
+                ("samples_lost", "Samples whose numbers are missing so far", health.lost),
+            ):
+                yield self._family(gauge, name, meaning, {"": value})
+            for field, (name, meaning) in COUNTERS.items():
+                yield self._family(counter, name, meaning, {"": getattr(health, field)})
+            for name, meaning, counts, label in (
+                ("messages_refused", "Messages that could not be used", health.refused_by_reason, "reason"),
+                ("failures", "Errors of this software that the node contained", health.failures, "stage"),
+            ):
+                yield self._family(counter, name, meaning, dict(sorted(counts.items())), label)
         if self._by_state is not None:
-            names = [*self._labels, "state"]
-            gauge = GaugeMetricFamily(f"{PREFIX}_alarms", "Alarms in each state", labels=names)
-            for name, state in _STATES.items():
-                gauge.add_metric([*self._labels.values(), state], self._by_state[AlarmState.Value(name)])
-            yield gauge
+            by_state = {state: self._by_state[AlarmState.Value(name)] for name, state in _STATES.items()}
+            yield self._family(gauge, "alarms", "Alarms in each state", by_state, "state")
         if self._free_bytes is not None:
             try:
                 free = self._free_bytes()
             except OSError:  # the folder is gone: no number is better than a wrong one
                 return
-            yield self._gauge("disk_free_bytes", "Room on the disk of the recordings", free)
+            yield self._family(gauge, "disk_free_bytes", "Room on the disk of the recordings", {"": free})
 
-    def _of_health(self, health: Health) -> "Iterator[Metric]":
-        from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
-
-        names, values = list(self._labels), list(self._labels.values())
-        info = InfoMetricFamily(f"{PREFIX}_node", "The node", labels=names)
-        info.add_metric(values, {"version": health.version})
-        yield info
-        phase = GaugeMetricFamily(f"{PREFIX}_phase", "1 for what the node does now", labels=[*names, "phase"])
-        phase.add_metric([*values, health.phase], 1)
-        yield phase
-        yield self._gauge("uptime_seconds", "Since the node was started", health.uptime_s)
-        yield self._gauge("lag_seconds", "The longest from receipt to the end of the work on it", health.lag_ms / 1e3)
-        yield self._gauge("reported_timestamp_seconds", "When the node counted this", health.time_ns / 1e9)
-        yield self._gauge("samples_lost", "Samples whose numbers are missing so far", health.lost)
-        for field, (name, meaning) in COUNTERS.items():
-            counter = CounterMetricFamily(f"{PREFIX}_{name}", meaning, labels=names)
-            counter.add_metric(values, getattr(health, field))
-            yield counter
-        refused = CounterMetricFamily(
-            f"{PREFIX}_messages_refused", "Messages that could not be used", labels=[*names, "reason"]
-        )
-        for reason, count in sorted(health.refused_by_reason.items()):
-            refused.add_metric([*values, reason], count)
-        yield refused
-        failures = CounterMetricFamily(
-            f"{PREFIX}_failures", "Errors of this software that the node contained", labels=[*names, "stage"]
-        )
-        for stage, count in sorted(health.failures.items()):
-            failures.add_metric([*values, stage], count)
-        yield failures
-
-    def _gauge(self, name: str, meaning: str, value: float) -> "Metric":
-        from prometheus_client.metrics_core import GaugeMetricFamily
-
-        gauge = GaugeMetricFamily(f"{PREFIX}_{name}", meaning, labels=list(self._labels))
-        gauge.add_metric(list(self._labels.values()), value)
-        return gauge
+    def _family(
+        self, kind: "Callable[..., Metric]", name: str, meaning: str, values: Mapping[str, object], label: str = ""
+    ) -> "Metric":
+        """A metric with its values, by the value of a label of its own if it has one."""
+        family: Any = kind(f"{PREFIX}_{name}", meaning, labels=[*self._labels, *filter(None, [label])])
+        for of_label, value in values.items():
+            family.add_metric([*self._labels.values(), *([of_label] if label else [])], value)
+        return family
 
 
 class FleetMetrics:
@@ -217,10 +196,10 @@ def serve_metrics(config: MetricsConfig, metrics: Page, node: str) -> Iterator[P
     Raises:
         InputError: Prometheus' library is not installed, or the port cannot be listened at.
     """
-    port = page_port(config, node)
-    if port is None:
+    if config.port is None:
         yield None
         return
+    port = config.port + PORT_OFFSET[node]
     try:
         from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
     except ImportError as missing:
