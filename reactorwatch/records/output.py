@@ -166,20 +166,12 @@ def _text(head: bytes) -> str | None:
 
 
 def _is_table(head: bytes) -> bool:
-    text = (_text(head) or "").lstrip()
-    return any(separator in text.partition("\n")[0] for separator in ",;\t")
+    first_line = (_text(head) or "").lstrip().partition("\n")[0]
+    return any(separator in first_line for separator in ",;\t")
 
 
-def _is_json(head: bytes) -> bool:
-    return (_text(head) or "").lstrip()[:1] in ("{", "[")
-
-
-def _is_page(head: bytes) -> bool:
-    return (_text(head) or "").lstrip()[:1] == "<"
-
-
-def _is_text(head: bytes) -> bool:
-    return _text(head) is not None
+def _is_text_from(*starts: str) -> Callable[[bytes], bool]:
+    return lambda head: (_text(head) or "").lstrip().startswith(starts)
 
 
 def _starts_with(magic: bytes) -> Callable[[bytes], bool]:
@@ -189,10 +181,10 @@ def _starts_with(magic: bytes) -> Callable[[bytes], bool]:
 _KINDS: Mapping[str, Callable[[bytes], bool]] = {
     ".csv": _is_table,
     ".gz": _starts_with(b"\x1f\x8b"),
-    ".html": _is_page,
-    ".json": _is_json,
+    ".html": _is_text_from("<"),
+    ".json": _is_text_from("{", "["),
     ".mcap": _starts_with(b"\x89MCAP"),
-    ".md": _is_text,
+    ".md": lambda head: _text(head) is not None,
     ".parquet": _starts_with(b"PAR1"),
     ".png": _starts_with(b"\x89PNG"),
     ".rrd": _starts_with(b"RRF"),

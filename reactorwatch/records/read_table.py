@@ -102,11 +102,7 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
 
 
 def _check_names(layout: Layout, asked: Sequence[str] | None, stated: FileFormat) -> None:
-    """Check that names of columns that may be read occur once: those asked for, or all columns of numbers.
-
-    Raises:
-        InputError: one occurs more often.
-    """
+    """Check that names of columns that may be read occur once: those asked for, or all columns of numbers."""
     for name, kind in zip(layout.names, layout.kinds, strict=True):
         is_read = kind == NUMBER if asked is None else name in (*asked, stated.time)
         if is_read and layout.names.count(name) > 1:
@@ -117,11 +113,7 @@ def _check_names(layout: Layout, asked: Sequence[str] | None, stated: FileFormat
 
 
 def _find_columns(layout: Layout, signals: Sequence[SignalColumn]) -> dict[str, int | None]:
-    """Number of each signal's column; None: there is none.
-
-    Raises:
-        InputError: two signals have the same column.
-    """
+    """Number of each signal's column; None: there is none."""
     found: dict[str, int | None] = {}
     bare = [bare_name(name) for name in layout.names]
     for signal in signals:
@@ -155,11 +147,7 @@ def _check_required(layout: Layout, signals: Sequence[SignalColumn], mapped: dic
 def _sources(
     layout: Layout, signals: Sequence[SignalColumn] | None, mapped: dict[str, int | None], time: TimeColumn
 ) -> list[_Source]:
-    """Columns to be read.
-
-    Raises:
-        InputError: no signals are asked for, and no column holds numbers.
-    """
+    """Columns to be read."""
     if signals is not None:
         pairs = ((signal, mapped[signal.name]) for signal in signals)
         return [_Source(signal, column, layout.units[column]) for signal, column in pairs if column is not None]
@@ -237,11 +225,7 @@ def _describe_texts(layout: Layout, time: TimeColumn, sources: Sequence[_Source]
 def _convert(
     layout: Layout, source: _Source, values: NDArray[np.float64], notes: list[str]
 ) -> tuple[NDArray[np.float64], str]:
-    """Values in the unit of the signal, and that unit.
-
-    Raises:
-        InputError: the file's unit is one of another quantity.
-    """
+    """Values in the unit of the signal, and that unit."""
     signal = source.signal
     if not (signal.unit and source.unit) or signal.unit == source.unit:
         return values, signal.unit or source.unit

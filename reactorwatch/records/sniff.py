@@ -138,11 +138,7 @@ def _is_unlabelled_by_row(layout: Layout) -> bool:
 
 
 def _transpose(path: Path, text: bytes, separator: str, stated: FileFormat) -> Layout:
-    """Layout of a table after its rows and columns were exchanged.
-
-    Raises:
-        InputError: its rows have different numbers of cells.
-    """
+    """Layout of a table after its rows and columns were exchanged."""
     rows = [split_line(line, separator) for line in text.decode().split("\n") if line.strip()]
     if len({len(cells) for cells in rows}) > 1:
         lengths = sorted({len(cells) for cells in rows})

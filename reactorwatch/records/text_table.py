@@ -187,11 +187,7 @@ class TextTable:
         return "skip"
 
     def _refuse_row(self, error: Exception) -> NoReturn:
-        """Find the row that pyarrow cannot split.
-
-        Raises:
-            InputError: always.
-        """
+        """Find the row that pyarrow cannot split."""
         width = len(self.layout.names)
         for line, cells in self.layout.rows():
             if len(cells) != width:

@@ -162,11 +162,7 @@ def _to_clock(
     stated: FileFormat,
     note: str,
 ) -> Times:
-    """Clock time of local times: in the zone that is stated or named in the header, else in UTC.
-
-    Raises:
-        InputError: local times are ambiguous in the zone, or step back by an hour without one.
-    """
+    """Clock time of local times: in the zone that is stated or named in the header, else in UTC."""
     at = column.columns[0]
     zone = stated.zone or _zone_in_name(table.layout, column)
     if zone is not None:

@@ -213,11 +213,7 @@ def _days(year: NDArray[np.int64], month: NDArray[np.int64], day: NDArray[np.int
 def _order_day_and_month(
     year: NDArray[np.int64], first: NDArray[np.int64], second: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Month and day of dates such as 03/04/2026: months are at most 12, and a record is short.
-
-    Raises:
-        ValueError: both orders are as plausible.
-    """
+    """Month and day of dates such as 03/04/2026: months are at most 12, and a record is short."""
     if (first > 12).any() or np.array_equal(first, second):
         return second, first
     if (second > 12).any():

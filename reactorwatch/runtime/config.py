@@ -210,11 +210,7 @@ def _describe_refusal(kind: object, text: str) -> str:
 
 
 def _rename_older(kind: type[Section], name: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Values with the present names of their keys.
-
-    Raises:
-        InputError: a key is there by both names.
-    """
+    """Values with the present names of their keys."""
     renamed = dict(values)
     for older, (key, convert) in getattr(kind, "older_keys", {}).items():
         if older not in values:

@@ -70,11 +70,7 @@ class DaskExecutor:
                 yield index, worker_death(error.allowed_failures + 1) if killed else _outcome(alone)
 
     def _in_completion_order(self, client: Any, futures: list[Any]) -> Iterator[Any]:
-        """Yield futures as they complete.
-
-        Raises:
-            InputError: the cluster has lost all its workers, and no others start.
-        """
+        """Yield futures as they complete."""
         from distributed import as_completed
 
         pending = set(futures)

@@ -139,11 +139,7 @@ def _check(plants: tuple[str, ...], days: float) -> None:
 
 
 def _check_paths(folder: Path, holders: list[str]) -> None:
-    """Check, before anything is written, that every path of a site is free or of its kind.
-
-    Raises:
-        InputError: a path is taken by something else.
-    """
+    """Check, before anything is written, that every path of a site is free or of its kind."""
     for name in (AUTHORITY, ROUTER, *holders):
         home = folder / name
         for path in (folder, home.parent, home):
@@ -155,11 +151,7 @@ def _check_paths(folder: Path, holders: list[str]) -> None:
 
 
 def _find_plants(folder: Path) -> list[str]:
-    """Names of the plants with a folder in a site.
-
-    Raises:
-        InputError: a folder of another name holds a role.
-    """
+    """Names of the plants with a folder in a site."""
     plants = []
     for holder in sorted(folder.glob("*/*")):
         plant = holder.parent.name
@@ -178,11 +170,7 @@ def _has_certificates(folder: Path, there: list[str]) -> bool:
 
 
 def _update_register(folder: Path, there: list[str], endpoint: str | None, listen: str | None) -> Register:
-    """The register of the site with the given addresses.
-
-    Raises:
-        InputError: the site's authority or its register is missing, or an address is malformed.
-    """
+    """The register of the site with the given addresses."""
     home = folder / AUTHORITY
     is_old = _has_certificates(folder, there)
     if is_old and not (home / KEY).exists():
@@ -325,11 +313,7 @@ LAST_PORT = 65535
 
 
 def _parse_host(endpoint: str) -> str:
-    """Host of an address.
-
-    Raises:
-        InputError: it is no address for TLS.
-    """
+    """Host of an address."""
     match = _ADDRESS.fullmatch(endpoint)
     if match is None or not 1 <= int(match["port"]) <= LAST_PORT:
         raise InputError(
