@@ -18,8 +18,8 @@ _BRACKETED = re.compile(r"\s*[\[(]([^\[\]()]+)[\])]\s*$")
 _LABELLED = re.compile(r"\s+(?:/|in)\s+([^\s\[\]]+)\s*$")
 """A unit after a name, as ISO 80000-1 writes it in tables (`T / K`), and in words."""
 
-
 COMMENT = re.compile(rb"^[ \t]*(?:#(?!N/A|NV\b|DIV/0!|[A-Z]+[!?])|%|//)[^\n]*", re.MULTILINE)
+"""A comment without its line end: it is replaced by a blank line, so that line numbers stay."""
 
 
 @dataclass(frozen=True)
@@ -107,11 +107,6 @@ def blank_repeats(layout: Layout) -> tuple[bytes, int]:
     if not repeats:
         return layout.text, 0
     return b"\n".join(head) + rest.replace(b"\n" + header + b"\n", b"\n\n"), repeats
-
-
-def blank_comments(text: bytes) -> bytes:
-    """Text with blank lines in place of comments, so that line numbers stay."""
-    return COMMENT.sub(b"", text)
 
 
 def bare_name(name: str) -> str:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.cells import NUMBER, find_sentinels, kind_of, to_numbers
-from reactorwatch.records.layout import Layout, blank_comments, blank_repeats, describe_separator, is_remark
+from reactorwatch.records.layout import COMMENT, Layout, blank_repeats, describe_separator, is_remark
 
 BLOCK_BYTES = 1 << 22
 _MISSING_CURE = "--missing {} reads it as not measured"
@@ -57,7 +57,7 @@ class TextTable:
             self._table = self._parse(dict.fromkeys(map(str, numbers), pa.float64()), texts)
         except pa.ArrowInvalid:  # some cells are no plain numbers, a row is too short, or there are comments
             text, self._repeats = blank_repeats(layout)
-            self.layout = replace(layout, text=blank_comments(text))
+            self.layout = replace(layout, text=COMMENT.sub(b"", text))
             self._body = _body(self.layout)
             self._table = self._parse({}, [*numbers, *texts])
         self._sentinels = find_sentinels(layout.missing)

@@ -25,17 +25,17 @@ time zeit t ts tstamp timestamp datetime date datum uhrzeit zeitstempel zeitpunk
 horodatage fecha hora tiempo tempo seconds minutes hours sekunden minuten stunden x_value"""
 _INDEX_NAMES = "index idx sample samples row rows nr no n i k step steps id # zeile schritt"
 _TIME_WORDS, _INDEX_WORDS = frozenset(_TIME_NAMES.split()), frozenset(_INDEX_NAMES.split())
-_UNIT_WORDS = {
-    "ns": ("ns",),
-    "us": ("us", "µs"),
-    "ms": ("ms", "msec", "millis", "milliseconds"),
-    "s": ("s", "sec", "secs", "second", "seconds", "sek", "sekunden"),
-    "min": ("min", "mins", "minute", "minutes", "minuten"),
-    "h": ("h", "hr", "hrs", "hour", "hours", "std", "stunden"),
-    "d": ("d", "day", "days", "tage"),
-}
+_UNIT_WORDS = (
+    "ns",
+    "us µs",
+    "ms msec millis milliseconds",
+    "s sec secs second seconds sek sekunden",
+    "min mins minute minutes minuten",
+    "h hr hrs hour hours std stunden",
+    "d day days tage",
+)
+_UNIT_OF = {word: words.split()[0] for words in _UNIT_WORDS for word in words.split()}
 PLAIN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_UNIT_OF = {word: unit for unit, words in _UNIT_WORDS.items() for word in words}
 _EPOCHS = {
     1.0: (6.3e8, 4.2e9),
     1e-3: (6.3e11, 4.2e12),

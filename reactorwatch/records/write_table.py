@@ -4,7 +4,6 @@ import csv
 import gzip
 import io
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -78,10 +77,6 @@ def _clock_texts(record: Record) -> list[str]:
     return [f"{text}Z" for text in times.astype("datetime64[ns]").astype(f"datetime64[{unit}]").astype(str).tolist()]
 
 
-def _rows(columns: dict[str, list[Any]]) -> Iterable[tuple[Any, ...]]:
-    return zip(*columns.values(), strict=True)
-
-
 def _write_text(path: Path, record: Record, clock: bool, *, compress: bool = False) -> None:
     columns = _columns(record, clock)
     with atomic_write(path) as temporary, temporary.open("wb") as file:
@@ -89,7 +84,7 @@ def _write_text(path: Path, record: Record, clock: bool, *, compress: bool = Fal
         with io.TextIOWrapper(packed, encoding="utf-8", newline="") as text:
             writer = csv.writer(text, lineterminator="\n")  # writes a float as its repr, which reads back exactly
             writer.writerow(columns)
-            writer.writerows(_rows(columns))
+            writer.writerows(zip(*columns.values(), strict=True))
 
 
 def _write_workbook(path: Path, record: Record, clock: bool) -> None:
@@ -101,7 +96,7 @@ def _write_workbook(path: Path, record: Record, clock: bool) -> None:
     book = openpyxl.Workbook(write_only=True)
     sheet = book.create_sheet("record")
     sheet.append(list(columns))
-    for row in _rows(columns):
+    for row in zip(*columns.values(), strict=True):
         sheet.append(row)
     with atomic_write(path) as temporary:
         book.save(temporary)
