@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.errors import InputError, hint_at_closest
+from reactorwatch.errors import InputError
 from reactorwatch.records.cells import NUMBER
 from reactorwatch.records.file_format import SECONDS, FileFormat
 from reactorwatch.records.layout import Layout, bare_name
@@ -36,13 +36,8 @@ _UNIT_WORDS = (
 )
 _UNIT_OF = {word: words.split()[0] for words in _UNIT_WORDS for word in words.split()}
 PLAIN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_EPOCHS = {
-    1.0: (6.3e8, 4.2e9),
-    1e-3: (6.3e11, 4.2e12),
-    1e-6: (6.3e14, 4.2e15),
-    1e-9: (6.3e17, 4.2e18),
-}
-"""Smallest and largest Unix times of 1990 to 2100, by their unit in seconds."""
+_EPOCH_S, _EPOCH_UNITS_S = (6.3e8, 4.2e9), (1.0, 1e-3, 1e-6, 1e-9)
+"""Smallest and largest Unix times of 1990 to 2100, and their units in seconds."""
 _SERIAL_DAYS, _SERIAL_ZERO, _SERIAL_STEP = (32_874, 73_050), 25_569, 0.05
 """Days of a spreadsheet from 1990 to 2100, that of 1970, and steps that are shorter than those of other numbers."""
 
@@ -78,7 +73,11 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
     if stated.period is not None:
         return TimeColumn(())
     if stated.time is not None:
-        return _describe(layout, find_column(layout, stated.time, "--time"), stated)
+        column = layout.find(stated.time)
+        if column is None:
+            found = f"expected a column {stated.time!r} (--time), got {layout.describe_names(stated.time)}"
+            raise InputError(f"{layout.path}, row {layout.header_row or 1}: {found}")
+        return _describe(layout, column, stated)
     for name, unit in STANDARD.items():
         if name in layout.names and (column := layout.names.index(name)) not in taken:
             if stated.time_unit is not None or stated.time_format is not None:
@@ -110,21 +109,6 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
     if not found:
         _refuse_without_time(layout, taken)
     return found[0]
-
-
-def find_column(layout: Layout, name: str, option: str) -> int:
-    """Number of a column by its header, its name without unit, or its number from 1.
-
-    Raises:
-        InputError: there is none, or several.
-    """
-    for names in (layout.names, [bare_name(each) for each in layout.names]):
-        if names.count(name) == 1:
-            return names.index(name)
-    if name.isdigit() and 1 <= int(name) <= len(layout.names):
-        return int(name) - 1
-    found = ", ".join(map(repr, layout.names)) + hint_at_closest(name, map(bare_name, layout.names))
-    raise InputError(f"{layout.path}, row {layout.header_row or 1}: expected a column {name!r} ({option}), got {found}")
 
 
 def _describe(layout: Layout, column: int, stated: FileFormat) -> TimeColumn:
@@ -184,8 +168,12 @@ def find_epoch(layout: Layout, item: TimeColumn, values: NDArray[np.float64]) ->
     if item.is_standard or not usable.size:
         return None
     low, high = float(usable.min()), float(usable.max())
-    for unit_s, (least, most) in _EPOCHS.items():
-        if least <= low and high <= most and (not item.unit or SECONDS[item.unit] == unit_s):
+    for unit_s in _EPOCH_UNITS_S:
+        if (
+            _EPOCH_S[0] <= low * unit_s
+            and high * unit_s <= _EPOCH_S[1]
+            and (not item.unit or SECONDS[item.unit] == unit_s)
+        ):
             return Epoch("seconds since 1970", unit_s)
     is_dated = "dat" in layout.names[item.columns[0]].lower()
     is_dense = usable.size > 1 and float(np.abs(np.diff(usable)).max()) < _SERIAL_STEP

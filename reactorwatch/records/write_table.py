@@ -1,4 +1,4 @@
-"""Write a record as a table: CSV, compressed CSV, workbook or Parquet, by the file's suffix."""
+"""Write a record as a table: CSV, compressed CSV, workbook or Parquet, by the file's suffix; or a data frame."""
 
 import csv
 import gzip
@@ -109,3 +109,20 @@ def _write_parquet(path: Path, record: Record, clock: bool) -> None:
     table = pa.table(_columns(record, clock))
     with atomic_write(path) as temporary:
         pyarrow.parquet.write_table(table, temporary)
+
+
+def write_frame(frame: Any, path: Path) -> Path:
+    """Write a data frame (pandas, polars, Arrow) as a Parquet file; returns its path.
+
+    Raises:
+        InputError: the frame has columns that are no plain values.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet
+
+    try:
+        pyarrow.parquet.write_table(pa.table(frame), path)
+    except (pa.ArrowException, TypeError) as error:
+        reason = str(error).partition("\n")[0]
+        raise InputError(f"data frame: expected columns of plain values: {reason}") from error
+    return path

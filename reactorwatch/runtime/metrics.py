@@ -12,7 +12,7 @@ that are replaced as a whole. A node of many plants has one page for all (`Fleet
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import structlog
 
@@ -174,11 +174,7 @@ class FleetMetrics:
         yield from merged.values()
 
 
-class _Page(Protocol):
-    def collect(self) -> "Iterator[Metric]": ...
-
-
-Page = TypeVar("Page", bound=_Page)
+Page = TypeVar("Page", Metrics, FleetMetrics)
 
 
 @contextmanager

@@ -9,19 +9,16 @@ that worker, so a job that it gives up gets a last run when it has the cluster t
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any
 
 from reactorwatch import __version__
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.parallel.jobs import Failed, internal_error, one_line, run_job, worker_death
+from reactorwatch.runtime.parallel.jobs import Failed, Job, Result, internal_error, one_line, run_job, worker_death
 
 CONNECT_WITHIN_S = 10.0
 WORKERS_WITHIN_S = 60.0  # a worker on a busy machine takes half a minute to start
 
 ASK_AGAIN_S = 0.2
-
-Job = TypeVar("Job")
-Result = TypeVar("Result")
 
 
 class DaskExecutor:
