@@ -157,7 +157,7 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
     plain = msgspec.json.format(
         msgspec.json.encode(report_object(diagnosis, str(case.file), seconds, case.measured.zero)), indent=2
     )
-    with fill_folder(folder, "--out") as temporary:
+    with fill_folder(folder) as temporary:
         write_extended_model(temporary / MODEL, diagnosis.extended_model)
         if diagnosis.experiment is not None:
             _write_experiment(diagnosis.experiment, temporary / EXPERIMENT)

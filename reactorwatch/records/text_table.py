@@ -17,11 +17,7 @@ _MISSING_CURE = "--missing {} reads it as not measured"
 
 
 def _to_numpy(cells: Any) -> NDArray[np.float64]:
-    """Values of a pyarrow column of numbers, NaN where null. Its `to_numpy` would import pandas, which takes long.
-
-    Args:
-        cells: pyarrow chunks of doubles, shape (rows,) together.
-    """
+    """Values of a pyarrow column of numbers, NaN where null. Its `to_numpy` would import pandas, which takes long."""
     values, begin = np.empty(len(cells)), 0
     for chunk in cells.chunks:
         valid, stored = chunk.buffers()

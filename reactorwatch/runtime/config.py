@@ -195,12 +195,7 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
 
 
 def _describe_refusal(kind: object, text: str) -> str:
-    """Describe an invalid word by the setting and the valid words; any other message of msgspec is returned as given.
-
-    Args:
-        kind: class of the settings.
-        text: message of msgspec, such as "Invalid enum value 'fast' - at `$.start`".
-    """
+    """Describe an invalid word by the setting and the valid words; other messages of msgspec stay as they are."""
     rule, _, path = text.partition(" - at ")
     words = valid_choices(kind, path.strip("`")) if rule.startswith(_NO_CHOICE) else ()
     if not words:
