@@ -6,6 +6,7 @@ its suffix is replaced only with `--force`.
 
 import re
 import stat
+from codecs import getincrementaldecoder
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
@@ -16,8 +17,6 @@ _FILE_SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,6}")
 """A new folder has no such suffix, which looks like that of a file."""
 
 _HEAD_BYTES = 65_536
-_PARTS = 4
-"""Most bytes of a UTF-8 character; the last one of a head may be incomplete."""
 
 
 def check_output_file(path: Path, sources: Iterable[Path | None] = (), *, force: bool = False) -> Path:
@@ -156,13 +155,12 @@ def _matches_suffix(path: Path) -> bool:
 
 def _text(head: bytes) -> str | None:
     """Decode the start of a file; None if it is no text."""
-    for cut in range(_PARTS if len(head) == _HEAD_BYTES else 1):
-        try:
-            text = head[: len(head) - cut].decode("utf-8-sig")
-        except UnicodeDecodeError:
-            continue
-        return None if "\0" in text else text
-    return None
+    decoder = getincrementaldecoder("utf-8-sig")()
+    try:
+        text = decoder.decode(head, final=len(head) < _HEAD_BYTES)  # else the last character may be incomplete
+    except UnicodeDecodeError:
+        return None
+    return None if "\0" in text else text
 
 
 def _is_table(head: bytes) -> bool:

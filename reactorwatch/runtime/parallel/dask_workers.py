@@ -8,7 +8,6 @@ that worker, so a job that it gives up gets a last run when it has the cluster t
 
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
 from typing import Any
 
 from reactorwatch import __version__
@@ -48,9 +47,14 @@ class DaskExecutor:
         Raises:
             InputError: there is no scheduler, it has no workers, or they have another version of this software.
         """
+        from distributed import Client
         from distributed.scheduler import KilledWorker
 
-        with _client(self._address) as client:
+        try:
+            connection = Client(self._address, timeout=CONNECT_WITHIN_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise InputError(f"--scheduler {self._address}: cannot be reached: {one_line(error)}") from error
+        with connection as client:
             _check_workers(client, self._address)
             indices = {client.submit(run_job, work, job, pure=False): index for index, job in enumerate(jobs)}
             suspects: list[int] = []
@@ -86,18 +90,6 @@ def _outcome(future: Any) -> Any:
     if error is not None:  # no error of the job, those are results: it could not be sent or read
         return internal_error(error)
     return future.result()
-
-
-@contextmanager
-def _client(address: str) -> Iterator[Any]:
-    from distributed import Client
-
-    try:
-        client = Client(address, timeout=CONNECT_WITHIN_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"--scheduler {address}: cannot be reached: {one_line(error)}") from error
-    with client:
-        yield client
 
 
 def _check_workers(client: Any, address: str) -> None:
