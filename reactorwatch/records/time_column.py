@@ -73,11 +73,11 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
     if stated.period is not None:
         return TimeColumn(())
     if stated.time is not None:
-        column = layout.find(stated.time)
-        if column is None:
-            found = f"expected a column {stated.time!r} (--time), got {layout.describe_names(stated.time)}"
-            raise InputError(f"{layout.path}, row {layout.header_row or 1}: {found}")
-        return _describe(layout, column, stated)
+        asked = layout.find(stated.time)
+        if asked is None:
+            rule = f"expected a column {stated.time!r} (--time), got {layout.describe_names(stated.time)}"
+            raise InputError(f"{layout.path}, row {layout.header_row or 1}: {rule}")
+        return _describe(layout, asked, stated)
     for name, unit in STANDARD.items():
         if name in layout.names and (column := layout.names.index(name)) not in taken:
             if stated.time_unit is not None or stated.time_format is not None:
@@ -98,10 +98,8 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
     ]
     found = [*stamps, *(item for item in named if _increases(layout, item))]
     if not found:
-        numbers = [item for item in candidates if layout.kinds[item.columns[0]] == NUMBER and _increases(layout, item)]
-        found = [
-            item for item in numbers if find_epoch(layout, item, sample_values(layout, item.columns[0])) is not None
-        ]
+        numbers = [item for item in candidates if _increases(layout, item)]
+        found = [item for item in numbers if find_epoch(layout, item, sample_values(layout, item.columns[0]))]
         found = found or [item for item in numbers if counts_rows(layout, item.columns[0])] or named
     if len(found) > 1:
         names = ", ".join(repr(layout.names[item.columns[0]]) for item in found)

@@ -155,15 +155,10 @@ class Metrics:
             yield self._family(gauge, "disk_free_bytes", "Room on the disk of the recordings", room)
 
     def _family(
-        self,
-        kind: "Callable[..., Metric]",
-        name: str,
-        meaning: str,
-        values: Iterable[tuple[str, str, object]],
-        label: str = "",
-    ) -> "Metric":
+        self, kind: Any, name: str, meaning: str, values: Iterable[tuple[str, str, object]], label: str = ""
+    ) -> Any:
         """A metric with its values, each by its plant and by the value of a label of its own if it has one."""
-        family: Any = kind(f"{PREFIX}_{name}", meaning, labels=["plant", "node", *filter(None, [label])])
+        family = kind(f"{PREFIX}_{name}", meaning, labels=["plant", "node", *filter(None, [label])])
         for plant, own, value in values:
             family.add_metric([plant, self.node, *([own] if label else [])], value)
         return family

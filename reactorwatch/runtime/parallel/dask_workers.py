@@ -52,8 +52,9 @@ class DaskExecutor:
 
         try:
             connection = Client(self._address, timeout=CONNECT_WITHIN_S, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise InputError(f"--scheduler {self._address}: cannot be reached: {one_line(error)}") from error
+        except (OSError, ValueError) as unreachable:
+            text = one_line(unreachable)
+            raise InputError(f"--scheduler {self._address}: cannot be reached: {text}") from unreachable
         with connection as client:
             _check_workers(client, self._address)
             indices = {client.submit(run_job, work, job, pure=False): index for index, job in enumerate(jobs)}
