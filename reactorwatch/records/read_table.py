@@ -70,10 +70,9 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
     long = find_long_format(layout, stated, asked)
     if long is not None:
         return _read_long(layout, long, signals, stated, notes)
-    mapped = _find_columns(layout, signals) if signals is not None else {}
+    mapped = _find_columns(layout, signals or ())
     time = choose_time(layout, stated, [column for column in mapped.values() if column is not None])
-    if signals is not None:
-        _check_required(layout, signals, mapped)
+    _check_required(layout, signals or (), mapped)
     sources = _sources(layout, signals, mapped, time)
     texts = [column for signal, column in sources if _is_coded(layout, signal, column)]
     run = layout.names.index(RUN) if RUN in layout.names and RUN not in asked else None
@@ -205,12 +204,8 @@ def _make_record(
 
 def _describe_texts(layout: Layout, time: TimeColumn, sources: Sequence[tuple[SignalColumn, int]]) -> list[str]:
     used = {*time.columns, *(column for _, column in sources)}
-    texts = [
-        layout.names[column]
-        for column in range(len(layout.names))
-        if column not in used and layout.kinds[column] == TEXT
-    ]
-    return [f"text left out: {', '.join(f'`{name}`' for name in texts)}"] if texts else []
+    unused = [column for column, kind in enumerate(layout.kinds) if kind == TEXT and column not in used]
+    return [f"text left out: {', '.join(f'`{layout.names[column]}`' for column in unused)}"] if unused else []
 
 
 def _convert(
