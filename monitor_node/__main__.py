@@ -224,14 +224,15 @@ def run(
     node = MonitorNode(config, time.time_ns())
     config = node.config
     node.preparation = stage.preparation(config, node.equations)
-    with serve_metrics(metrics_config, Metrics(config.plant, NODE), NODE) as metrics, stop_on_signals() as stop:
+    page = Metrics(NODE, {config.plant: node.alarms.all_alarms})
+    with serve_metrics(metrics_config, page) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:
             return
         try:
             length = config.training_length
             log.info("listening", plant=config.plant, training_min=length.minutes, training_rows=length.rows or None)
-            on_publish = metrics.observe(node.alarms.all_alarms) if metrics is not None else None
+            on_publish = metrics.on_publish if metrics is not None else None
             loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
             # All samples published since the state was stored, however long ago; the node skips those it knows.
             history_s = inf if node.resumed else 0.0

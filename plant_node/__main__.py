@@ -45,7 +45,7 @@ def run(
     """
     plant = plant_from(config, process, driver)
     log.info("plant", seed=config.seed, settings=msgspec.to_builtins(config))
-    with serve_metrics(metrics_config, Metrics(config.name, NODE), NODE) as metrics, stop_on_signals() as stop:
+    with serve_metrics(metrics_config, Metrics(NODE, {config.name: None})) as metrics, stop_on_signals() as stop:
         bus = connect(bus_config, NODE, stop)
         if bus is None:
             return
@@ -55,7 +55,7 @@ def run(
                 config,
                 bus,
                 stop,
-                metrics.observe() if metrics is not None else None,
+                metrics.on_publish if metrics is not None else None,
             )
         finally:
             bus.close()

@@ -76,7 +76,8 @@ def record(
     if names.dated and not names.folder.suffix[1:].isalpha():  # run.csv is a file of another kind, not a folder's name
         make_folder(names.folder, "--out")
     files = open_files(config)
-    with serve_metrics(metrics_config, Metrics(config.plant, NODE, files.free_bytes), NODE) as metrics:
+    page = Metrics(NODE, {config.plant: lambda: node.alarms()}, files.free_bytes)
+    with serve_metrics(metrics_config, page) as metrics:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:
             return None
@@ -86,7 +87,7 @@ def record(
                 history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
                 fingerprints = files.fingerprints_since(start_ns - history_ns)
                 node = start_node(config, files, start_ns, fingerprints, fingerprints_until_ns=start_ns + history_ns)
-                on_publish = metrics.observe(node.alarms) if metrics is not None else None
+                on_publish = metrics.on_publish if metrics is not None else None
                 loop = EventLoop(node, bus, stop, drain_timeout_s=config.linger_s, on_publish=on_publish)
                 loop.subscribe(config.key_expression, history_s=bus_config.history_s, on_gap=node.on_gap)
                 loop.accept_commands(*(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS))

@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
+from typing import Unpack
 
 from google.protobuf.message import Message
 
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.keys import matches
-from reactorwatch.runtime.bus import Request
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.bus import Request, SubscribeOptions
 
 
 @dataclass(frozen=True)
@@ -59,37 +59,20 @@ class MemoryBus:
                 handler(message)
 
     def subscribe(
-        self,
-        key_expression: str,
-        handler: Callable[[Encoded], None],
-        *,
-        on_gap: Callable[[Gap], None] | None = None,
-        history_s: float = 0.0,
-        on_history_end: Callable[[], None] | None = None,
+        self, key_expression: str, handler: Callable[[Encoded], None], **options: Unpack[SubscribeOptions]
     ) -> None:
         """See `Bus`; nothing is lost here, and nothing cached."""
         with self._exchange.lock:
             self._exchange.subscriptions.append((self, key_expression, handler))
+        on_history_end = options.get("on_history_end")
         if on_history_end is not None:
             on_history_end()
 
     def subscribe_batched(
-        self,
-        key_expression: str,
-        handler: Callable[[list[Encoded]], None],
-        *,
-        on_gap: Callable[[Gap], None] | None = None,
-        history_s: float = 0.0,
-        on_history_end: Callable[[], None] | None = None,
+        self, key_expression: str, handler: Callable[[list[Encoded]], None], **options: Unpack[SubscribeOptions]
     ) -> None:
         """See `Bus`; here each batch is one message."""
-        self.subscribe(
-            key_expression,
-            lambda message: handler([message]),
-            on_gap=on_gap,
-            history_s=history_s,
-            on_history_end=on_history_end,
-        )
+        self.subscribe(key_expression, lambda message: handler([message]), **options)
 
     def flush_deliveries(self) -> None:
         """See `Bus`."""

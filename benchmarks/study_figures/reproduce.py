@@ -74,7 +74,7 @@ def reproduce(
     require_matplotlib()
     check_output_folder(check_output_folder(out) / FOLDER)
     found: list[tuple[Figure, Finding]] = []
-    with fill_folder(out, "--out") as folder:
+    with fill_folder(out) as folder:
         pictures = make_folder(folder / FOLDER).absolute()
         jobs = [Job(figure.key, pictures / figure.file_name, seed, measured, data) for figure in figures]
         with results_in_order(draw, jobs, "reproducing", processes, scheduler) as findings:

@@ -37,7 +37,7 @@ from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
-from reactorwatch.runtime.metrics import FleetMetrics, serve_metrics
+from reactorwatch.runtime.metrics import Metrics, serve_metrics
 from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
 
 log = structlog.get_logger()
@@ -85,7 +85,7 @@ class FleetNode(FleetMonitor):
         bus: Bus,
         start_ns: int,
         states: FleetStates | None = None,
-        metrics: FleetMetrics | None = None,
+        metrics: Metrics | None = None,
     ) -> None:
         self._bus, self.metrics = bus, metrics
         self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
@@ -398,7 +398,7 @@ def run(
     kinds = (*load_kinds(config, fleet), PlantKind(ANY, *load_process(config)))
     WatchedKinds(kinds, 0, points=fleet.points).prepare()
     states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
-    with serve_metrics(metrics_config, FleetMetrics(NODE), NODE) as metrics, stop_on_signals() as stop:
+    with serve_metrics(metrics_config, Metrics(NODE)) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop, uncached=UNCACHED, many_keys=True)
         if bus is None:
             return

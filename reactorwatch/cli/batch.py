@@ -278,7 +278,7 @@ def write_summary(folder: Path, rows: Sequence[Row]) -> None:
     writer.writerows(rows)
     content = {SUMMARY_OBJECT: msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n"}
     content[SUMMARY_TABLE] = table.getvalue().encode()
-    with fill_folder(folder, "--out") as temporary:
+    with fill_folder(folder) as temporary:
         for name, text in content.items():
             with atomic_write(temporary / name) as file:
                 file.write_bytes(text)

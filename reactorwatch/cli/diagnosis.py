@@ -92,7 +92,7 @@ def write_report(found: DiagnosisResult, file: Path, folder: Path, asked: Diagno
     page = as_page(found, found.model, found.effects, *files, origin=report_origin(file, settings))
     report = report_object(found, str(file), found.seconds, found.zero)
     plain = msgspec.json.format(msgspec.json.encode(report), indent=2)
-    with fill_folder(folder, "--out") as temporary:
+    with fill_folder(folder) as temporary:
         write_extended_model(temporary / MODEL, found.extended_model)
         if found.experiment is not None:
             _write_experiment(found.experiment, temporary / EXPERIMENT)

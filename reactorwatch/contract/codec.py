@@ -6,7 +6,7 @@ many of them as an empty message.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, get_args
 
 from google.protobuf.message import DecodeError as ProtobufDecodeError
 from google.protobuf.message import Message
@@ -17,30 +17,6 @@ PREFIX = "application/protobuf;"
 
 MAX_PAYLOAD = 1 << 20
 """Largest payload that is decoded, in bytes; messages take less than a hundredth of it."""
-
-MESSAGES: tuple[type[Message], ...] = (
-    messages.Sample,
-    messages.Estimate,
-    messages.ModelSnapshot,
-    messages.ChartPoint,
-    messages.Alarm,
-    messages.AlarmKpis,
-    messages.Reconstruction,
-    messages.Baseline,
-    messages.Promise,
-    messages.Health,
-    messages.Fault,
-    messages.Audit,
-    messages.SetInput,
-    messages.InjectFault,
-    messages.ClearFault,
-    messages.AlarmCommand,
-    messages.ShelveAlarm,
-    messages.ListAlarms,
-    messages.BaselineCommand,
-    messages.ReplayCommand,
-    messages.CommandReply,
-)
 
 Body: TypeAlias = (
     messages.Sample
@@ -57,6 +33,19 @@ Body: TypeAlias = (
     | messages.Audit
 )
 """Messages that are published; each has `time_ns`."""
+
+MESSAGES: tuple[type[Message], ...] = (
+    *get_args(Body),
+    messages.SetInput,
+    messages.InjectFault,
+    messages.ClearFault,
+    messages.AlarmCommand,
+    messages.ShelveAlarm,
+    messages.ListAlarms,
+    messages.BaselineCommand,
+    messages.ReplayCommand,
+    messages.CommandReply,
+)
 
 
 class Publication(NamedTuple):

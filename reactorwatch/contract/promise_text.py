@@ -13,18 +13,10 @@ def promise_fields(promise: Promise | None) -> dict[str, Any]:
     if promise is None:
         return {"promise": None, "power": []}
     stated = {
-        "expected": _three_digits(promise.expected),
-        "expected_90": _three_digits(promise.expected_90),
-        "checked_rows": promise.checked_rows,
-        "found_in_training": promise.found_in_training,
-        "expected_in_training": _three_digits(promise.expected_in_training),
-        "kept": promise.kept,
-        "can_keep_per_30_days": _three_digits(promise.can_keep_per_30_days),
-        "text": promise.text,
-        "rows": promise.rows,
-        "found": promise.found,
-        "expected_so_far": _three_digits(promise.expected_so_far),
-        "drifted": promise.drifted,
+        name: _three_digits(value) if isinstance(value, float) else value
+        for name in Promise.DESCRIPTOR.fields_by_name
+        if name not in ("time_ns", "power")
+        for value in [getattr(promise, name)]
     }
     return {"promise": stated, "power": [_power(item) for item in promise.power]}
 

@@ -36,14 +36,10 @@ def make_folder(folder: Path, option: str = "", *, may_exist: bool = True) -> Pa
 
 
 @contextmanager
-def fill_folder(folder: Path, option: str = "") -> Iterator[Path]:
-    """Yield a temporary folder; when the block ends, its files are moved to `folder`.
+def fill_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder; when the block ends, its files are moved to `folder`, which `--out` names.
 
-    When the block raises, `folder` is unchanged and the temporary folder is removed.
-
-    Args:
-        folder: path of the folder; made if it does not exist.
-        option: see `make_folder`.
+    `folder` is made if it does not exist. When the block raises, it is unchanged and the temporary folder is removed.
 
     Raises:
         InputError: the folder cannot be made or written to.
@@ -53,10 +49,10 @@ def fill_folder(folder: Path, option: str = "") -> Iterator[Path]:
     try:
         temporary.mkdir()
     except OSError as error:
-        raise InputError(f"{f'{option} ' if option else ''}{folder}: cannot be written to: {error.strerror}") from error
+        raise InputError(f"--out {folder}: cannot be written to: {error.strerror}") from error
     try:
         yield temporary
-        make_folder(folder, option)
+        make_folder(folder, "--out")
         for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
             target = folder / file.relative_to(temporary)
             make_folder(target.parent)

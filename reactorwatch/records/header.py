@@ -92,11 +92,7 @@ class HeaderSearch:
         )
 
     def _unequal_header(self, first: int) -> list[tuple[int, list[str]]]:
-        """Header with another number of cells than the rows.
-
-        Raises:
-            InputError: the surplus cells of the rows hold values.
-        """
+        """Header with another number of cells than the rows."""
         if not first or len(self._table[first - 1][1]) == 1 or not self._is_names(self._table[first - 1][1]):
             return []
         row, names = self._table[first - 1]
@@ -168,11 +164,7 @@ class HeaderSearch:
         return row - sum(cell.count("\n") for cell in cells)
 
     def _guess_decimal(self, layout: Layout) -> str:
-        """Decimal sign, from all rows where the first ones leave it open.
-
-        Raises:
-            InputError: it stays open.
-        """
+        """Decimal sign, from all rows where the first ones leave it open."""
         found = guess_decimal([cell for cells in layout.sample for cell in cells])
         found = found or guess_decimal([cell for _, cells in layout.rows() for cell in cells])
         if found is None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, hint_at_closest
 from reactorwatch.records.cells import EMPTY, TEXT, kind_of
 from reactorwatch.units import is_unit
 
@@ -18,8 +18,8 @@ _BRACKETED = re.compile(r"\s*[\[(]([^\[\]()]+)[\])]\s*$")
 _LABELLED = re.compile(r"\s+(?:/|in)\s+([^\s\[\]]+)\s*$")
 """A unit after a name, as ISO 80000-1 writes it in tables (`T / K`), and in words."""
 
-
 COMMENT = re.compile(rb"^[ \t]*(?:#(?!N/A|NV\b|DIV/0!|[A-Z]+[!?])|%|//)[^\n]*", re.MULTILINE)
+"""A comment without its line end: it is replaced by a blank line, so that line numbers stay."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,18 @@ class Layout:
     missing: frozenset[str]
     notes: list[str] = field(default_factory=list)
     transposed: bool = False
+
+    def find(self, name: str, *, by_number: bool = True) -> int | None:
+        """Index of a column by its header, its name without unit or its number from 1; None: none, or several."""
+        for names in (list(self.names), [bare_name(each) for each in self.names]):
+            if names.count(name) == 1:
+                return names.index(name)
+        is_number = by_number and name.isdecimal() and 1 <= int(name) <= len(self.names)
+        return int(name) - 1 if is_number else None
+
+    def describe_names(self, name: str) -> str:
+        """Names of the columns, with a hint at that which is closest to a name that was not found."""
+        return ", ".join(map(repr, self.names)) + hint_at_closest(name, map(bare_name, self.names))
 
     def cells(self, column: int) -> list[str]:
         """Cells of a column in the sample."""
@@ -107,11 +119,6 @@ def blank_repeats(layout: Layout) -> tuple[bytes, int]:
     if not repeats:
         return layout.text, 0
     return b"\n".join(head) + rest.replace(b"\n" + header + b"\n", b"\n\n"), repeats
-
-
-def blank_comments(text: bytes) -> bytes:
-    """Text with blank lines in place of comments, so that line numbers stay."""
-    return COMMENT.sub(b"", text)
 
 
 def bare_name(name: str) -> str:

@@ -6,6 +6,7 @@ its suffix is replaced only with `--force`.
 
 import re
 import stat
+from codecs import getincrementaldecoder
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
@@ -16,8 +17,6 @@ _FILE_SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,6}")
 """A new folder has no such suffix, which looks like that of a file."""
 
 _HEAD_BYTES = 65_536
-_PARTS = 4
-"""Most bytes of a UTF-8 character; the last one of a head may be incomplete."""
 
 
 def check_output_file(path: Path, sources: Iterable[Path | None] = (), *, force: bool = False) -> Path:
@@ -156,30 +155,21 @@ def _matches_suffix(path: Path) -> bool:
 
 def _text(head: bytes) -> str | None:
     """Decode the start of a file; None if it is no text."""
-    for cut in range(_PARTS if len(head) == _HEAD_BYTES else 1):
-        try:
-            text = head[: len(head) - cut].decode("utf-8-sig")
-        except UnicodeDecodeError:
-            continue
-        return None if "\0" in text else text
-    return None
+    decoder = getincrementaldecoder("utf-8-sig")()
+    try:
+        text = decoder.decode(head, final=len(head) < _HEAD_BYTES)  # else the last character may be incomplete
+    except UnicodeDecodeError:
+        return None
+    return None if "\0" in text else text
 
 
 def _is_table(head: bytes) -> bool:
-    text = (_text(head) or "").lstrip()
-    return any(separator in text.partition("\n")[0] for separator in ",;\t")
+    first_line = (_text(head) or "").lstrip().partition("\n")[0]
+    return any(separator in first_line for separator in ",;\t")
 
 
-def _is_json(head: bytes) -> bool:
-    return (_text(head) or "").lstrip()[:1] in ("{", "[")
-
-
-def _is_page(head: bytes) -> bool:
-    return (_text(head) or "").lstrip()[:1] == "<"
-
-
-def _is_text(head: bytes) -> bool:
-    return _text(head) is not None
+def _is_text_from(*starts: str) -> Callable[[bytes], bool]:
+    return lambda head: (_text(head) or "").lstrip().startswith(starts)
 
 
 def _starts_with(magic: bytes) -> Callable[[bytes], bool]:
@@ -189,10 +179,10 @@ def _starts_with(magic: bytes) -> Callable[[bytes], bool]:
 _KINDS: Mapping[str, Callable[[bytes], bool]] = {
     ".csv": _is_table,
     ".gz": _starts_with(b"\x1f\x8b"),
-    ".html": _is_page,
-    ".json": _is_json,
+    ".html": _is_text_from("<"),
+    ".json": _is_text_from("{", "["),
     ".mcap": _starts_with(b"\x89MCAP"),
-    ".md": _is_text,
+    ".md": lambda head: _text(head) is not None,
     ".parquet": _starts_with(b"PAR1"),
     ".png": _starts_with(b"\x89PNG"),
     ".rrd": _starts_with(b"RRF"),

@@ -47,15 +47,6 @@ class SignalColumn:
     required: bool = True
 
 
-@dataclass(frozen=True)
-class _Source:
-    """Column of a signal in the file, and the unit that the file states for it."""
-
-    signal: SignalColumn
-    column: int
-    unit: str
-
-
 def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated: FileFormat = GUESS) -> Record:
     """Read a record.
 
@@ -79,19 +70,18 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
     long = find_long_format(layout, stated, asked)
     if long is not None:
         return _read_long(layout, long, signals, stated, notes)
-    mapped = _find_columns(layout, signals) if signals is not None else {}
+    mapped = _find_columns(layout, signals or ())
     time = choose_time(layout, stated, [column for column in mapped.values() if column is not None])
-    if signals is not None:
-        _check_required(layout, signals, mapped)
+    _check_required(layout, signals or (), mapped)
     sources = _sources(layout, signals, mapped, time)
-    texts = [source.column for source in sources if _is_coded(layout, source)]
+    texts = [column for signal, column in sources if _is_coded(layout, signal, column)]
     run = layout.names.index(RUN) if RUN in layout.names and RUN not in asked else None
     stamps = time.columns if time.pattern is not None else ()
     table = TextTable(
         layout,
         [
             *(time.columns if time.pattern is None else ()),
-            *(item.column for item in sources if item.column not in texts),
+            *(column for _, column in sources if column not in texts),
         ],
         [*stamps, *texts, *([] if run is None else [run])],
     )
@@ -102,11 +92,7 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
 
 
 def _check_names(layout: Layout, asked: Sequence[str] | None, stated: FileFormat) -> None:
-    """Check that names of columns that may be read occur once: those asked for, or all columns of numbers.
-
-    Raises:
-        InputError: one occurs more often.
-    """
+    """Check that names of columns that may be read occur once: those asked for, or all columns of numbers."""
     for name, kind in zip(layout.names, layout.kinds, strict=True):
         is_read = kind == NUMBER if asked is None else name in (*asked, stated.time)
         if is_read and layout.names.count(name) > 1:
@@ -117,18 +103,10 @@ def _check_names(layout: Layout, asked: Sequence[str] | None, stated: FileFormat
 
 
 def _find_columns(layout: Layout, signals: Sequence[SignalColumn]) -> dict[str, int | None]:
-    """Number of each signal's column; None: there is none.
-
-    Raises:
-        InputError: two signals have the same column.
-    """
+    """Number of each signal's column; None: there is none."""
     found: dict[str, int | None] = {}
-    bare = [bare_name(name) for name in layout.names]
     for signal in signals:
-        name = signal.column or signal.name
-        known = next((names for names in (layout.names, bare) if names.count(name) == 1), None)
-        number = int(name) - 1 if signal.column and name.isdecimal() and 1 <= int(name) <= len(bare) else None
-        column = list(known).index(name) if known is not None else number
+        column = layout.find(signal.column or signal.name, by_number=bool(signal.column))
         other = next((item for item, taken in found.items() if taken == column), None)
         if column is not None and other is not None:
             raise InputError(
@@ -144,25 +122,20 @@ def _check_required(layout: Layout, signals: Sequence[SignalColumn], mapped: dic
         if signal.required and mapped[signal.name] is None:
             asked = signal.column or signal.name
             named = f" (for {signal.name})" if asked != signal.name else ""
-            found = ", ".join(map(repr, layout.names)) + hint_at_closest(asked, map(bare_name, layout.names))
             cure = shlex.quote(f"{signal.name}=NAME")
             raise MissingColumnError(
                 f"{layout.path}, row {layout.header_row or layout.first_row}: expected a column {asked!r} in the header"
-                f"{named}, got {found}; --column {cure} names another"
+                f"{named}, got {layout.describe_names(asked)}; --column {cure} names another"
             )
 
 
 def _sources(
     layout: Layout, signals: Sequence[SignalColumn] | None, mapped: dict[str, int | None], time: TimeColumn
-) -> list[_Source]:
-    """Columns to be read.
-
-    Raises:
-        InputError: no signals are asked for, and no column holds numbers.
-    """
+) -> list[tuple[SignalColumn, int]]:
+    """Signals to be read, and their columns."""
     if signals is not None:
         pairs = ((signal, mapped[signal.name]) for signal in signals)
-        return [_Source(signal, column, layout.units[column]) for signal, column in pairs if column is not None]
+        return [(signal, column) for signal, column in pairs if column is not None]
     bare = [bare_name(name) for name in layout.names]
     sources = []
     for column, name in enumerate(layout.names):
@@ -171,7 +144,7 @@ def _sources(
         if column in time.columns or name == RUN or is_unnamed or layout.kinds[column] not in (NUMBER, EMPTY):
             continue
         own = bare[column] if bare.count(bare[column]) == 1 else name
-        sources.append(_Source(SignalColumn(own), column, layout.units[column]))
+        sources.append((SignalColumn(own), column))
     if not sources:
         raise InputError(
             f"{layout.path}, row {layout.first_row}: expected columns of numbers, got only text in "
@@ -180,31 +153,36 @@ def _sources(
     return sources
 
 
-def _is_coded(layout: Layout, source: _Source) -> bool:
-    return source.signal.role in ("mode", "label") and layout.kinds[source.column] == TEXT
+def _is_coded(layout: Layout, signal: SignalColumn, column: int) -> bool:
+    return signal.role in ("mode", "label") and layout.kinds[column] == TEXT
 
 
 def _make_record(
-    table: TextTable, time: TimeColumn, times: Times, sources: Sequence[_Source], run: int | None, notes: list[str]
+    table: TextTable,
+    time: TimeColumn,
+    times: Times,
+    sources: Sequence[tuple[SignalColumn, int]],
+    run: int | None,
+    notes: list[str],
 ) -> Record:
     layout = table.layout
     columns, units = {}, {}
     notes = [*notes, *times.notes]
-    for source in sources:
-        name = source.signal.name
-        if _is_coded(layout, source):
-            cells = table.texts(source.column).dictionary_encode()
+    for signal, column in sources:
+        name = signal.name
+        if _is_coded(layout, signal, column):
+            cells = table.texts(column).dictionary_encode()
             words = cells.dictionary.to_pylist()
             codes = np.array([np.nan if word.strip() in layout.missing else code for code, word in enumerate(words)])
             columns[name] = codes[np.asarray(cells.indices)]
             known = (f"{word} = {code:g}" for word, code in zip(words, codes, strict=True) if not np.isnan(code))
             notes.append(f"{name}: {', '.join(known)}")
         else:
-            columns[name] = table.numbers(source.column)
-            check_values(table, source.column, columns[name])
-        columns[name], units[name] = _convert(layout, source, columns[name], notes)
+            columns[name] = table.numbers(column)
+            check_values(table, column, columns[name])
+        columns[name], units[name] = _convert(layout, signal, column, layout.units[column], columns[name], notes)
     minutes, zero_ns = times.since_first()
-    zero_ns = zero_ns or find_written_zero_ns(layout, time, [source.column for source in sources])
+    zero_ns = zero_ns or find_written_zero_ns(layout, time, [column for _, column in sources])
     runs = numbered_runs(table, run)
     kept = filled_rows(times, columns)
     check_times(table, time, times, minutes, runs, kept)
@@ -224,38 +202,29 @@ def _make_record(
     )
 
 
-def _describe_texts(layout: Layout, time: TimeColumn, sources: Sequence[_Source]) -> list[str]:
-    used = {*time.columns, *(source.column for source in sources)}
-    texts = [
-        layout.names[column]
-        for column in range(len(layout.names))
-        if column not in used and layout.kinds[column] == TEXT
-    ]
-    return [f"text left out: {', '.join(f'`{name}`' for name in texts)}"] if texts else []
+def _describe_texts(layout: Layout, time: TimeColumn, sources: Sequence[tuple[SignalColumn, int]]) -> list[str]:
+    used = {*time.columns, *(column for _, column in sources)}
+    unused = [column for column, kind in enumerate(layout.kinds) if kind == TEXT and column not in used]
+    return [f"text left out: {', '.join(f'`{layout.names[column]}`' for column in unused)}"] if unused else []
 
 
 def _convert(
-    layout: Layout, source: _Source, values: NDArray[np.float64], notes: list[str]
+    layout: Layout, signal: SignalColumn, column: int, unit: str, values: NDArray[np.float64], notes: list[str]
 ) -> tuple[NDArray[np.float64], str]:
-    """Values in the unit of the signal, and that unit.
-
-    Raises:
-        InputError: the file's unit is one of another quantity.
-    """
-    signal = source.signal
-    if not (signal.unit and source.unit) or signal.unit == source.unit:
-        return values, signal.unit or source.unit
-    name = f"{layout.path}, row {layout.header_row}, column {layout.names[source.column]!r}"
+    """Values of a column, whose unit is given, in the unit of the signal, and that unit."""
+    if not (signal.unit and unit) or signal.unit == unit:
+        return values, signal.unit or unit
+    name = f"{layout.path}, row {layout.header_row}, column {layout.names[column]!r}"
     try:
-        scale, offset = conversion(source.unit, signal.unit, name)
+        scale, offset = conversion(unit, signal.unit, name)
     except UnknownUnitError:
-        notes.append(f"{signal.name} in {signal.unit}, whatever {source.unit!r} means")
+        notes.append(f"{signal.name} in {signal.unit}, whatever {unit!r} means")
         return values, signal.unit
     except InputError as error:
         raise InputError(f"{error}; correct the header or the unit of signal {signal.name!r}") from error
     if (scale, offset) == (1.0, 0.0):
         return values, signal.unit
-    notes.append(f"{signal.name} from {source.unit} to {signal.unit}")
+    notes.append(f"{signal.name} from {unit} to {signal.unit}")
     return scale * values + offset, signal.unit
 
 
@@ -274,17 +243,17 @@ def _read_long(
         tag = by_name.get(signal.column or signal.name)
         if tag is None:
             if signal.required:
-                found = ", ".join(map(repr, series))
                 asked = signal.column or signal.name
-                found += hint_at_closest(asked, series)
+                found = ", ".join(map(repr, series)) + hint_at_closest(asked, series)
                 raise MissingColumnError(f"{layout.path}: expected rows of the tag {asked!r}, got {found}")
             continue
         own, first = np.unique(series[tag].times, return_index=True)
         strays += series[tag].times.size - own.size
         values = np.full(times.size, np.nan)
         values[np.searchsorted(times, own)] = series[tag].values[first]
-        source = _Source(signal, long.value, unit_of_name(tag))
-        columns[signal.name], units[signal.name] = _convert(layout, source, values, notes)
+        columns[signal.name], units[signal.name] = _convert(
+            layout, signal, long.value, unit_of_name(tag), values, notes
+        )
     minutes, zero_ns = Times(times, np.full(times.size, fill_value=True), is_clock, []).since_first()
     known = {name: unit for name, unit in units.items() if unit}
     return Record(minutes, columns, layout.path.name, zero_ns, units=known, strays=strays, read_as=", ".join(notes))

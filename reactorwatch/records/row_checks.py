@@ -72,19 +72,14 @@ def check_times(
         table.refuse(row, column, rule, "check its unit: seconds are time_s")
     if np.isinf(minutes[row]):
         table.refuse(row, column, "expected a finite number")
-    after = f" after {_time_text(table, time, int(rows[at - 1]))}, that of the row before" if at else ""
-    table.refuse(
-        row,
-        column,
-        f"expected a time{after}",
-        "state --zone if summer time ends here" if times.is_clock and times.valid[row] else "",
-    )
-
-
-def _time_text(table: TextTable, time: TimeColumn, row: int) -> str:
-    if time.pattern is None:
-        return repr(float(table.numbers(time.columns[0])[row]))
-    return str(table.texts(time.columns[0])[row])
+    rule = "expected a time"
+    if at:
+        before = int(rows[at - 1])
+        is_number = time.pattern is None
+        text = repr(float(table.numbers(column)[before])) if is_number else str(table.texts(column)[before])
+        rule += f" after {text}, that of the row before"
+    is_clock = times.is_clock and times.valid[row]
+    table.refuse(row, column, rule, "state --zone if summer time ends here" if is_clock else "")
 
 
 def check_values(table: TextTable, column: int, values: NDArray[np.float64]) -> None:

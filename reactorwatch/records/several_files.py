@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS, Record, join_runs
 
@@ -27,15 +25,10 @@ def join_files(records: Sequence[Record]) -> Record:
         for number, run in enumerate(record.split_runs()):
             part = replace(run, time_min=run.time_min + shift_min)
             if parts and not number and parts[-1].time_min[-1] < part.time_min[0]:
-                part = _append(parts.pop(), part)
+                part = replace(join_runs([parts.pop(), part]), runs=None)
             parts.append(part)
     strays = sum(record.strays for record in records)
     return replace(join_runs(parts), zero_ns=first.zero_ns, first_row=None, strays=strays, read_as=first.read_as)
-
-
-def _append(before: Record, after: Record) -> Record:
-    columns = {name: np.concatenate([values, after.columns[name]]) for name, values in before.columns.items()}
-    return replace(before, time_min=np.concatenate([before.time_min, after.time_min]), columns=columns)
 
 
 def _check_alike(record: Record, first: Record) -> None:

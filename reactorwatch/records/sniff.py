@@ -13,7 +13,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.cells import EMPTY, MISSING, NUMBER, TEXT, TIME, kind_of
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.header import HeaderSearch
-from reactorwatch.records.layout import COMMENT, Layout, blank_comments, split_line
+from reactorwatch.records.layout import COMMENT, Layout, split_line
 
 HEAD_BYTES = 65_536
 HEAD_LINES = 200
@@ -48,7 +48,7 @@ def sniff(path: Path, text: bytes, stated: FileFormat) -> Layout:
         (text.count(b"\n", 0, found.start()) + 1, found[0].decode()) for found in COMMENT.finditer(text, 0, HEAD_BYTES)
     ]
     if comments:
-        text = blank_comments(text)
+        text = COMMENT.sub(b"", text)
     numbered = [(row, line) for row, line in _head(text) if line.strip(" \t\n")]
     if not numbered:
         raise InputError(f"{path}: expected a header and rows, got only comments")
@@ -138,11 +138,7 @@ def _is_unlabelled_by_row(layout: Layout) -> bool:
 
 
 def _transpose(path: Path, text: bytes, separator: str, stated: FileFormat) -> Layout:
-    """Layout of a table after its rows and columns were exchanged.
-
-    Raises:
-        InputError: its rows have different numbers of cells.
-    """
+    """Layout of a table after its rows and columns were exchanged."""
     rows = [split_line(line, separator) for line in text.decode().split("\n") if line.strip()]
     if len({len(cells) for cells in rows}) > 1:
         lengths = sorted({len(cells) for cells in rows})

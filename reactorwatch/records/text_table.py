@@ -10,18 +10,14 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.cells import NUMBER, find_sentinels, kind_of, to_numbers
-from reactorwatch.records.layout import Layout, blank_comments, blank_repeats, describe_separator, is_remark
+from reactorwatch.records.layout import COMMENT, Layout, blank_repeats, describe_separator, is_remark
 
 BLOCK_BYTES = 1 << 22
 _MISSING_CURE = "--missing {} reads it as not measured"
 
 
 def _to_numpy(cells: Any) -> NDArray[np.float64]:
-    """Values of a pyarrow column of numbers, NaN where null. Its `to_numpy` would import pandas, which takes long.
-
-    Args:
-        cells: pyarrow chunks of doubles, shape (rows,) together.
-    """
+    """Values of a pyarrow column of numbers, NaN where null. Its `to_numpy` would import pandas, which takes long."""
     values, begin = np.empty(len(cells)), 0
     for chunk in cells.chunks:
         valid, stored = chunk.buffers()
@@ -57,7 +53,7 @@ class TextTable:
             self._table = self._parse(dict.fromkeys(map(str, numbers), pa.float64()), texts)
         except pa.ArrowInvalid:  # some cells are no plain numbers, a row is too short, or there are comments
             text, self._repeats = blank_repeats(layout)
-            self.layout = replace(layout, text=blank_comments(text))
+            self.layout = replace(layout, text=COMMENT.sub(b"", text))
             self._body = _body(self.layout)
             self._table = self._parse({}, [*numbers, *texts])
         self._sentinels = find_sentinels(layout.missing)
@@ -187,11 +183,7 @@ class TextTable:
         return "skip"
 
     def _refuse_row(self, error: Exception) -> NoReturn:
-        """Find the row that pyarrow cannot split.
-
-        Raises:
-            InputError: always.
-        """
+        """Find the row that pyarrow cannot split."""
         width = len(self.layout.names)
         for line, cells in self.layout.rows():
             if len(cells) != width:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.errors import InputError, hint_at_closest
+from reactorwatch.errors import InputError
 from reactorwatch.records.cells import NUMBER
 from reactorwatch.records.file_format import SECONDS, FileFormat
 from reactorwatch.records.layout import Layout, bare_name
@@ -25,24 +25,19 @@ time zeit t ts tstamp timestamp datetime date datum uhrzeit zeitstempel zeitpunk
 horodatage fecha hora tiempo tempo seconds minutes hours sekunden minuten stunden x_value"""
 _INDEX_NAMES = "index idx sample samples row rows nr no n i k step steps id # zeile schritt"
 _TIME_WORDS, _INDEX_WORDS = frozenset(_TIME_NAMES.split()), frozenset(_INDEX_NAMES.split())
-_UNIT_WORDS = {
-    "ns": ("ns",),
-    "us": ("us", "µs"),
-    "ms": ("ms", "msec", "millis", "milliseconds"),
-    "s": ("s", "sec", "secs", "second", "seconds", "sek", "sekunden"),
-    "min": ("min", "mins", "minute", "minutes", "minuten"),
-    "h": ("h", "hr", "hrs", "hour", "hours", "std", "stunden"),
-    "d": ("d", "day", "days", "tage"),
-}
+_UNIT_WORDS = (
+    "ns",
+    "us µs",
+    "ms msec millis milliseconds",
+    "s sec secs second seconds sek sekunden",
+    "min mins minute minutes minuten",
+    "h hr hrs hour hours std stunden",
+    "d day days tage",
+)
+_UNIT_OF = {word: words.split()[0] for words in _UNIT_WORDS for word in words.split()}
 PLAIN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_UNIT_OF = {word: unit for unit, words in _UNIT_WORDS.items() for word in words}
-_EPOCHS = {
-    1.0: (6.3e8, 4.2e9),
-    1e-3: (6.3e11, 4.2e12),
-    1e-6: (6.3e14, 4.2e15),
-    1e-9: (6.3e17, 4.2e18),
-}
-"""Smallest and largest Unix times of 1990 to 2100, by their unit in seconds."""
+_EPOCH_S, _EPOCH_UNITS_S = (6.3e8, 4.2e9), (1.0, 1e-3, 1e-6, 1e-9)
+"""Smallest and largest Unix times of 1990 to 2100, and their units in seconds."""
 _SERIAL_DAYS, _SERIAL_ZERO, _SERIAL_STEP = (32_874, 73_050), 25_569, 0.05
 """Days of a spreadsheet from 1990 to 2100, that of 1970, and steps that are shorter than those of other numbers."""
 
@@ -78,7 +73,11 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
     if stated.period is not None:
         return TimeColumn(())
     if stated.time is not None:
-        return _describe(layout, find_column(layout, stated.time, "--time"), stated)
+        asked = layout.find(stated.time)
+        if asked is None:
+            rule = f"expected a column {stated.time!r} (--time), got {layout.describe_names(stated.time)}"
+            raise InputError(f"{layout.path}, row {layout.header_row or 1}: {rule}")
+        return _describe(layout, asked, stated)
     for name, unit in STANDARD.items():
         if name in layout.names and (column := layout.names.index(name)) not in taken:
             if stated.time_unit is not None or stated.time_format is not None:
@@ -99,10 +98,8 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
     ]
     found = [*stamps, *(item for item in named if _increases(layout, item))]
     if not found:
-        numbers = [item for item in candidates if layout.kinds[item.columns[0]] == NUMBER and _increases(layout, item)]
-        found = [
-            item for item in numbers if find_epoch(layout, item, sample_values(layout, item.columns[0])) is not None
-        ]
+        numbers = [item for item in candidates if _increases(layout, item)]
+        found = [item for item in numbers if find_epoch(layout, item, sample_values(layout, item.columns[0]))]
         found = found or [item for item in numbers if counts_rows(layout, item.columns[0])] or named
     if len(found) > 1:
         names = ", ".join(repr(layout.names[item.columns[0]]) for item in found)
@@ -110,21 +107,6 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
     if not found:
         _refuse_without_time(layout, taken)
     return found[0]
-
-
-def find_column(layout: Layout, name: str, option: str) -> int:
-    """Number of a column by its header, its name without unit, or its number from 1.
-
-    Raises:
-        InputError: there is none, or several.
-    """
-    for names in (layout.names, [bare_name(each) for each in layout.names]):
-        if names.count(name) == 1:
-            return names.index(name)
-    if name.isdigit() and 1 <= int(name) <= len(layout.names):
-        return int(name) - 1
-    found = ", ".join(map(repr, layout.names)) + hint_at_closest(name, map(bare_name, layout.names))
-    raise InputError(f"{layout.path}, row {layout.header_row or 1}: expected a column {name!r} ({option}), got {found}")
 
 
 def _describe(layout: Layout, column: int, stated: FileFormat) -> TimeColumn:
@@ -184,8 +166,12 @@ def find_epoch(layout: Layout, item: TimeColumn, values: NDArray[np.float64]) ->
     if item.is_standard or not usable.size:
         return None
     low, high = float(usable.min()), float(usable.max())
-    for unit_s, (least, most) in _EPOCHS.items():
-        if least <= low and high <= most and (not item.unit or SECONDS[item.unit] == unit_s):
+    for unit_s in _EPOCH_UNITS_S:
+        if (
+            _EPOCH_S[0] <= low * unit_s
+            and high * unit_s <= _EPOCH_S[1]
+            and (not item.unit or SECONDS[item.unit] == unit_s)
+        ):
             return Epoch("seconds since 1970", unit_s)
     is_dated = "dat" in layout.names[item.columns[0]].lower()
     is_dense = usable.size > 1 and float(np.abs(np.diff(usable)).max()) < _SERIAL_STEP

@@ -94,22 +94,17 @@ def is_newest_first(layout: Layout, column: TimeColumn) -> bool:
 
 def find_written_zero_ns(layout: Layout, column: TimeColumn, taken: Collection[int]) -> int:
     """Zero of the minutes in a table that `write_table` wrote with clock times; 0: it has none."""
-    if not column.is_standard or CLOCK not in layout.names or not layout.sample:
+    if not column.is_standard or column.unit != "min" or CLOCK not in layout.names or not layout.sample:
         return 0
     at = layout.names.index(CLOCK)
-    pattern = guess_pattern(layout.cells(at)[:1])
-    if at in taken or pattern is None or not pattern.has_date:
+    cell, minutes = layout.sample[0][at], layout.sample[0][column.columns[0]].strip()
+    pattern = guess_pattern([cell])
+    if at in taken or pattern is None or not pattern.has_date or not PLAIN.fullmatch(minutes):
         return 0
     import pyarrow as pa
 
-    instants, _ = parse(pa.array(layout.cells(at)[:1]), pattern)
-    minutes = layout.cells(column.columns[0])[0].strip()
-    if (
-        column.unit != "min"
-        or not instants.valid[0]
-        or not np.isfinite(instants.offset_s[0])
-        or not PLAIN.fullmatch(minutes)
-    ):
+    instants, _ = parse(pa.array([cell]), pattern)
+    if not instants.valid[0] or not np.isfinite(instants.offset_s[0]):
         return 0
     return int(instants.local_ns[0]) - int(instants.offset_s[0]) * 1_000_000_000 - to_time_ns(float(minutes))
 
@@ -135,22 +130,16 @@ def _read_stamps(table: TextTable, column: TimeColumn, pattern: Pattern, stated:
     notes, local_ns = [f"time {name} {form}"], instants.local_ns
     if not pattern.has_date:
         local_ns = local_ns + DAY_NS * np.cumsum(np.diff(local_ns, prepend=local_ns[:1]) < -12 * HOUR_NS)
-        return Times(
-            np.where(instants.valid, local_ns / MINUTE_NS, np.nan), instants.valid, is_clock=False, notes=notes
-        )
+        minutes = np.where(instants.valid, local_ns / MINUTE_NS, np.nan)
+        return Times(minutes, instants.valid, is_clock=False, notes=notes)
     offset = np.isfinite(instants.offset_s)
     if offset.any():
         if not offset[instants.valid].all():
             row = int(np.flatnonzero(instants.valid & ~offset)[0])
-            table.refuse(
-                row, at, "expected a time with a known offset from UTC, as in other rows", "write it as +01:00"
-            )
-        return Times(
-            local_ns - (np.nan_to_num(instants.offset_s) * 1e9).astype(np.int64),
-            instants.valid,
-            is_clock=True,
-            notes=notes,
-        )
+            rule = "expected a time with a known offset from UTC, as in other rows"
+            table.refuse(row, at, rule, "write it as +01:00")
+        utc_ns = local_ns - (np.nan_to_num(instants.offset_s) * 1e9).astype(np.int64)
+        return Times(utc_ns, instants.valid, is_clock=True, notes=notes)
     return _to_clock(table, column, local_ns, instants.valid, stated, notes[0])
 
 
@@ -162,11 +151,7 @@ def _to_clock(
     stated: FileFormat,
     note: str,
 ) -> Times:
-    """Clock time of local times: in the zone that is stated or named in the header, else in UTC.
-
-    Raises:
-        InputError: local times are ambiguous in the zone, or step back by an hour without one.
-    """
+    """Clock time of local times: in the zone that is stated or named in the header, else in UTC."""
     at = column.columns[0]
     zone = stated.zone or _zone_in_name(table.layout, column)
     if zone is not None:
@@ -178,12 +163,8 @@ def _to_clock(
         return Times(utc_ns, valid, is_clock=True, notes=[f"{note} in {zone}"])
     steps = np.diff(local_ns)
     usual = float(np.median(steps)) if (steps <= 0).any() else 0.0
-    back = (
-        np.flatnonzero(np.abs(steps + HOUR_NS - usual) < max(usual / 2, 1e9))
-        if usual < HOUR_NS
-        else np.flatnonzero(steps == 0)
-    )
-    back = back[steps[back] <= 0]
+    is_hour_back = np.abs(steps + HOUR_NS - usual) < max(usual / 2, 1e9) if usual < HOUR_NS else steps == 0
+    back = np.flatnonzero(is_hour_back & (steps <= 0))
     if back.size:
         rule = "expected increasing times; the clock steps back by an hour, as at the end of summer time"
         table.refuse(int(back[0]) + 1, at, rule, "state the zone, such as --zone Europe/Berlin (--zone UTC: none)")

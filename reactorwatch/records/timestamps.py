@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import fixed_offset_s
 
 _NAMES = "jan feb mar apr may jun jul aug sep oct nov dec"
 _MONTHS = {name: number for number, name in enumerate(_NAMES.split(), start=1)}
@@ -45,7 +46,7 @@ _DIRECTIVES = {
     "%Z": _ZONE,
     "%%": "%",
 }
-_OFFSETS_H = {"Z": 0, "UTC": 0, "GMT": 0, "WET": 0, "BST": 1, "WEST": 1, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
+_OFFSETS_H = {"WET": 0, "BST": 1, "WEST": 1, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
 _OFFSETS_H |= {"EET": 2, "EEST": 3, "EST": -5, "EDT": -4, "CST": -6, "CDT": -5, "MST": -7, "MDT": -6, "PST": -8}
 _OFFSETS_H |= {"PDT": -7, "JST": 9}
 
@@ -213,11 +214,7 @@ def _days(year: NDArray[np.int64], month: NDArray[np.int64], day: NDArray[np.int
 def _order_day_and_month(
     year: NDArray[np.int64], first: NDArray[np.int64], second: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Month and day of dates such as 03/04/2026: months are at most 12, and a record is short.
-
-    Raises:
-        ValueError: both orders are as plausible.
-    """
+    """Month and day of dates such as 03/04/2026: months are at most 12, and a record is short."""
     if (first > 12).any() or np.array_equal(first, second):
         return second, first
     if (second > 12).any():
@@ -234,10 +231,7 @@ def _offsets(cells: Any) -> NDArray[np.float64]:
     encoded = cells.dictionary_encode()
     values: list[float] = []
     for text in encoded.dictionary.to_pylist():
-        digits = re.sub(r"\D", "", text)
-        if digits:
-            values.append((-1 if text[0] == "-" else 1) * (int(digits[:2]) * 3600 + int(digits[2:] or 0) * 60))
-        else:
-            values.append(_OFFSETS_H.get(text.upper(), np.nan) * 3600)
+        offset_s = fixed_offset_s(text)
+        values.append(_OFFSETS_H.get(text.upper(), np.nan) * 3600 if offset_s is None else offset_s)
     index = np.asarray(encoded.indices.fill_null(len(values)))
     return np.asarray(np.array([*values, np.nan], dtype=np.float64)[index], dtype=np.float64)

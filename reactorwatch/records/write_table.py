@@ -1,10 +1,9 @@
-"""Write a record as a table: CSV, compressed CSV, workbook or Parquet, by the file's suffix."""
+"""Write a record as a table: CSV, compressed CSV, workbook or Parquet, by the file's suffix; or a data frame."""
 
 import csv
 import gzip
 import io
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -78,10 +77,6 @@ def _clock_texts(record: Record) -> list[str]:
     return [f"{text}Z" for text in times.astype("datetime64[ns]").astype(f"datetime64[{unit}]").astype(str).tolist()]
 
 
-def _rows(columns: dict[str, list[Any]]) -> Iterable[tuple[Any, ...]]:
-    return zip(*columns.values(), strict=True)
-
-
 def _write_text(path: Path, record: Record, clock: bool, *, compress: bool = False) -> None:
     columns = _columns(record, clock)
     with atomic_write(path) as temporary, temporary.open("wb") as file:
@@ -89,7 +84,7 @@ def _write_text(path: Path, record: Record, clock: bool, *, compress: bool = Fal
         with io.TextIOWrapper(packed, encoding="utf-8", newline="") as text:
             writer = csv.writer(text, lineterminator="\n")  # writes a float as its repr, which reads back exactly
             writer.writerow(columns)
-            writer.writerows(_rows(columns))
+            writer.writerows(zip(*columns.values(), strict=True))
 
 
 def _write_workbook(path: Path, record: Record, clock: bool) -> None:
@@ -101,7 +96,7 @@ def _write_workbook(path: Path, record: Record, clock: bool) -> None:
     book = openpyxl.Workbook(write_only=True)
     sheet = book.create_sheet("record")
     sheet.append(list(columns))
-    for row in _rows(columns):
+    for row in zip(*columns.values(), strict=True):
         sheet.append(row)
     with atomic_write(path) as temporary:
         book.save(temporary)
@@ -114,3 +109,20 @@ def _write_parquet(path: Path, record: Record, clock: bool) -> None:
     table = pa.table(_columns(record, clock))
     with atomic_write(path) as temporary:
         pyarrow.parquet.write_table(table, temporary)
+
+
+def write_frame(frame: Any, path: Path) -> Path:
+    """Write a data frame (pandas, polars, Arrow) as a Parquet file; returns its path.
+
+    Raises:
+        InputError: the frame has columns that are no plain values.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet
+
+    try:
+        pyarrow.parquet.write_table(pa.table(frame), path)
+    except (pa.ArrowException, TypeError) as error:
+        reason = str(error).partition("\n")[0]
+        raise InputError(f"data frame: expected columns of plain values: {reason}") from error
+    return path

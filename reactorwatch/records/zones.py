@@ -55,33 +55,22 @@ def to_utc(local_ns: NDArray[np.int64], zone: str, refuse: Callable[[int, str], 
     twice = np.flatnonzero(late > early)
     for stretch in np.split(twice, np.flatnonzero(np.diff(twice) > 1) + 1) if twice.size else ():
         first, end = int(stretch[0]), int(stretch[-1]) + 1
-        early[first:end] = _resolve(early, late, local_ns, first, end, zone, refuse)
+        back = np.flatnonzero(np.diff(local_ns[first:end]) <= 0)
+        if back.size:
+            second = first + int(back[0]) + 1
+            early[second:end] = late[second:end]
+            continue
+        gaps = []
+        for times in (early, late):
+            before = times[first] - early[first - 1] if first else 0
+            after = early[end] - times[end - 1] if end < early.size else 0
+            gaps.append(max(before, after))
+        if gaps[0] == gaps[1]:
+            refuse(
+                first,
+                f"expected a time that is unique in {zone}, where this hour occurs twice and the rows fit both "
+                "(--zone +01:00, for instance, states the offset)",
+            )
+        if gaps[0] > gaps[1]:
+            early[first:end] = late[first:end]
     return early
-
-
-def _resolve(  # an inner step of `to_utc`
-    early: NDArray[np.int64],
-    late: NDArray[np.int64],
-    local_ns: NDArray[np.int64],
-    first: int,
-    end: int,
-    zone: str,
-    refuse: Callable[[int, str], NoReturn],
-) -> NDArray[np.int64]:
-    """UTC of rows whose local times occur twice."""
-    back = np.flatnonzero(np.diff(local_ns[first:end]) <= 0)
-    if back.size:
-        second = first + int(back[0]) + 1
-        return np.concatenate([early[first:second], late[second:end]])
-    gaps = []
-    for times in (early, late):
-        before = times[first] - early[first - 1] if first else 0
-        after = early[end] - times[end - 1] if end < early.size else 0
-        gaps.append(max(before, after))
-    if gaps[0] == gaps[1]:
-        refuse(
-            first,
-            f"expected a time that is unique in {zone}, where this hour occurs twice and the rows fit both "
-            "(--zone +01:00, for instance, states the offset)",
-        )
-    return (early if gaps[0] < gaps[1] else late)[first:end]

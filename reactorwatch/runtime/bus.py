@@ -1,7 +1,7 @@
 """The bus protocol. The nodes know only this; `bus_zenoh` implements it."""
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, TypedDict, Unpack
 
 from google.protobuf.message import Message
 
@@ -26,6 +26,22 @@ class Request(Protocol):
         """Leave the answer to other queryables; instead of `reply`."""
 
 
+class SubscribeOptions(TypedDict, total=False):
+    """Options of a subscription.
+
+    Attributes:
+        on_gap: called, from a thread of the bus, with messages that were published and never arrived.
+        history_s: age of the oldest earlier publication to receive first, as far as publishers cache it; `inf`: all
+            that they cache, 0 (the default): none.
+        on_history_end: called, from a thread of the bus and between the messages, when the earlier publications have
+            all been handed over.
+    """
+
+    on_gap: Callable[[Gap], None] | None
+    history_s: float
+    on_history_end: Callable[[], None] | None
+
+
 class Bus(Protocol):
     """Publish and subscribe, query and reply, and liveliness tokens."""
 
@@ -33,37 +49,16 @@ class Bus(Protocol):
         """Publish bytes on their key."""
 
     def subscribe(
-        self,
-        key_expression: str,
-        handler: Callable[[Encoded], None],
-        *,
-        on_gap: Callable[[Gap], None] | None = None,
-        history_s: float = 0.0,
-        on_history_end: Callable[[], None] | None = None,
+        self, key_expression: str, handler: Callable[[Encoded], None], **options: Unpack[SubscribeOptions]
     ) -> None:
         """Call the handler, from a thread of the bus, with each message published on matching keys.
 
         Messages of one publisher, kind and plant arrive in the order of publication if the expression matches whole
         kinds (it ends in `/**`); messages on one key always do.
-
-        Args:
-            key_expression: the keys.
-            handler: called with each message.
-            on_gap: called, from a thread of the bus, with messages that were published and never arrived.
-            history_s: age of the oldest earlier publication to receive first, as far as publishers cache it; `inf`: all
-                that they cache, 0: none.
-            on_history_end: called, from a thread of the bus and between the messages, when the earlier publications
-                have all been handed over.
         """
 
     def subscribe_batched(
-        self,
-        key_expression: str,
-        handler: Callable[[list[Encoded]], None],
-        *,
-        on_gap: Callable[[Gap], None] | None = None,
-        history_s: float = 0.0,
-        on_history_end: Callable[[], None] | None = None,
+        self, key_expression: str, handler: Callable[[list[Encoded]], None], **options: Unpack[SubscribeOptions]
     ) -> None:
         """`subscribe` with a handler that takes all messages that have arrived, up to about `MAX_BATCH` at a time."""
 

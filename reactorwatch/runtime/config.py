@@ -195,12 +195,7 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
 
 
 def _describe_refusal(kind: object, text: str) -> str:
-    """Describe an invalid word by the setting and the valid words; any other message of msgspec is returned as given.
-
-    Args:
-        kind: class of the settings.
-        text: message of msgspec, such as "Invalid enum value 'fast' - at `$.start`".
-    """
+    """Describe an invalid word by the setting and the valid words; other messages of msgspec stay as they are."""
     rule, _, path = text.partition(" - at ")
     words = valid_choices(kind, path.strip("`")) if rule.startswith(_NO_CHOICE) else ()
     if not words:
@@ -210,11 +205,7 @@ def _describe_refusal(kind: object, text: str) -> str:
 
 
 def _rename_older(kind: type[Section], name: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Values with the present names of their keys.
-
-    Raises:
-        InputError: a key is there by both names.
-    """
+    """Values with the present names of their keys."""
     renamed = dict(values)
     for older, (key, convert) in getattr(kind, "older_keys", {}).items():
         if older not in values:

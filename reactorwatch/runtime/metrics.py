@@ -5,14 +5,16 @@ space of its disk. Names keep Prometheus' conventions (https://prometheus.io/doc
 units at the end, `_total` for counters. Missing samples are a gauge: one that arrives late is missing no more, and
 Prometheus takes a falling counter for a restart.
 
-The node's loop passes each publication on (`Metrics.observe`); a scrape reads, in a thread of the server, references
-that are replaced as a whole. A node of many plants has one page for all (`FleetMetrics`).
+The node's loop passes each publication on (`Metrics.on_publish`); a scrape reads, in a thread of the server,
+references that are replaced as a whole. A node of many plants has one page for all.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import structlog
 
@@ -45,6 +47,14 @@ COUNTERS = {
 }
 """Name without prefix and `_total`, and description, by field of `Health`."""
 
+GAUGES = (
+    ("uptime_seconds", "Since the node was started", "uptime_s", 1),
+    ("lag_seconds", "The longest from receipt to the end of the work on it", "lag_ms", 1e3),
+    ("reported_timestamp_seconds", "When the node counted this", "time_ns", 1e9),
+    ("samples_lost", "Samples whose numbers are missing so far", "lost", 1),
+)
+"""Name without prefix, description, field of `Health`, and by what it is divided."""
+
 _STATES = {
     name: name.removeprefix("ALARM_STATE_").lower()
     for name, number in AlarmState.items()
@@ -52,164 +62,115 @@ _STATES = {
 }
 
 
-def page_port(config: MetricsConfig, node: str) -> int | None:
-    """Port of a node's page; None: it has none."""
-    return None if config.port is None else config.port + PORT_OFFSET[node]
+Alarms: TypeAlias = Callable[[], Iterable[Alarm] | None] | None
+NO_PLANTS: Mapping[str, Alarms] = MappingProxyType({})
+
+
+@dataclass
+class _Plant:
+    """A plant on the page: its alarms, as the node returns them, and what the node has published of it."""
+
+    alarms: Alarms
+    health: Health | None = None
+    by_state: Counter[int] | None = None
 
 
 class Metrics:
-    """The page of a node, a collector of Prometheus' library.
+    """The page of a node of one plant or many, a collector of Prometheus' library.
 
     Args:
-        plant: name of the node's plant.
         node: name of the node.
+        plants: by name of a plant, a function that returns its alarms, or None if they have not changed; it is called
+            in the thread of the caller. None: the node has no alarms.
         free_bytes: returns the free space of its disk; None: it writes no files.
     """
 
-    def __init__(self, plant: str, node: str, free_bytes: Callable[[], int] | None = None) -> None:
-        self._labels = {"plant": plant, "node": node}
+    def __init__(
+        self, node: str, plants: Mapping[str, Alarms] = NO_PLANTS, free_bytes: Callable[[], int] | None = None
+    ) -> None:
+        self.node = node
         self._free_bytes = free_bytes
-        self._health: Health | None = None
-        self._by_state: Counter[int] | None = None
+        self._plants = {plant: _Plant(alarms) for plant, alarms in plants.items()}
 
-    def observe(self, alarms: Callable[[], Iterable[Alarm] | None] | None = None) -> Callable[[Publication], None]:
-        """Return a function to be called with each publication of the node.
+    def add_plant(self, plant: str, alarms: Alarms) -> None:
+        """Add a plant to the page, with a function as in `plants`, unless there are `MAX_PLANTS`."""
+        if len(self._plants) < MAX_PLANTS:
+            self._plants[plant] = _Plant(alarms)
 
-        Args:
-            alarms: returns the node's alarms, or None if they have not changed; called in the thread of the caller.
-                None: the node has no alarms.
-        """
+    def remove_plant(self, plant: str) -> None:
+        """Remove a plant from the page."""
+        self._plants.pop(plant, None)
 
-        def on_publication(publication: Publication) -> None:
-            message = publication.message
-            if isinstance(message, Health):
-                self._health = message
-            elif not isinstance(message, Alarm):
-                return
-            changed = alarms() if alarms is not None else None
-            if changed is not None:
-                self._by_state = Counter(alarm.state for alarm in changed)
-
-        return on_publication
+    def on_publish(self, publication: Publication) -> None:
+        """Take the counts and alarm states from a publication of the node."""
+        message = publication.message
+        if not isinstance(message, Health | Alarm):
+            return
+        topic = keys.parse(publication.key)
+        plant = self._plants.get(topic.plant) if topic is not None else None
+        if plant is None:
+            return
+        if isinstance(message, Health):
+            plant.health = message
+        changed = plant.alarms() if plant.alarms is not None else None
+        if changed is not None:
+            plant.by_state = Counter(alarm.state for alarm in changed)
 
     def collect(self) -> "Iterator[Metric]":
-        """Yield the metrics; those not known yet are left out."""
-        from prometheus_client.metrics_core import GaugeMetricFamily
+        """Yield each metric with the values of all plants; those not known yet are left out."""
+        from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 
-        if self._health is not None:
-            yield from self._of_health(self._health)
-        if self._by_state is not None:
-            names = [*self._labels, "state"]
-            gauge = GaugeMetricFamily(f"{PREFIX}_alarms", "Alarms in each state", labels=names)
-            for name, state in _STATES.items():
-                gauge.add_metric([*self._labels.values(), state], self._by_state[AlarmState.Value(name)])
-            yield gauge
+        gauge, counter, plants = GaugeMetricFamily, CounterMetricFamily, list(self._plants.items())
+        healths = [(name, plant.health) for name, plant in plants if plant.health is not None]
+        if healths:
+            versions = [(plant, "", {"version": health.version}) for plant, health in healths]
+            yield self._family(InfoMetricFamily, "node", "The node", versions)
+            phases = [(plant, health.phase, 1) for plant, health in healths]
+            yield self._family(gauge, "phase", "1 for what the node does now", phases, "phase")
+            for name, meaning, field, scale in GAUGES:
+                values = [(plant, "", getattr(health, field) / scale) for plant, health in healths]
+                yield self._family(gauge, name, meaning, values)
+            for field, (name, meaning) in COUNTERS.items():
+                yield self._family(counter, name, meaning, [(plant, "", getattr(it, field)) for plant, it in healths])
+            for name, meaning, field, label in (
+                ("messages_refused", "Messages that could not be used", "refused_by_reason", "reason"),
+                ("failures", "Errors of this software that the node contained", "failures", "stage"),
+            ):
+                counts = [(plant, *item) for plant, it in healths for item in sorted(getattr(it, field).items())]
+                yield self._family(counter, name, meaning, counts, label)
+        states = [
+            (name, state, plant.by_state[AlarmState.Value(word)])
+            for name, plant in plants
+            if plant.by_state is not None
+            for word, state in _STATES.items()
+        ]
+        if states:
+            yield self._family(gauge, "alarms", "Alarms in each state", states, "state")
         if self._free_bytes is not None:
             try:
                 free = self._free_bytes()
             except OSError:  # the folder is gone: no number is better than a wrong one
                 return
-            yield self._gauge("disk_free_bytes", "Room on the disk of the recordings", free)
+            room = [(plant, "", free) for plant, _ in plants]
+            yield self._family(gauge, "disk_free_bytes", "Room on the disk of the recordings", room)
 
-    def _of_health(self, health: Health) -> "Iterator[Metric]":
-        from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
-
-        names, values = list(self._labels), list(self._labels.values())
-        info = InfoMetricFamily(f"{PREFIX}_node", "The node", labels=names)
-        info.add_metric(values, {"version": health.version})
-        yield info
-        phase = GaugeMetricFamily(f"{PREFIX}_phase", "1 for what the node does now", labels=[*names, "phase"])
-        phase.add_metric([*values, health.phase], 1)
-        yield phase
-        yield self._gauge("uptime_seconds", "Since the node was started", health.uptime_s)
-        yield self._gauge("lag_seconds", "The longest from receipt to the end of the work on it", health.lag_ms / 1e3)
-        yield self._gauge("reported_timestamp_seconds", "When the node counted this", health.time_ns / 1e9)
-        yield self._gauge("samples_lost", "Samples whose numbers are missing so far", health.lost)
-        for field, (name, meaning) in COUNTERS.items():
-            counter = CounterMetricFamily(f"{PREFIX}_{name}", meaning, labels=names)
-            counter.add_metric(values, getattr(health, field))
-            yield counter
-        refused = CounterMetricFamily(
-            f"{PREFIX}_messages_refused", "Messages that could not be used", labels=[*names, "reason"]
-        )
-        for reason, count in sorted(health.refused_by_reason.items()):
-            refused.add_metric([*values, reason], count)
-        yield refused
-        failures = CounterMetricFamily(
-            f"{PREFIX}_failures", "Errors of this software that the node contained", labels=[*names, "stage"]
-        )
-        for stage, count in sorted(health.failures.items()):
-            failures.add_metric([*values, stage], count)
-        yield failures
-
-    def _gauge(self, name: str, meaning: str, value: float) -> "Metric":
-        from prometheus_client.metrics_core import GaugeMetricFamily
-
-        gauge = GaugeMetricFamily(f"{PREFIX}_{name}", meaning, labels=list(self._labels))
-        gauge.add_metric(list(self._labels.values()), value)
-        return gauge
-
-
-class FleetMetrics:
-    """The page of a node of many plants.
-
-    Args:
-        node: name of the node.
-    """
-
-    def __init__(self, node: str) -> None:
-        self._node = node
-        self._pages: dict[str, tuple[Metrics, Callable[[Publication], None]]] = {}  # by plant
-
-    def add_plant(self, plant: str, alarms: Callable[[], Iterable[Alarm] | None]) -> None:
-        """Add a plant to the page, unless there are `MAX_PLANTS`.
-
-        Args:
-            plant: name of the plant.
-            alarms: see `Metrics.observe`.
-        """
-        if len(self._pages) < MAX_PLANTS:
-            page = Metrics(plant, self._node)
-            self._pages[plant] = page, page.observe(alarms)
-
-    def remove_plant(self, plant: str) -> None:
-        """Remove a plant from the page."""
-        self._pages.pop(plant, None)
-
-    def on_publish(self, publication: Publication) -> None:
-        """Take the counts and alarm states from a publication of the node."""
-        topic = keys.parse(publication.key)
-        page = self._pages.get(topic.plant) if topic is not None else None
-        if page is not None:
-            page[1](publication)
-
-    def collect(self) -> "Iterator[Metric]":
-        """Yield each metric with the samples of all plants."""
-        merged: dict[str, Metric] = {}
-        for page, _ in list(self._pages.values()):
-            for metric in page.collect():
-                if metric.name in merged:
-                    merged[metric.name].samples += metric.samples
-                else:
-                    merged[metric.name] = metric
-        yield from merged.values()
-
-
-class _Page(Protocol):
-    def collect(self) -> "Iterator[Metric]": ...
-
-
-Page = TypeVar("Page", bound=_Page)
+    def _family(
+        self, kind: Any, name: str, meaning: str, values: Iterable[tuple[str, str, object]], label: str = ""
+    ) -> Any:
+        """A metric with its values, each by its plant and by the value of a label of its own if it has one."""
+        family = kind(f"{PREFIX}_{name}", meaning, labels=["plant", "node", *filter(None, [label])])
+        for plant, own, value in values:
+            family.add_metric([plant, self.node, *([own] if label else [])], value)
+        return family
 
 
 @contextmanager
-def serve_metrics(config: MetricsConfig, metrics: Page, node: str) -> Iterator[Page | None]:
+def serve_metrics(config: MetricsConfig, metrics: Metrics) -> Iterator[Metrics | None]:
     """Serve the page while the context lasts, if the settings name a port.
 
     Args:
         config: the settings.
         metrics: the page.
-        node: name of the node.
 
     Returns:
         The page; None without a port.
@@ -217,10 +178,11 @@ def serve_metrics(config: MetricsConfig, metrics: Page, node: str) -> Iterator[P
     Raises:
         InputError: Prometheus' library is not installed, or the port cannot be listened at.
     """
-    port = page_port(config, node)
-    if port is None:
+    if config.port is None:
         yield None
         return
+    port = config.port + PORT_OFFSET[metrics.node]
+    address = f"{config.address}:{port}"
     try:
         from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
     except ImportError as missing:
@@ -232,9 +194,9 @@ def serve_metrics(config: MetricsConfig, metrics: Page, node: str) -> Iterator[P
         server, thread = start_http_server(port, config.address, registry)
     except OSError as error:
         raise InputError(
-            f"[metrics] port {config.port}: the {node} cannot listen at {config.address}:{port}: {error.strerror}"
+            f"[metrics] port {config.port}: the {metrics.node} cannot listen at {address}: {error.strerror}"
         ) from error
-    log.info("metrics", page=f"http://{config.address}:{port}/metrics")
+    log.info("metrics", page=f"http://{address}/metrics")
     try:
         yield metrics
     finally:

@@ -4,10 +4,11 @@ import contextlib
 import secrets
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any, NamedTuple
+from typing import Any, Unpack
 
 import structlog
 import zenoh
@@ -16,15 +17,15 @@ from google.protobuf.message import Message
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode_message
-from reactorwatch.runtime.bus import MAX_BATCH, Request
+from reactorwatch.runtime.bus import MAX_BATCH, Request, SubscribeOptions
 from reactorwatch.runtime.bus_zenoh.messages import (
     MAX_ENCODING,
     SEQUENCE_ATTACHMENT,
+    ReadSample,
     SampleReader,
     first_line,
     has_wildcard,
     matches_whole_streams,
-    parse_sample,
     truncated_payload,
     zenoh_expression,
 )
@@ -51,6 +52,8 @@ LOG_INTERVAL_S = 60.0
 MAX_CHANNEL = 5 * MAX_BATCH
 MAX_BATCH_BYTES = 1 << 20
 
+LAST = "_max=1"
+"""Selector of the last message that a publisher caches on each key."""
 HISTORY_WITHIN_S = 10.0
 MAX_TRANSIT_S = 5.0  # of a message; a missing one was published at most this long before its predecessor arrived
 LAST_QUERY_PERIOD_S = 20.0
@@ -81,26 +84,6 @@ class ZenohRequest:
         self.query.drop()
 
 
-@dataclass
-class _Key:
-    """Publisher of a key."""
-
-    publisher: zenoh.ext.AdvancedPublisher
-    stream: str
-
-
-class _CacheReply(NamedTuple):
-    """Messages from publishers' caches.
-
-    Attributes:
-        messages: the messages.
-        is_complete: True if every publisher replied in time.
-    """
-
-    messages: list[SequencedMessage]
-    is_complete: bool
-
-
 class ZenohBus:
     """See `reactorwatch.runtime.bus.Bus`."""
 
@@ -118,8 +101,8 @@ class ZenohBus:
         self._new_keys, self._new_keys_at = float(MAX_NEW_KEYS), time.monotonic()  # token bucket of declarations
         self._config = config
         self._name = secrets.randbits(64)
-        self._keys: dict[str, _Key] = {}
-        self._numbers: dict[str, int] = {}  # next number of each stream
+        self._publishers: dict[str, tuple[zenoh.ext.AdvancedPublisher, str]] = {}  # and their streams, by key
+        self._numbers = Counter[str]()  # next number of each stream
         self._publishing = threading.Lock()  # messages are sent in the order of their numbers
         self._published_at: float | None = None
         self._declared: list[Any] = []  # Zenoh undeclares objects without a reference
@@ -136,13 +119,13 @@ class ZenohBus:
             self._publish_uncached(message)
             return
         with self._publishing:
-            key = self._keys.get(message.key)
-            if key is None:
-                key = self._keys[message.key] = self._declare_publisher(message.key)
-            number = self._numbers[key.stream]
-            self._numbers[key.stream] = number + 1
+            if message.key not in self._publishers:
+                self._publishers[message.key] = self._declare_publisher(message.key), stream_of(message.key)
+            publisher, stream = self._publishers[message.key]
+            number = self._numbers[stream]
+            self._numbers[stream] = number + 1
             attachment = SEQUENCE_ATTACHMENT.pack(self._name, number)
-            key.publisher.put(message.payload, encoding=message.encoding, attachment=attachment)
+            publisher.put(message.payload, encoding=message.encoding, attachment=attachment)
             self._published_at = time.monotonic()
 
     def _publish_uncached(self, message: Encoded) -> None:
@@ -162,13 +145,7 @@ class ZenohBus:
         publisher.put(message.payload, encoding=message.encoding)
 
     def subscribe(
-        self,
-        key_expression: str,
-        handler: Callable[[Encoded], None],
-        *,
-        on_gap: Callable[[Gap], None] | None = None,
-        history_s: float = 0.0,
-        on_history_end: Callable[[], None] | None = None,
+        self, key_expression: str, handler: Callable[[Encoded], None], **options: Unpack[SubscribeOptions]
     ) -> None:
         """See `Bus`."""
 
@@ -176,32 +153,16 @@ class ZenohBus:
             for message in messages:
                 handler(message)
 
-        delivery = self._make_delivery(key_expression, handle_each, on_gap)
+        delivery = self._make_delivery(key_expression, handle_each, options.get("on_gap"))
 
         def on_sample(sample: zenoh.Sample) -> None:
-            if has_wildcard(str(sample.key_expr)):
-                self._refuse_wildcard(str(sample.key_expr))
-                return
-            arrived = parse_sample(sample, time.time_ns())
-            if delivery is None or isinstance(arrived, Encoded):  # or its publisher does not number messages
-                handler(arrived if isinstance(arrived, Encoded) else arrived.message)
-            else:
-                delivery.receive((arrived,))
+            self._sort_out([SampleReader(sample.encoding).read(sample, time.time_ns())], delivery, handle_each)
 
         self._declare_subscriber(key_expression, on_sample)
-        if delivery is not None:
-            self._start(delivery, key_expression, history_s, on_history_end)
-        elif on_history_end is not None:
-            on_history_end()
+        self._start(delivery, key_expression, options)
 
     def subscribe_batched(
-        self,
-        key_expression: str,
-        handler: Callable[[list[Encoded]], None],
-        *,
-        on_gap: Callable[[Gap], None] | None = None,
-        history_s: float = 0.0,
-        on_history_end: Callable[[], None] | None = None,
+        self, key_expression: str, handler: Callable[[list[Encoded]], None], **options: Unpack[SubscribeOptions]
     ) -> None:
         """See `Bus`.
 
@@ -209,7 +170,7 @@ class ZenohBus:
         into a channel that one thread empties, in half the time a message. After each batch the thread pauses: under
         load batches get larger, and a single message is not delayed.
         """
-        delivery = self._make_delivery(key_expression, handler, on_gap)
+        delivery = self._make_delivery(key_expression, handler, options.get("on_gap"))
         # The thread holds the channel alone: a subscriber in use cannot be undeclared.
         channel = self._declare_subscriber(key_expression, zenoh.handlers.FifoChannel(MAX_CHANNEL)).handler
 
@@ -217,31 +178,29 @@ class ZenohBus:
             reader = SampleReader()
             with contextlib.suppress(zenoh.ZError):  # it is closed
                 while True:
-                    sample, now_ns = channel.recv(), time.time_ns()
-                    arrived, others = list[tuple[int, int, Encoded]](), list[Encoded]()
-                    left, room = MAX_BATCH, MAX_BATCH_BYTES
-                    while sample is not None:
-                        origin, message = reader.read(sample, now_ns)
-                        if has_wildcard(message.key):
-                            self._refuse_wildcard(message.key)
-                        elif origin is None or delivery is None:
-                            others.append(message)
-                        else:
-                            arrived.append((*origin, message))
-                        left, room = left - 1, room - len(message.payload)
-                        sample = channel.try_recv() if left and room > 0 else None
-                    if others:
-                        handler(others)
-                    if delivery is not None and arrived:
-                        delivery.receive(arrived)
+                    self._sort_out(_read_batch(channel, reader), delivery, handler)
                     time.sleep(BATCH_PERIOD_S)
 
         self._batch_threads.append(threading.Thread(target=empty, name="gather", daemon=True))
         self._batch_threads[-1].start()
-        if delivery is not None:
-            self._start(delivery, key_expression, history_s, on_history_end)
-        elif on_history_end is not None:
-            on_history_end()
+        self._start(delivery, key_expression, options)
+
+    def _sort_out(
+        self, read: Iterable[ReadSample], delivery: Delivery | None, handler: Callable[[list[Encoded]], None]
+    ) -> None:
+        """Deliver numbered messages in order, and hand over others at once."""
+        numbered, others = list[tuple[int, int, Encoded]](), list[Encoded]()
+        for origin, message in read:
+            if has_wildcard(message.key):
+                self._refuse_wildcard(message.key)
+            elif origin is None or delivery is None:  # its publisher does not number messages
+                others.append(message)
+            else:
+                numbered.append((*origin, message))
+        if others:
+            handler(others)
+        if delivery is not None and numbered:
+            delivery.receive(numbered)
 
     def subscribe_uncached(self, key_expression: str, handler: Callable[[Encoded], None]) -> None:
         """Subscribe to live messages only, each as it arrives.
@@ -274,7 +233,7 @@ class ZenohBus:
         """See `LAST_QUERY_PERIOD_S`; ends with the bus."""
         while not self._closed.wait(LAST_QUERY_PERIOD_S):
             with contextlib.suppress(zenoh.ZError):  # it is being closed
-                delivery.receive(self._query_cache(key_expression, "_max=1").messages)
+                delivery.receive(self._query_cache(key_expression, LAST)[0])
 
     def _declare_subscriber(self, key_expression: str, handler: Any) -> Any:
         """Subscribe, with a callback or a channel."""
@@ -285,29 +244,28 @@ class ZenohBus:
         self._declared.append(subscriber)
         return subscriber
 
-    def _start(
-        self, delivery: Delivery, key_expression: str, history_s: float, on_history_end: Callable[[], None] | None
-    ) -> None:
+    def _start(self, delivery: Delivery | None, key_expression: str, options: SubscribeOptions) -> None:
         """Query the history and start delivery."""
+        on_history_end, history_s = options.get("on_history_end"), options.get("history_s", 0.0)
+        if delivery is None:
+            if on_history_end is not None:
+                on_history_end()
+            return
         # The subscriber's own query of the history left out keys that were being published on meanwhile.
-        for _ in range(MAX_QUERIES):
-            answers = self._query_cache(key_expression, "_max=1")
-            for last in answers.messages:
-                delivery.set_last(last)
-            if answers.is_complete:
-                break
-        started, missing = time.monotonic(), history_s > 0.0
-        since_s = history_s
+        newest, is_complete = self._query_caches(key_expression, lambda _waited_s: LAST)
+        for last in newest:
+            delivery.set_last(last)
+        started, missing, since_s = time.monotonic(), history_s > 0.0, history_s
         for _ in range(MAX_QUERIES):
             if not missing:
                 break
-            answers = self._query_cache(key_expression, _history_selector(since_s))
-            for earlier in answers.messages:
+            history, is_complete = self._query_cache(key_expression, _history_selector(since_s))
+            for earlier in history:
                 delivery.add_history(earlier)
-            missing = not (answers.is_complete and delivery.history_complete())
+            missing = not (is_complete and delivery.history_complete())
             waited_s = time.monotonic() - started
-            since_s = HEARTBEAT_S + waited_s if answers.is_complete else history_s + waited_s
-        if missing or not answers.is_complete:
+            since_s = HEARTBEAT_S + waited_s if is_complete else history_s + waited_s
+        if missing or not is_complete:
             log.warning(
                 "publishers did not answer in time; what they published before may be missing", keys=key_expression
             )
@@ -331,12 +289,9 @@ class ZenohBus:
         """See `Bus`."""
         buffer: ReorderBuffer[Encoded] = ReorderBuffer(await_history=True)
         with contextlib.suppress(zenoh.ZError):  # it is closed
-            for _ in range(MAX_QUERIES):
-                answers = self._query_cache(key_expression, _history_selector(self._config.history_s))
-                for sent in answers.messages:
-                    buffer.add_history(sent.publisher, sent.stream, sent.message.key, sent.number, sent.message)
-                if answers.is_complete:
-                    break
+            selector = _history_selector(self._config.history_s)
+            for sent in self._query_caches(key_expression, lambda _waited_s: selector)[0]:
+                buffer.add_history(sent.publisher, sent.stream, sent.message.key, sent.number, sent.message)
         released = list(buffer.end_history(0))
         while (due_ns := buffer.due_ns()) is not None:  # missing messages are not waited for
             released += buffer.release_overdue(due_ns)
@@ -344,35 +299,43 @@ class ZenohBus:
 
     def _query_stream(self, stream: str, since_s: float) -> list[SequencedMessage]:
         """Messages of a stream from publishers' caches."""
-        messages, started = list[SequencedMessage](), time.monotonic()
         try:
-            for _ in range(MAX_QUERIES):
-                waited_s = time.monotonic() - started
-                answers = self._query_cache(keys_of(stream), _history_selector(since_s + waited_s + MAX_TRANSIT_S))
-                messages += answers.messages
-                if answers.is_complete:
-                    break
+            return self._query_caches(
+                keys_of(stream), lambda waited_s: _history_selector(since_s + waited_s + MAX_TRANSIT_S)
+            )[0]
         except zenoh.ZError as error:  # the bus is being closed, for instance
             log.info("cannot query missing messages", stream=stream, why=first_line(error))
-        return messages
+            return []
 
-    def _query_cache(self, key_expression: str, which: str) -> "_CacheReply":
-        """Query the publishers' caches."""
+    def _query_caches(
+        self, key_expression: str, selector: Callable[[float], str]
+    ) -> tuple[list[SequencedMessage], bool]:
+        """Query the publishers' caches until all of them reply in time; `selector` depends on the seconds waited."""
+        messages, started, is_complete = list[SequencedMessage](), time.monotonic(), False
+        for _ in range(MAX_QUERIES):
+            replies, is_complete = self._query_cache(key_expression, selector(time.monotonic() - started))
+            messages += replies
+            if is_complete:
+                break
+        return messages, is_complete
+
+    def _query_cache(self, key_expression: str, which: str) -> tuple[list[SequencedMessage], bool]:
+        """Query the publishers' caches once; returns their messages, and True if every publisher replied in time."""
         replies = self._session.get(
             f"{zenoh_expression(key_expression)}/{CACHE_SUFFIX}?{which}",
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=HISTORY_WITHIN_S,
         )
-        messages, complete = list[SequencedMessage](), True
+        messages, is_complete = list[SequencedMessage](), True
         for reply in replies:
             if reply.ok is None:  # Zenoh: a publisher did not reply in time, on a busy machine
-                complete = False
+                is_complete = False
                 continue
-            cached = parse_sample(reply.ok, time.time_ns())
-            if isinstance(cached, SequencedMessage) and not has_wildcard(cached.message.key):
-                messages.append(cached)
-        return _CacheReply(messages, complete)
+            origin, message = SampleReader(reply.ok.encoding).read(reply.ok, time.time_ns())
+            if origin is not None and not has_wildcard(message.key):
+                messages.append(SequencedMessage(*origin, message))
+        return messages, is_complete
 
     def _refuse_wildcard(self, key: str) -> None:
         """Count a message on many keys at once, which no node sends, and log it once a minute."""
@@ -382,13 +345,11 @@ class ZenohBus:
             self._wildcard_logged_at = now_s
             log.warning("refused: a message must be on one key", key=key[:MAX_ENCODING], so_far=self._wildcards)
 
-    def _declare_publisher(self, key: str) -> _Key:
-        stream = stream_of(key)
-        self._numbers.setdefault(stream, 0)
+    def _declare_publisher(self, key: str) -> zenoh.ext.AdvancedPublisher:
         # Of the same priority as all else: at a lower one, the end of the reply would overtake the replies.
         replies = zenoh.ext.RepliesConfig(congestion_control=zenoh.CongestionControl.BLOCK)
         drop = self._config.congestion == "drop"
-        publisher = zenoh.ext.declare_advanced_publisher(
+        return zenoh.ext.declare_advanced_publisher(
             self._voice,
             key,
             congestion_control=zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK,
@@ -396,7 +357,6 @@ class ZenohBus:
             sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
             publisher_detection=True,
         )
-        return _Key(publisher, stream)
 
     def declare_queryable(self, key_expression: str, handler: Callable[[Request], None]) -> None:
         """See `Bus`."""
@@ -451,7 +411,11 @@ class ZenohBus:
         for _ in self._voice.get(NO_QUERYABLE, timeout=FLUSH_WITHIN_S):
             pass
         # Advanced ones may outlive the session otherwise, and hang the process (eclipse-zenoh/zenoh-python#624).
-        for declared in (*self._declared, *self._tokens.values(), *(key.publisher for key in self._keys.values())):
+        for declared in (
+            *self._declared,
+            *self._tokens.values(),
+            *(publisher for publisher, _ in self._publishers.values()),
+        ):
             with contextlib.suppress(zenoh.ZError):
                 declared.undeclare()
         self._session.close()
@@ -475,6 +439,17 @@ def cache_size(key: str, cache_messages: int) -> int:
     topic = keys.parse(key)
     is_of_every_row = topic is not None and topic.kind in EVERY_ROW and topic.name.split("/")[0] not in RARE_CHARTS
     return cache_messages if is_of_every_row else min(cache_messages, MAX_CACHED_OF_OTHERS)
+
+
+def _read_batch(channel: Any, reader: SampleReader) -> Iterator[ReadSample]:
+    """Wait for a sample, and read it and those that have arrived until then."""
+    sample, now_ns = channel.recv(), time.time_ns()
+    left, room = MAX_BATCH, MAX_BATCH_BYTES
+    while sample is not None:
+        read = reader.read(sample, now_ns)
+        yield read
+        left, room = left - 1, room - len(read[1].payload)
+        sample = channel.try_recv() if left and room > 0 else None
 
 
 def _history_selector(seconds: float) -> str:

@@ -2,11 +2,11 @@
 
 import re
 import struct
+from typing import TypeAlias
 
 import zenoh
 
 from reactorwatch.contract.codec import MAX_PAYLOAD, Encoded
-from reactorwatch.runtime.delivery.delivery import SequencedMessage
 from reactorwatch.runtime.delivery.streams import STREAM_PARTS
 
 MAX_ENCODING = 1000
@@ -14,6 +14,9 @@ MAX_KEY = 1000
 """Characters of a key whose messages are put in order. A key may have 65,535, and names of streams are stored."""
 
 SEQUENCE_ATTACHMENT = struct.Struct("<QQ")  # publisher, and sequence number in the stream
+
+ReadSample: TypeAlias = tuple[tuple[int, int] | None, Encoded]
+"""Publisher and number of a sample, if it has them, and its message."""
 
 
 def truncated_payload(payload: zenoh.ZBytes) -> bytes:
@@ -37,7 +40,7 @@ class SampleReader:
     def __init__(self, encoding: zenoh.Encoding = zenoh.Encoding.ZENOH_BYTES) -> None:
         self._encoding, self._text = encoding, truncated_encoding(encoding)
 
-    def read(self, sample: zenoh.Sample, now_ns: int) -> tuple[tuple[int, int] | None, Encoded]:
+    def read(self, sample: zenoh.Sample, now_ns: int) -> ReadSample:
         """Publisher and number, if the sample has them and its key is at most `MAX_KEY`; and the message."""
         encoding = sample.encoding
         if encoding != self._encoding:
@@ -63,12 +66,6 @@ def has_wildcard(key: str) -> bool:
 def truncated_encoding(encoding: zenoh.Encoding) -> str:
     """Text of an encoding; senders control its length, so it is cut."""
     return str(encoding)[:MAX_ENCODING]
-
-
-def parse_sample(sample: zenoh.Sample, now_ns: int) -> SequencedMessage | Encoded:
-    """Convert a single sample, see `SampleReader`; with its number if it has one."""
-    who, message = SampleReader(sample.encoding).read(sample, now_ns)
-    return message if who is None else SequencedMessage(*who, message)
 
 
 def zenoh_expression(key_expression: str) -> str:

@@ -16,7 +16,6 @@ from reactorwatch.runtime.bus_zenoh.messages import first_line
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.heap import release_large_blocks
-from reactorwatch.runtime.security.identity import ROUTER_FILES, TLS, client_tls
 
 log = structlog.get_logger()
 
@@ -24,6 +23,10 @@ FIRST_RETRY_S = 0.1
 MAX_RETRY_S = 2.0
 LOG_INTERVAL_S = 30.0
 STUCK_S = 1.0
+
+_TLS = "transport/link/tls"
+_ROUTER_FILES = ("root_ca_certificate", "listen_certificate", "listen_private_key")
+"""Keys of a router's TLS settings whose values are files."""
 
 _SHARED_MEMORY = "transport/shared_memory/enabled"
 _TRANSPORT = {
@@ -99,8 +102,16 @@ def _client(config: BusConfig) -> zenoh.Config:
         "scouting/multicast/enabled": False,
         "timestamping/enabled": True,  # they give the age of a message
         **_TRANSPORT,
-        **client_tls(config),
     }
+    if config.ca is not None:
+        settings |= {
+            f"{_TLS}/root_ca_certificate": config.ca,
+            f"{_TLS}/connect_certificate": config.certificate,
+            f"{_TLS}/connect_private_key": config.key,
+            f"{_TLS}/enable_mtls": True,
+            f"{_TLS}/verify_name_on_connect": True,
+            f"{_TLS}/close_link_on_expiration": True,
+        }
     return _validate(settings, config.endpoint)
 
 
@@ -151,26 +162,22 @@ def router_from_file(path: Path) -> ZenohBus:
     try:
         config = zenoh.Config.from_file(str(path))
         config.insert_json5(_SHARED_MEMORY, "false")
-        for name in ROUTER_FILES:
-            file = json.loads(config.get_json(f"{TLS}/{name}"))
+        for name in _ROUTER_FILES:
+            file = json.loads(config.get_json(f"{_TLS}/{name}"))
             if file is not None:
-                config.insert_json5(f"{TLS}/{name}", json.dumps(str(path.parent / file)))
+                config.insert_json5(f"{_TLS}/{name}", json.dumps(str(path.parent / file)))
         return ZenohBus(zenoh.open(config), BusConfig())
     except zenoh.ZError as error:
         raise InputError(f"router settings {path}: {first_line(error)}") from error
 
 
-def _zenoh_config(settings: dict[str, Any]) -> zenoh.Config:
-    config = zenoh.Config()
-    for path, value in settings.items():
-        config.insert_json5(path, json.dumps(value))
-    return config
-
-
 def _validate(settings: dict[str, Any], endpoint: str) -> zenoh.Config:
+    config = zenoh.Config()
     try:
-        return _zenoh_config(settings)
+        for path, value in settings.items():
+            config.insert_json5(path, json.dumps(value))
     except zenoh.ZError as error:
         raise InputError(
             f"endpoint must be like 'tcp/127.0.0.1:7447', got {endpoint!r}: {first_line(error)}"
         ) from error
+    return config

@@ -8,20 +8,16 @@ that worker, so a job that it gives up gets a last run when it has the cluster t
 
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any
 
 from reactorwatch import __version__
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.parallel.jobs import Failed, internal_error, one_line, run_job, worker_death
+from reactorwatch.runtime.parallel.jobs import Failed, Job, Result, internal_error, one_line, run_job, worker_death
 
 CONNECT_WITHIN_S = 10.0
 WORKERS_WITHIN_S = 60.0  # a worker on a busy machine takes half a minute to start
 
 ASK_AGAIN_S = 0.2
-
-Job = TypeVar("Job")
-Result = TypeVar("Result")
 
 
 class DaskExecutor:
@@ -51,9 +47,15 @@ class DaskExecutor:
         Raises:
             InputError: there is no scheduler, it has no workers, or they have another version of this software.
         """
+        from distributed import Client
         from distributed.scheduler import KilledWorker
 
-        with _client(self._address) as client:
+        try:
+            connection = Client(self._address, timeout=CONNECT_WITHIN_S, set_as_default=False)
+        except (OSError, ValueError) as unreachable:
+            text = one_line(unreachable)
+            raise InputError(f"--scheduler {self._address}: cannot be reached: {text}") from unreachable
+        with connection as client:
             _check_workers(client, self._address)
             indices = {client.submit(run_job, work, job, pure=False): index for index, job in enumerate(jobs)}
             suspects: list[int] = []
@@ -70,11 +72,7 @@ class DaskExecutor:
                 yield index, worker_death(error.allowed_failures + 1) if killed else _outcome(alone)
 
     def _in_completion_order(self, client: Any, futures: list[Any]) -> Iterator[Any]:
-        """Yield futures as they complete.
-
-        Raises:
-            InputError: the cluster has lost all its workers, and no others start.
-        """
+        """Yield futures as they complete."""
         from distributed import as_completed
 
         pending = set(futures)
@@ -93,18 +91,6 @@ def _outcome(future: Any) -> Any:
     if error is not None:  # no error of the job, those are results: it could not be sent or read
         return internal_error(error)
     return future.result()
-
-
-@contextmanager
-def _client(address: str) -> Iterator[Any]:
-    from distributed import Client
-
-    try:
-        client = Client(address, timeout=CONNECT_WITHIN_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"--scheduler {address}: cannot be reached: {one_line(error)}") from error
-    with client:
-        yield client
 
 
 def _check_workers(client: Any, address: str) -> None:

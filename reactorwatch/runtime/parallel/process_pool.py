@@ -18,17 +18,14 @@ from dataclasses import dataclass
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
-from reactorwatch.runtime.parallel.jobs import RETRIES, Failed, internal_error, run_job, worker_death
+from reactorwatch.runtime.parallel.jobs import RETRIES, Failed, Job, Result, internal_error, run_job, worker_death
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that libraries of linear algebra read when they are loaded."""
 
 END_WITHIN_S = 5.0
-
-Job = TypeVar("Job")
-Result = TypeVar("Result")
 
 _SPAWN = get_context("spawn")
 

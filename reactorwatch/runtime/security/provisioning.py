@@ -32,6 +32,7 @@ from reactorwatch.runtime.security.certificates import (
     read_key,
 )
 from reactorwatch.runtime.security.site_register import Register, read_register
+from reactorwatch.runtime.setting_rules import LAST_PORT
 
 AUTHORITY, ROUTER = "authority", "router"
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
@@ -41,14 +42,10 @@ FILES = (CA, CERTIFICATE, KEY, ROUTER_SETTINGS, SETTINGS, REGISTER_FILE)
 DEFAULT_ENDPOINT = "tls/127.0.0.1:7447"
 AUTHORITY_DAYS = 3650.0
 
-
 MAX_DAYS = 3650.0
 MAX_COMMON_NAME = 64
 """Letters of a certificate's common name (RFC 5280, ub-common-name)."""
 MAX_PLANT_NAME = MAX_COMMON_NAME - max(len(common_name("", role.name)) for role in ROLES) - 2 * SERIAL_BYTES - 1
-
-Write = Callable[[Path], None]
-"""Writes the files of an identity into a folder."""
 
 
 def make_site(
@@ -139,11 +136,7 @@ def _check(plants: tuple[str, ...], days: float) -> None:
 
 
 def _check_paths(folder: Path, holders: list[str]) -> None:
-    """Check, before anything is written, that every path of a site is free or of its kind.
-
-    Raises:
-        InputError: a path is taken by something else.
-    """
+    """Check, before anything is written, that every path of a site is free or of its kind."""
     for name in (AUTHORITY, ROUTER, *holders):
         home = folder / name
         for path in (folder, home.parent, home):
@@ -155,11 +148,7 @@ def _check_paths(folder: Path, holders: list[str]) -> None:
 
 
 def _find_plants(folder: Path) -> list[str]:
-    """Names of the plants with a folder in a site.
-
-    Raises:
-        InputError: a folder of another name holds a role.
-    """
+    """Names of the plants with a folder in a site."""
     plants = []
     for holder in sorted(folder.glob("*/*")):
         plant = holder.parent.name
@@ -178,11 +167,7 @@ def _has_certificates(folder: Path, there: list[str]) -> bool:
 
 
 def _update_register(folder: Path, there: list[str], endpoint: str | None, listen: str | None) -> Register:
-    """The register of the site with the given addresses.
-
-    Raises:
-        InputError: the site's authority or its register is missing, or an address is malformed.
-    """
+    """The register of the site with the given addresses."""
     home = folder / AUTHORITY
     is_old = _has_certificates(folder, there)
     if is_old and not (home / KEY).exists():
@@ -214,14 +199,7 @@ def _load_authority(folder: Path, now: datetime.datetime, *, is_old: bool) -> tu
 
 
 class _Issuer:
-    """Completes folders of identities.
-
-    Args:
-        ca: the authority.
-        now: time from which new certificates are valid.
-        days: days for which new certificates are valid.
-        until: certificates that end before this time are renewed.
-    """
+    """Completes folders of identities; certificates that end before `until` are renewed."""
 
     def __init__(self, ca: Identity, now: datetime.datetime, days: float, until: datetime.datetime) -> None:
         self._ca, self._now, self._days, self._until = ca, now, days, until
@@ -232,14 +210,7 @@ class _Issuer:
         self._ca_pem = ca.certificate.public_bytes(serialization.Encoding.PEM)
 
     def complete(self, folder: Path, name: str, hosts: tuple[str, ...] = (), settings: str = "") -> bool:
-        """Make the missing, damaged and outdated files of a folder; returns False if there are none.
-
-        Args:
-            folder: folder of the holder.
-            name: common name of its certificate.
-            hosts: host names and addresses of a router.
-            settings: text of `settings.toml`, which is not replaced.
-        """
+        """Make the missing, damaged and outdated files of a folder; returns False if there are none."""
         is_new = not self._is_valid(folder, name)
         if not is_new and (folder / CA).is_file() and (not settings or (folder / SETTINGS).is_file()):
             return False
@@ -248,7 +219,7 @@ class _Issuer:
             if is_new:
                 issue(self._ca, name, self._now, self._days, hosts).write(new / CERTIFICATE, new / KEY)
             (new / CA).write_bytes(self._ca_pem)
-            if settings and not (folder / SETTINGS).exists():
+            if settings and not (folder / SETTINGS).exists():  # it may have been edited
                 (new / SETTINGS).write_text(settings, encoding="utf-8")
 
         _install(folder, write)
@@ -264,7 +235,7 @@ class _Issuer:
         return is_pair and read_common_name(certificate) == name and certificate.not_valid_after_utc > self._until
 
 
-def _install(folder: Path, write: Write, mode: int = 0o777) -> None:
+def _install(folder: Path, write: Callable[[Path], None], mode: int = 0o777) -> None:
     """Write files to a temporary folder and move them into `folder`; a new folder appears complete."""
     new = folder.with_name(f".{folder.name}.new")
     if new.is_symlink() or new.is_file():
@@ -321,15 +292,10 @@ def _settings(plant: str, endpoint: str) -> str:
 
 
 _ADDRESS = re.compile(r"tls/(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>\d{1,5})")
-LAST_PORT = 65535
 
 
 def _parse_host(endpoint: str) -> str:
-    """Host of an address.
-
-    Raises:
-        InputError: it is no address for TLS.
-    """
+    """Host of an address."""
     match = _ADDRESS.fullmatch(endpoint)
     if match is None or not 1 <= int(match["port"]) <= LAST_PORT:
         raise InputError(

@@ -19,7 +19,7 @@ def test_all_files_appear_at_the_end(tmp_path: Path, there: bool) -> None:
         out.mkdir(parents=True)
         (out / "old.csv").write_text("old")
         (out / "kept.csv").write_text("kept")
-    with fill_folder(out, "--out") as folder:
+    with fill_folder(out) as folder:
         (folder / "new.csv").write_text("new")
         (folder / "old.csv").write_text("new")
         assert not (out / "new.csv").exists()
@@ -48,6 +48,6 @@ def test_an_exception_leaves_the_folder_as_it_was(tmp_path: Path, error: BaseExc
 
 def test_where_no_folder_can_be_made_it_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match=r"--out .*cannot be made"), fill_folder(tmp_path / "file" / "in", "--out"):
+    with pytest.raises(InputError, match=r"--out .*cannot be made"), fill_folder(tmp_path / "file" / "in"):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -12,7 +12,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import MetricsConfig, section
 from reactorwatch.runtime.loopback import LOOPBACK
-from reactorwatch.runtime.metrics import PORT_OFFSET, FleetMetrics, Metrics, serve_metrics
+from reactorwatch.runtime.metrics import PORT_OFFSET, Metrics, serve_metrics
 from tests.ports import three_free_ports
 from tests.running import WITHIN_S
 
@@ -75,10 +75,10 @@ def alarms() -> list[Alarm]:
 def tell(port: int, alarms: list[Alarm]) -> Iterator[Told]:
     """Publishes as the monitor, whose page is served."""
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    with serve_metrics(MetricsConfig(port=port), Metrics("R-101", "monitor", lambda: 5_000_000), "monitor") as metrics:
+    page = Metrics("monitor", {"R-101": lambda: alarms}, lambda: 5_000_000)
+    with serve_metrics(MetricsConfig(port=port), page) as metrics:
         assert metrics is not None
-        told = metrics.observe(lambda: alarms)
-        yield lambda message: told(Publication("key", message))
+        yield lambda message: metrics.on_publish(Publication("reactor/R-101/of/node", message))
 
 
 def test_the_counts_of_health_are_there_in_base_units(port: int, tell: Told) -> None:
@@ -136,7 +136,7 @@ def test_the_page_of_a_fleet_has_the_counts_and_alarms_of_each_plant_that_is_wat
 ) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     found: dict[str, list[Alarm] | None] = {"a": alarms, "b": alarms[1:], "c": alarms}
-    with serve_metrics(MetricsConfig(port=port), FleetMetrics("monitor"), "monitor") as metrics:
+    with serve_metrics(MetricsConfig(port=port), Metrics("monitor")) as metrics:
         assert metrics is not None
         for plant in found:
             metrics.add_plant(plant, lambda plant=plant: found[plant])  # type: ignore[misc]
@@ -165,7 +165,7 @@ def test_the_page_of_a_fleet_has_so_many_plants_and_one_that_leaves_makes_room(
 ) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     monkeypatch.setattr("reactorwatch.runtime.metrics.MAX_PLANTS", 2)
-    with serve_metrics(MetricsConfig(port=port), FleetMetrics("monitor"), "monitor") as metrics:
+    with serve_metrics(MetricsConfig(port=port), Metrics("monitor")) as metrics:
         assert metrics is not None
         for plant in "abc":
             metrics.add_plant(plant, lambda: None)
@@ -182,19 +182,19 @@ def test_a_disk_that_is_gone_leaves_its_number_out(port: int) -> None:
         raise FileNotFoundError
 
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    with serve_metrics(MetricsConfig(port=port), Metrics("R-101", "recorder", gone), "recorder"):
+    with serve_metrics(MetricsConfig(port=port), Metrics("recorder", {"R-101": None}, gone)):
         assert not any("disk" in name for name in page(port, "recorder"))
 
 
 def test_nothing_is_served_unless_asked() -> None:
-    with serve_metrics(MetricsConfig(), Metrics("R-101", "plant"), "plant") as metrics:
+    with serve_metrics(MetricsConfig(), Metrics("plant", {"R-101": None})) as metrics:
         assert metrics is None
 
 
 def test_the_page_goes_with_the_node(port: int) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     for _ in range(2):  # the port is free again, too
-        with serve_metrics(MetricsConfig(port=port), Metrics("R-101", "plant"), "plant"):
+        with serve_metrics(MetricsConfig(port=port), Metrics("plant", {"R-101": None})):
             assert page(port, "plant")
     with pytest.raises(OSError, match="refused"):
         page(port, "plant")
@@ -203,7 +203,7 @@ def test_the_page_goes_with_the_node(port: int) -> None:
 def test_a_port_that_is_taken_is_told_with_the_node_and_the_address(port: int) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     with socket.create_server((LOOPBACK, port + 1)):
-        metrics = serve_metrics(MetricsConfig(port=port), Metrics("R-101", "monitor"), "monitor")
+        metrics = serve_metrics(MetricsConfig(port=port), Metrics("monitor", {"R-101": None}))
         said = rf"\[metrics\] port {port}: the monitor cannot listen at 127\.0\.0\.1:{port + 1}: "
         with pytest.raises(InputError, match=said), metrics:
             pass
@@ -211,7 +211,7 @@ def test_a_port_that_is_taken_is_told_with_the_node_and_the_address(port: int) -
 
 def test_without_the_library_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
-    metrics = serve_metrics(MetricsConfig(port=9464), Metrics("R-101", "monitor"), "monitor")
+    metrics = serve_metrics(MetricsConfig(port=9464), Metrics("monitor", {"R-101": None}))
     with pytest.raises(InputError, match=r"pip install 'reactorwatch\[metrics\]'"), metrics:
         pass
 

@@ -18,7 +18,7 @@ from monitor_node.storage.fleet_states import FleetStates
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmKpis
-from reactorwatch.runtime.metrics import FleetMetrics
+from reactorwatch.runtime.metrics import Metrics
 from reactorwatch.runtime.security.command_rate import PER_NAME
 from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S
@@ -172,7 +172,7 @@ def test_a_flood_of_commands_is_refused_and_leaves_quiet_plants_quiet(
 
 def test_the_counts_and_alarms_of_each_plant_are_on_the_page_as_long_as_it_is_watched(bench: Bench) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    metrics = bench.node.metrics = FleetMetrics("monitor")
+    metrics = bench.node.metrics = Metrics("monitor")
     plant = next(name for name in map(str, range(99)) if home_shard(name, 2) == 2)
     bench.node.on_alive(f"reactor/{plant}/alive/plant", True, bench.now_ns)
     bench.tick_until_watched(plant)
