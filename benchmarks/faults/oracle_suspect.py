@@ -3,9 +3,9 @@
 Some causes imitate each other so well (see `bank.TWINS`) that no method distinguishes them in the noise of a run. This
 oracle knows the onset, the profile, the equations, the state before the onset, the spread of the noise, and the run to
 its end. For every cause that the monitor compares it fits the size, by least squares over the noise of the measurements
-(Gauss and Newton's steps with central differences, halved until they gain), and it suspects the one that fits best: for
-independent normal noise the likeliest, if all were equally likely before. Where a fault puts the reactor out those
-steps may end in a local minimum; so that the true cause is not missed for that, its true size is tried as well.
+(Gauss and Newton's steps, halved until they gain), and it suspects the one that fits best: for independent normal noise
+the likeliest, if all were equally likely before. Where a fault puts the reactor out those steps may end in a local
+minimum; so that the true cause is not missed for that, its true size is tried as well.
 """
 
 from math import inf
@@ -27,7 +27,6 @@ REACH = 3.0
 """Sizes up to this times the large one of the bank are tried."""
 
 _STEPS, _HALVINGS, _GAIN = 25, 8, 0.1
-_DIFFERENCE = 1e-4  # of the typical size
 
 
 def oracle_suspect(case: Case, record: Record, truth: Truth) -> str:
@@ -53,20 +52,17 @@ def _misfit(effect: Effect, case: Case, record: Record, truth: Truth, since: int
     name = f"{effect.name}.size"
     shape = profile_changes(case, effect.name)
 
-    largest = REACH * next(item.sizes[-1] for item in BANK if item.cause == effect.name)
-    lower, upper = max(effect.lower, -largest), min(effect.upper, largest)
-    step = _DIFFERENCE * abs(effect.typical)
-
     def at(size: float) -> tuple[float, Array, Array]:
         """Sum of squares, residuals and their derivatives but for the sign."""
-        sizes = (size, max(size - step, lower), min(size + step, upper))
         try:
-            runs = [simulator.run(time_min, flows, start, shape | {name: item}).outputs / NOISE_SD for item in sizes]
+            run, sensitivities = simulator.run_with_sensitivities(time_min, flows, start, [name], shape | {name: size})
         except SimulationError:  # no plant goes there
             return inf, np.zeros(1), np.zeros(1)
-        residuals = (measured / NOISE_SD - runs[0]).ravel()
-        return float(residuals @ residuals), residuals, (runs[2] - runs[1]).ravel() / (sizes[2] - sizes[1])
+        residuals = ((measured - run.outputs) / NOISE_SD).ravel()
+        return float(residuals @ residuals), residuals, (sensitivities.outputs[:, :, 0] / NOISE_SD).ravel()
 
+    largest = REACH * next(item.sizes[-1] for item in BANK if item.cause == effect.name)
+    lower, upper = max(effect.lower, -largest), min(effect.upper, largest)
     size = 0.0
     squares, residuals, slopes = at(size)
     for _ in range(_STEPS):

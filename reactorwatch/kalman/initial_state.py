@@ -18,7 +18,7 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, output_function
-from reactorwatch.process.effect_states import reset_function, rest_function, with_jacobian
+from reactorwatch.process.effect_states import reset_function, rest_function, with_derivatives
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, SteadyStates
 
@@ -149,4 +149,4 @@ def correction_function(model: ProcessModel) -> ca.Function:
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
 def _memory_functions(model: ProcessModel) -> tuple[ca.Function, ca.Function]:
     """`rest_function` and `reset_function`, with their derivatives."""
-    return with_jacobian(rest_function(model)), with_jacobian(reset_function(model))
+    return with_derivatives(rest_function(model), 0), with_derivatives(reset_function(model), 0)

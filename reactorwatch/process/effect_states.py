@@ -119,8 +119,9 @@ def reset_function(model: ProcessModel) -> ca.Function:
     return ca.Function("reset", symbols, [ca.densify(result)])
 
 
-def with_jacobian(function: ca.Function) -> ca.Function:
-    """Append the derivative of the only result with respect to the first argument."""
+def with_derivatives(function: ca.Function, *arguments: int) -> ca.Function:
+    """Append the derivatives of the only result with respect to some arguments, given by index."""
     symbols = function.sx_in()
     result = function(*symbols)
-    return ca.Function(function.name(), symbols, [result, ca.densify(ca.jacobian(result, symbols[0]))])
+    derivatives = (ca.densify(ca.jacobian(result, symbols[i])) for i in arguments)
+    return ca.Function(function.name(), symbols, [result, *derivatives])

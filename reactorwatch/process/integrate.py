@@ -10,11 +10,14 @@ upset, an ignition: the reaction then has time constants below a second) the int
 A step never crosses a sample, where the input jumps, nor a breakpoint of the model.
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from math import isfinite
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
@@ -89,35 +92,98 @@ def _weighted_sum(weights: tuple[float, ...], slopes: list[ca.SX]) -> ca.SX:
     return sum(terms, ca.SX(0))
 
 
+@dataclass(frozen=True, eq=False)
 class StepGrid:
     """Consecutive integration steps of a run, which end at every sample and every breakpoint.
-
-    Args:
-        time_min: shape (rows,), increasing.
-        breakpoints: shape (n,), times in minutes; those outside the record have no effect.
 
     Attributes:
         start_min: start of each step, shape (steps,).
         length_min: length of each step, shape (steps,).
         middle_min: middle of the interval without a jump that contains the step, shape (steps,).
         row: row of the record whose input holds, shape (steps,).
+        origin: breakpoint at the start of that interval, shape (steps,); -1: none.
+        target: breakpoint at its end, shape (steps,); -1: none.
+        share_before: share of the interval before the step, in [0, 1), shape (steps,).
+        share: share of the interval that the step covers, in (0, 1], shape (steps,).
         end_of_row: index of the step that ends at the following row, shape (rows - 1,).
     """
 
-    def __init__(self, time_min: Array, breakpoints: Array) -> None:
-        inside = (breakpoints > time_min[0]) & (breakpoints < time_min[-1])
-        edges = np.union1d(time_min, breakpoints[inside])
-        interval, before_jump = np.diff(edges), np.nextafter(edges[1:], -np.inf)
-        counts = np.maximum(np.ceil(interval / LONGEST_STEP_MIN - 1e-9).astype(np.int64), 1)
+    start_min: Array
+    length_min: Array
+    middle_min: Array
+    row: NDArray[np.int64]
+    origin: NDArray[np.int64]
+    target: NDArray[np.int64]
+    share_before: Array
+    share: Array
+    end_of_row: NDArray[np.int64]
+
+    def refine(self, cuts: Mapping[int, Array]) -> "StepGrid":
+        """Cut some steps.
+
+        Args:
+            cuts: lengths of the parts of a step, by index of the step.
+        """
+        counts = np.ones(self.length_min.size, dtype=np.int64)
+        counts[list(cuts)] = [lengths.size for lengths in cuts.values()]
+        parts = np.repeat(np.arange(counts.size), counts)
+        length = self.length_min[parts]
         ends = np.cumsum(counts)
-        part = np.repeat(np.arange(interval.size), counts)
-        position = np.arange(part.size) - (ends - counts)[part]
-        share = 1.0 / counts[part]
-        self.start_min = edges[part] + position * share * interval[part]
-        self.length_min = share * interval[part]
-        self.middle_min = np.minimum(0.5 * (edges[:-1] + edges[1:]), before_jump)[part]
-        self.row = np.searchsorted(time_min, edges[part], side="right") - 1
-        self.end_of_row = ends[np.searchsorted(edges[1:], time_min[1:], side="left")] - 1
+        for step, lengths in cuts.items():
+            length[ends[step] - lengths.size : ends[step]] = lengths
+        total = np.cumsum(length)
+        before = total - length - np.concatenate(([0.0], total[ends[:-1] - 1]))[parts]
+        uncut = np.where(self.length_min > 0, self.length_min, 1.0)[parts]  # a step of zero length is not cut
+        fraction = np.where(counts[parts] > 1, length / uncut, 1.0)
+        fraction_before = before / uncut
+        return StepGrid(
+            start_min=self.start_min[parts] + before,
+            length_min=length,
+            middle_min=self.middle_min[parts],
+            row=self.row[parts],
+            origin=self.origin[parts],
+            target=self.target[parts],
+            share_before=self.share_before[parts] + fraction_before * self.share[parts],
+            share=fraction * self.share[parts],
+            end_of_row=ends[self.end_of_row] - 1,
+        )
+
+
+def step_grid(time_min: Array, breakpoints: Array, longest_min: float = LONGEST_STEP_MIN) -> StepGrid:
+    """Make steps that end at every sample and every breakpoint.
+
+    A breakpoint on a sample opens an interval of zero length before it: derivatives with respect to it are those
+    towards later times. Of coinciding breakpoints, the last gets the derivative of all.
+
+    Args:
+        time_min: shape (rows,), increasing.
+        breakpoints: shape (n,), times in minutes; those outside the record have no effect.
+        longest_min: the longest step.
+    """
+    inside = np.flatnonzero((breakpoints >= time_min[0]) & (breakpoints < time_min[-1]))
+    edges = np.concatenate([time_min, breakpoints[inside]])
+    marks = np.concatenate([np.full(time_min.size, -1), inside])
+    order = np.argsort(edges, kind="stable")
+    edges, marks = edges[order], marks[order]
+    interval = np.diff(edges)
+    middle = np.minimum(0.5 * (edges[:-1] + edges[1:]), np.nextafter(edges[1:], -np.inf))  # before the jump at its end
+    counts = np.maximum(np.ceil(interval / longest_min - 1e-9).astype(np.int64), 1)
+    part = np.repeat(np.arange(interval.size), counts)
+    position = np.arange(part.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    share = 1.0 / counts[part]
+    row = np.searchsorted(time_min, edges[:-1], side="right") - 1
+    ends = np.cumsum(counts) - 1
+    return StepGrid(
+        start_min=edges[part] + position * share * interval[part],
+        length_min=share * interval[part],
+        middle_min=middle[part],
+        row=row[part],
+        origin=marks[part],
+        target=marks[part + 1],
+        share_before=position * share,
+        share=share,
+        end_of_row=ends[np.searchsorted(edges[1:], time_min[1:], side="left")],
+    )
 
 
 class Stepper:
@@ -130,12 +196,8 @@ class Stepper:
     def __init__(self, model: ProcessModel) -> None:
         self._model = model
         self._step = ArrayFunction(symbolic_step(model))
-        self._break_indices = [model.parameter_names.index(name) for name in model.breakpoints]
+        self._breakpoints = [model.parameter_names.index(name) for name in model.breakpoints]
         self._reset = ArrayFunction(reset_function(model)) if model.resets else None
-
-    def breakpoints(self, p: Array) -> Array:
-        """Breakpoints of the model with these parameters, shape (n,), in minutes."""
-        return p[self._break_indices]
 
     def start_row(self, x: Array, u: Array, p: Array, time_min: float) -> Array:
         """State after the jumps (`ProcessModel.resets`) at a row.
@@ -164,7 +226,7 @@ class Stepper:
         Raises:
             SimulationError: the equations cannot be integrated further.
         """
-        jumps = sorted({point for point in self.breakpoints(p).tolist() if start_min < point < end_min})
+        jumps = sorted({float(p[i]) for i in self._breakpoints if start_min < p[i] < end_min})
         edges = [start_min, *jumps, end_min]
         for left, right in pairwise(edges):
             x, _ = self.integrate(x, u, p, left, right - left, 0.5 * (left + right))

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.process.integrate import SimulationError, StepGrid, Stepper, symbolic_step
+from reactorwatch.process.integrate import SimulationError, Stepper, step_grid, symbolic_step
 from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.library.cstr.effects.heat_transfer import HeatTransfer
 from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
@@ -82,13 +82,26 @@ def test_equations_too_stiff_for_it_are_told_and_do_not_hang() -> None:
 
 def test_grid_ends_a_step_at_every_sample_and_breakpoint() -> None:
     time_min = np.array([0.0, 0.1, 0.37, 0.4])
-    grid = StepGrid(time_min, np.array([0.2123, -1.0, 9.0]))
+    grid = step_grid(time_min, np.array([0.2123, -1.0, 9.0]))
     ends = grid.start_min + grid.length_min
     np.testing.assert_allclose(ends[grid.end_of_row], time_min[1:], rtol=0, atol=1e-15)
     assert np.min(np.abs(ends - 0.2123)) < 1e-15
     assert np.all(grid.length_min <= 0.05 + 1e-12)
     np.testing.assert_allclose(np.diff(grid.start_min), grid.length_min[:-1], rtol=0, atol=1e-15)
     np.testing.assert_array_equal(grid.row, np.searchsorted(time_min, grid.start_min + 1e-9) - 1)
+
+
+def test_refined_grid_covers_the_same_time() -> None:
+    grid = step_grid(np.array([0.0, 0.1, 0.2]), np.array([0.1]))
+    fine = grid.refine({1: grid.length_min[1] * np.array([0.25, 0.75]), 3: grid.length_min[3] * np.array([0.5, 0.5])})
+    assert fine.length_min.size == grid.length_min.size + 2
+    np.testing.assert_allclose(fine.start_min[1:], np.cumsum(fine.length_min)[:-1], atol=1e-15)
+    np.testing.assert_allclose((fine.start_min + fine.length_min)[fine.end_of_row], [0.1, 0.2], atol=1e-15)
+    # the parts of a stretch add up to it, cut or not
+    for of_grid in (grid, fine):
+        assert np.isfinite(of_grid.share).all()
+        assert of_grid.share[of_grid.target == 0].sum() == pytest.approx(1.0)
+        assert of_grid.share[of_grid.origin == 0].sum() == pytest.approx(1.0)
 
 
 def test_two_faults_may_set_in_at_once() -> None:

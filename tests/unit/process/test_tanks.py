@@ -87,6 +87,18 @@ def test_at_its_neutral_size_it_is_the_base_model_and_at_another_it_is_not(effec
 
 
 @of_every_effect
+def test_its_sensitivity_is_a_difference_of_runs(effect: Effect) -> None:
+    simulator, name, step = Simulator(effect.extend(tanks())), f"{effect.name}.size", 1e-4 * effect.typical
+    _, found = simulator.run_with_sensitivities(TIMES, FLOWS, START, [name], {name: effect.typical})
+    up, down = (
+        simulator.run(TIMES, FLOWS, START, {name: effect.typical + sign * step}).outputs for sign in (1.0, -1.0)
+    )
+    expected = (up - down) / (2 * step)
+    share = 1e-2 if effect.name == "overflow" else 1e-4  # one step leaps over the whole of the soft corner at the brim
+    np.testing.assert_allclose(found.outputs[:, :, 0], expected, atol=share * np.max(np.abs(expected)))
+
+
+@of_every_effect
 def test_its_facts_make_sense(effect: Effect) -> None:
     assert effect.lower <= effect.neutral <= effect.upper
     assert effect.lower <= effect.typical <= effect.upper
