@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from reactorwatch.errors import InputError
 from reactorwatch.identification.adaptation import AdaptiveRegression
 from reactorwatch.identification.linear_model import LinearModel
-from reactorwatch.identification.regressor import Rows, rows_of
 from reactorwatch.identification.rls import RecursiveLeastSquares
+from reactorwatch.identification.scaled_record import ScaledRecord
 from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
 
 SINGULAR_CONDITION = 1e13
@@ -31,12 +31,14 @@ class LeastSquares:
         inverse: shape (parameters, parameters), (X'X)^-1.
         noise_variance: shape (outputs,), r'r / (rows - parameters); inf for as many rows as parameters.
         condition: condition number of the regressors.
+        rows: number of rows.
     """
 
     parameters: NDArray[np.float64]
     inverse: NDArray[np.float64]
     noise_variance: NDArray[np.float64]
     condition: float
+    rows: int
 
 
 def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
@@ -74,7 +76,7 @@ def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
     free = rows - parameters
     squares = np.sum(residuals * residuals, axis=0)
     variance = squares / free if free > 0 else np.full(y.shape[1], np.inf)
-    return LeastSquares(theta.T, inverse_factor @ inverse_factor.T, variance, condition)
+    return LeastSquares(theta.T, inverse_factor @ inverse_factor.T, variance, condition, rows)
 
 
 def fit_arx(
@@ -98,16 +100,13 @@ def fit_arx(
     Raises:
         InputError: too few rows, an output that is constant, or rows that don't determine the parameters.
     """
-    u = as_columns(inputs, "inputs", structure.inputs)
-    y = as_columns(outputs, "outputs", structure.outputs)
-    check_not_constant(y)
-    scaling = Scaling.of(u, y, centred=structure.offset)
-    rows = check_row_count(rows_of(structure, scaling.inputs(u), scaling.outputs(y), time, choice), len(y))
-    return linear_model(structure, scaling, least_squares(rows.regressors, rows.outputs), rows.position.size)
+    record = ScaledRecord.of(structure, inputs, outputs, time)
+    rows = record.enough_rows(choice)
+    return linear_model(structure, record.scaling, least_squares(rows.regressors, rows.outputs))
 
 
 def linear_model(
-    structure: Structure, scaling: Scaling, solution: LeastSquares, rows: int, simulates: bool = False
+    structure: Structure, scaling: Scaling, solution: LeastSquares, simulates: bool = False
 ) -> LinearModel:
     """Make a model in the signals' own units from a solution for scaled signals.
 
@@ -115,7 +114,6 @@ def linear_model(
         structure: terms of the model.
         scaling: scaling of the signals.
         solution: solution for all outputs.
-        rows: number of rows of the fit.
         simulates: whether it was fitted by simulation.
     """
     solved, size = solution.parameters.shape
@@ -127,48 +125,15 @@ def linear_model(
         if np.isfinite(solution.noise_variance[i]) and np.all(np.isfinite(solution.inverse)):
             covariance[i] = solution.noise_variance[i] * matrix @ solution.inverse @ matrix.T
     noise_sd = np.sqrt(solution.noise_variance) * scaling.output_spreads
-    return LinearModel(structure, parameters, covariance, noise_sd, solution.condition, rows, simulates)
+    return LinearModel(structure, parameters, covariance, noise_sd, solution.condition, solution.rows, simulates)
 
 
-def model_of(
-    structure: Structure, scaling: Scaling, estimator: RecursiveLeastSquares | AdaptiveRegression, simulates: bool
-) -> LinearModel:
-    """Make a model of one output from a recursive estimator of scaled signals."""
-    solution = LeastSquares(
+def solution_of(estimator: RecursiveLeastSquares | AdaptiveRegression) -> LeastSquares:
+    """Solution of one output from a recursive estimator."""
+    return LeastSquares(
         estimator.parameters[None, :],
         estimator.unit_covariance,
         np.array([estimator.noise_variance]),
         estimator.condition,
+        estimator.rows,
     )
-    return linear_model(structure, scaling, solution, estimator.rows, simulates)
-
-
-def check_not_constant(outputs: NDArray[np.float64]) -> None:
-    """Check that every output changes.
-
-    Raises:
-        InputError: an output whose measured values are all equal.
-    """
-    for o, column in enumerate(outputs.T):
-        values = column[np.isfinite(column)]
-        if values.size and np.ptp(values) == 0.0:
-            raise InputError(f"output {o + 1} is constant, {values[0]:g} in all rows: there is nothing to identify")
-
-
-def check_row_count(rows: Rows, of: int) -> Rows:
-    """Check that there are enough rows to determine the parameters; returns them.
-
-    Args:
-        rows: usable rows of a record.
-        of: number of rows of the record.
-
-    Raises:
-        InputError: fewer rows than parameters.
-    """
-    usable, parameters = rows.regressors.shape
-    if usable < parameters:
-        raise InputError(
-            f"{parameters} parameters need at least {parameters} rows that are complete and follow complete rows "
-            f"without a gap, got {usable} of {of}"
-        )
-    return rows

@@ -22,9 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.instrumental_variable import instrumental_variable
-from reactorwatch.identification.linear_model import RunPlan, plan_run, simulate
-from reactorwatch.identification.regressor import consecutive_rows, rows_of
-from reactorwatch.identification.structure import Scaling, Structure, as_columns
+from reactorwatch.identification.linear_model import RunPlan, simulate
+from reactorwatch.identification.regressor import consecutive_rows
+from reactorwatch.identification.scaled_record import ScaledRecord
+from reactorwatch.identification.structure import Structure, as_columns
 
 INDEPENDENT = 0.01
 """Smallest ratio of the weakest to the strongest direction of the input's lagged copies."""
@@ -169,10 +170,7 @@ def conditioning(structure: Structure, inputs: ArrayLike, outputs: ArrayLike, ti
     Raises:
         InputError: shapes that don't fit, times that don't increase, or fewer rows than parameters.
     """
-    u = as_columns(inputs, "inputs", structure.inputs)
-    y = as_columns(outputs, "outputs", structure.outputs)
-    scaling = Scaling.of(u, y, centred=structure.offset)
-    regressors = rows_of(structure, scaling.inputs(u), scaling.outputs(y), time).regressors
+    regressors = ScaledRecord.of(structure, inputs, outputs, time).rows().regressors
     if len(regressors) < structure.parameters:
         raise InputError(f"{structure.parameters} parameters need as many complete rows, got {len(regressors)}")
     return condition_check(float(np.linalg.cond(regressors)))
@@ -202,12 +200,8 @@ def sampling(
     Raises:
         InputError: too few rows, or rows that don't determine the parameters.
     """
-    u = as_columns(inputs, "inputs", structure.inputs)
-    y = as_columns(outputs, "outputs", 1)
-    scaling = Scaling.of(u, y, centred=structure.offset)
-    scaled_u, scaled_y = scaling.inputs(u), scaling.outputs(y)
-    plan = plan_run(structure, scaled_u, scaled_y, time)
-    samples = response_samples(structure, instrumental_variable(structure, scaled_u, scaled_y, plan, time))
+    estimate = instrumental_variable(ScaledRecord.of(structure, inputs, outputs, time))
+    samples = response_samples(structure, estimate)
     if math.isnan(samples):
         reason = "cannot tell: the model found has no settled step response; a longer or livelier record would help"
         return SamplingCheck("sampling", reason, math.nan, FASTEST_SAMPLES)
@@ -261,17 +255,9 @@ def amplitude(structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time:
     Raises:
         InputError: too few rows, or rows that don't determine the parameters.
     """
-    rich = Structure(
-        2 * structure.output_lags,
-        2 * structure.input_lags,
-        structure.delay,
-        structure.inputs,
-        1,
-        structure.offset,
-    )
-    u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
-    scaling = Scaling.of(u, y, centred=structure.offset)
-    rows = rows_of(rich, scaling.inputs(u), scaling.outputs(y), time)
+    lags = 2 * structure.output_lags, 2 * structure.input_lags
+    rich = Structure(*lags, structure.delay, structure.inputs, 1, structure.offset)
+    rows = ScaledRecord.of(rich, inputs, outputs, time).rows()
     # Nearly dependent columns do not affect the residual.
     theta = np.linalg.lstsq(rows.regressors, rows.outputs)[0]
     residuals = rows.outputs - rows.regressors @ theta

@@ -13,15 +13,16 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification import report_scheme
 from reactorwatch.identification.adaptation import GAINS, AdaptiveRegression
-from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, model_of
+from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, linear_model, solution_of
 from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.excitation import check_record
 from reactorwatch.identification.free_run import free_run
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
+from reactorwatch.identification.linear_predictor import Kind
 from reactorwatch.identification.output_error import fit_oe
 from reactorwatch.identification.polynomial_narx import PolynomialModel, fit_narx, name_product
 from reactorwatch.identification.polynomial_oe import fit_noe
-from reactorwatch.identification.prediction_error import Kind, PredictionErrorModel, fit_armax, fit_box_jenkins
+from reactorwatch.identification.prediction_error import PredictionErrorModel, fit_armax, fit_box_jenkins
 from reactorwatch.identification.recursive_prediction_error import RecursivePredictionError
 from reactorwatch.identification.regressor import consecutive_rows, rows_of
 from reactorwatch.identification.residual_tests import DEFAULT_LAGS, independence, whiteness
@@ -48,8 +49,8 @@ SCHEMES: Mapping[str, Mapping[str, Callable[..., FittedModel]]] = {
 
 FORGETTING = "forgetting"
 
-RECURSIVE_MODELS: Mapping[str, Kind | None] = {"arx": None, "oe": None, "armax": "armax", "bj": "bj"}
-"""Models that can be learned row by row, with their model of the disturbance."""
+RECURSIVE_MODELS: Mapping[str, Kind | None] = {"arx": None, "oe": "oe", "armax": "armax", "bj": "bj"}
+"""Models that can be learned row by row, with their kind of a recursive prediction error model; ARX is linear."""
 
 WORST_MINUS_LOG10_P = 6.0
 
@@ -318,26 +319,25 @@ def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
     if not form.recursive:
         return SCHEMES[form.scheme][form.model](structure, u, y, t)
     scaling = Scaling.of(u, y)
-    if form.model != "arx":
-        running = RecursivePredictionError(structure, scaling, form.forgetting, RECURSIVE_MODELS[form.model])
+    if kind := RECURSIVE_MODELS[form.model]:
+        running = RecursivePredictionError(structure, scaling, form.forgetting, kind)
         for k, unbroken_rows in enumerate(consecutive_rows(np.concatenate([u, y], axis=1), t)):
             if unbroken_rows <= 1:
                 running.restart()
             if unbroken_rows:
                 running.update(u[k], float(y[k, 0]))
         return running.model
+    estimator: RecursiveLeastSquares | AdaptiveRegression
+    if form.adaptation == FORGETTING:
+        estimator = RecursiveLeastSquares(structure.parameters, form.forgetting)
+    else:
+        estimator = AdaptiveRegression(structure.parameters, form.adaptation, form.gain)
     rows = rows_of(structure, scaling.inputs(u), scaling.outputs(y), t)
-    if form.adaptation != FORGETTING:
-        adaptive = AdaptiveRegression(structure.parameters, form.adaptation, form.gain)
-        for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
-            adaptive.update(regressor, float(value))
-        return model_of(structure, scaling, adaptive, simulates=False)
-    estimator = RecursiveLeastSquares(structure.parameters, form.forgetting)
     for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
-        estimator.update(regressor, value)
-    if not estimator.condition < SINGULAR_CONDITION:
+        estimator.update(regressor, float(value))
+    if estimator.condition >= SINGULAR_CONDITION:
         raise InputError(f"the rows don't determine {structure.parameters} parameters")
-    return model_of(structure, scaling, estimator, simulates=False)
+    return linear_model(structure, scaling, solution_of(estimator))
 
 
 def _coefficients(model: FittedModel, form: ModelForm, data: Dataset) -> tuple[dict[str, Any], dict[str, Any]]:

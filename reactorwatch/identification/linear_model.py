@@ -6,6 +6,7 @@ one-step-ahead prediction, an output-error model by its simulation, and these ar
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -142,8 +143,7 @@ def fit_percent(measured: ArrayLike, predicted: ArrayLike) -> float:
     return float(100.0 * (1.0 - np.linalg.norm(y - yhat) / np.linalg.norm(y - np.mean(y))))
 
 
-@dataclass(frozen=True)
-class RunPlan:
+class RunPlan(NamedTuple):
     """Rows of a record that a simulation covers.
 
     Attributes:
@@ -169,13 +169,14 @@ def plan_run(
         outputs: shape (rows, outputs), NaN where nothing was measured.
         time: shape (rows,); None: gaps are not detected.
     """
-    starts, running = _plan(
-        structure.history,
-        consecutive_rows(inputs, time),
-        consecutive_rows(np.concatenate([inputs, outputs], axis=1), time),
-        consecutive_rows(np.zeros((len(inputs), 1)), time) == 1,
+    return RunPlan(
+        *_plan(
+            structure.history,
+            consecutive_rows(inputs, time),
+            consecutive_rows(np.concatenate([inputs, outputs], axis=1), time),
+            consecutive_rows(np.zeros((len(inputs), 1)), time) == 1,
+        )
     )
-    return RunPlan(starts, running)
 
 
 def simulate(
@@ -194,17 +195,8 @@ def simulate(
         outputs: shape (rows, outputs).
         plan: plan for this record and structure.
     """
-    return _run(
-        np.ascontiguousarray(parameters),
-        structure.output_lags,
-        structure.input_lags,
-        structure.delay,
-        structure.offset,
-        np.ascontiguousarray(inputs),
-        np.ascontiguousarray(outputs),
-        plan.starts,
-        plan.running,
-    )
+    theta, u, y = (np.ascontiguousarray(item) for item in (parameters, inputs, outputs))
+    return _run(theta, structure.orders, structure.offset, u, y, plan)
 
 
 @jit
@@ -226,23 +218,21 @@ def _plan(
 @jit
 def _run(
     parameters: NDArray[np.float64],
-    output_lags: int,
-    input_lags: int,
-    delay: int,
+    orders: tuple[int, int, int],
     offset: bool,
     u: NDArray[np.float64],
     y: NDArray[np.float64],
-    starts: NDArray[np.bool_],
-    running: NDArray[np.bool_],
+    plan: RunPlan,
 ) -> NDArray[np.float64]:
+    output_lags, input_lags, delay = orders
     rows, outputs = y.shape
     inputs = u.shape[1]
     run = np.full((rows, outputs), np.nan)
     own = np.empty((rows, outputs))
     for k in range(rows):
-        if not running[k]:
+        if not plan.running[k]:
             continue
-        if starts[k]:
+        if plan.starts[k]:
             for back in range(1, output_lags + 1):
                 for o in range(outputs):  # a slice would take two seconds to compile
                     own[k - back, o] = y[k - back, o]

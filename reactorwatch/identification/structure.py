@@ -66,6 +66,15 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Number of rows before row k that its equation needs."""
         return max(self.output_lags, self.delay + self.input_lags - 1 if self.inputs else 0)
 
+    @property
+    def orders(self) -> tuple[int, int, int]:
+        """Lags of the output and of the inputs, and the delay."""
+        return self.output_lags, self.input_lags, self.delay
+
+    def without_offset(self) -> Self:
+        """The lagged signals alone."""
+        return msgspec.structs.replace(self, offset=False)
+
     def parameter_names(self) -> tuple[str, ...]:
         """Names of one equation's parameters, in order; signals are numbered only where there are several.
 

@@ -6,9 +6,11 @@ from scipy.optimize import least_squares as scipy_least_squares
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.descent import _triangle
 from reactorwatch.identification.instrumental_variable import stabilize
 from reactorwatch.identification.linear_model import plan_run, simulate
-from reactorwatch.identification.output_error import _triangle, fit_oe, is_stable, run_with_gradient
+from reactorwatch.identification.linear_predictor import is_stable, predict_with_gradient
+from reactorwatch.identification.output_error import fit_oe
 from reactorwatch.identification.structure import RowChoice, Structure
 from tests.unit.identification.truth import Array, Daisy, NoisyPlant, oscillating_plant
 
@@ -49,8 +51,7 @@ def test_the_gradient_is_the_derivative_of_the_run() -> None:
     assert plan.starts.sum() == 3
 
     def run(parameters: Array) -> tuple[Array, Array]:
-        values, gradient = run_with_gradient(parameters, 2, 2, 2, True, u, y[:, 0], plan.starts, plan.running)
-        return values, gradient
+        return predict_with_gradient(parameters, (2, 2, 2, 0), u, y[:, 0], plan)
 
     values, gradient = run(theta)
     np.testing.assert_allclose(values, simulate(structure, theta[None, :], u, y, plan)[:, 0], rtol=1e-12)

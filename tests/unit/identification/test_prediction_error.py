@@ -5,11 +5,11 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.linear_model import plan_run
+from reactorwatch.identification.linear_predictor import predict_with_gradient
 from reactorwatch.identification.prediction_error import (
     PredictionErrorModel,
     fit_armax,
     fit_box_jenkins,
-    predict_with_gradient,
 )
 from reactorwatch.identification.structure import Structure
 from tests.unit.identification.systems import ARMA, ARMAX, BOX_JENKINS, OUTPUT_ERROR, System
@@ -49,7 +49,7 @@ def test_the_gradient_is_the_derivative_of_the_prediction() -> None:
     theta = np.array([1.4, -0.6, 0.9, -0.5, 0.4, 0.2, 0.1, -0.3, -0.2, 0.5, 0.1])
 
     def predict(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return predict_with_gradient(parameters, 2, 2, 1, u, y, plan.starts, plan.running)
+        return predict_with_gradient(parameters, (2, 2, 1, 2), u, y, plan)
 
     predicted, gradient = predict(theta)
     assert np.isfinite(predicted[20])

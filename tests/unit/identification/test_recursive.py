@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.output_error import fit_oe, is_stable
-from reactorwatch.identification.prediction_error import Kind, PredictionErrorModel, fit_armax, fit_box_jenkins
+from reactorwatch.identification.linear_predictor import Kind, is_stable
+from reactorwatch.identification.output_error import fit_oe
+from reactorwatch.identification.prediction_error import PredictionErrorModel, fit_armax, fit_box_jenkins
 from reactorwatch.identification.recursive_prediction_error import RecursivePredictionError
 from reactorwatch.identification.structure import Scaling, Structure
 from tests.unit.identification.systems import ARMA, ARMAX, BOX_JENKINS, System
