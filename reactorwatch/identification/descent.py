@@ -76,8 +76,8 @@ def solution_at(objective: Objective, theta: Array) -> LeastSquares:
     errors, gradient = objective(theta)
     linear = least_squares(gradient, errors)
     free = errors.size - theta.size
-    variance = np.array([float(errors @ errors) / free if free > 0 else math.inf])
-    return LeastSquares(theta[None, :], linear.inverse, variance, linear.condition, errors.size)
+    variance = float(errors @ errors) / free if free > 0 else math.inf
+    return LeastSquares(theta, linear.inverse, variance, linear.condition, errors.size)
 
 
 @jit

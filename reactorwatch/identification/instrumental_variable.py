@@ -12,8 +12,8 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.identification.batch import least_squares
-from reactorwatch.identification.linear_model import simulate
 from reactorwatch.identification.scaled_record import ScaledRecord
+from reactorwatch.identification.simulation import simulate
 from reactorwatch.identification.structure import Structure
 
 _ITERATIONS = 5
@@ -26,7 +26,7 @@ def stable_arx(record: ScaledRecord) -> Array:
         InputError: too few rows, or rows that don't determine the parameters.
     """
     rows = record.rows()
-    return stabilize(record.structure, least_squares(rows.regressors, rows.outputs).parameters[0])
+    return stabilize(record.structure, least_squares(rows.regressors, rows.outputs).parameters)
 
 
 def instrumental_variable(record: ScaledRecord) -> Array:
@@ -37,7 +37,7 @@ def instrumental_variable(record: ScaledRecord) -> Array:
     """
     structure, rows, theta = record.structure, record.rows(), stable_arx(record)
     for _ in range(_ITERATIONS):
-        run = simulate(structure, theta[None, :], record.u, record.y, record.plan)
+        run = simulate(structure, theta, record.u, record.y, record.plan)
         # A simulation starts from measured rows.
         instruments = replace(record, y=np.where(np.isfinite(run), run, record.y)).rows()
         both = np.intersect1d(rows.position, instruments.position, assume_unique=True)

@@ -20,17 +20,18 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.identification.linear_model import RunPlan
+from reactorwatch.identification.simulation import PlanArrays, RunPlan
 from reactorwatch.identification.structure import Structure
 
-Kind = Literal["oe", "armax", "bj"]
+Kind = Literal["arx", "oe", "armax", "bj"]
+"""Kind of a model; `oe` is output error, `bj` is Box-Jenkins."""
 
 
 class LinearPredictor:
     """Parameters of a kind of model.
 
     Args:
-        kind: `oe` (output error), `armax` or `bj` (Box-Jenkins).
+        kind: kind of the model.
         structure: terms of the plant; the disturbance has as many lags as the output.
 
     Attributes:
@@ -41,7 +42,7 @@ class LinearPredictor:
 
     def __init__(self, kind: Kind, structure: Structure) -> None:
         self.structure, plant, lags = structure, structure.parameters, structure.output_lags
-        self.noise_lags = 0 if kind == "oe" else lags
+        self.noise_lags = lags if kind in ("armax", "bj") else 0
         self.index = np.arange(plant + 2 * self.noise_lags)
         if kind == "armax":
             order = np.arange(plant + lags)
@@ -91,7 +92,7 @@ class PredictionErrors:
     def predict(self, theta: Array) -> tuple[Array, Array]:
         """Prediction, shape (rows,), and its gradient, shape (rows, parameters); NaN and 0 where it does not run."""
         index, orders = self._predictor.index, (*self._predictor.structure.orders, self._predictor.noise_lags)
-        predicted, full = predict_with_gradient(theta[index], orders, self._inputs, self._outputs, self._plan)
+        predicted, full = predict_with_gradient(theta[index], orders, self._inputs, self._outputs, self._plan.arrays)
         if index.size == self._predictor.size:
             return predicted, full
         gradient = np.zeros((full.shape[0], self._predictor.size))
@@ -135,7 +136,7 @@ def predict_with_gradient(
     orders: tuple[int, int, int, int],
     u: NDArray[np.float64],
     y: NDArray[np.float64],
-    plan: RunPlan,
+    plan: PlanArrays,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Predict one output one step ahead, with derivatives.
 
@@ -144,12 +145,12 @@ def predict_with_gradient(
         orders: `Structure.orders`, and the number of lags of d and of c: those of the output, or 0.
         u: shape (rows, inputs).
         y: shape (rows,), NaN where nothing was measured.
-        plan: rows that are predicted.
+        plan: rows that are predicted, see `RunPlan.arrays`.
 
     Returns:
         The prediction, shape (rows,), and its gradient, shape (rows, parameters); NaN and 0 where it does not run.
     """
-    lags, input_lags, delay, noise_lags = orders
+    (lags, input_lags, delay, noise_lags), (starts, running) = orders, plan
     rows, inputs = u.shape
     size = theta.size
     first_d = size - 2 * noise_lags
@@ -161,9 +162,9 @@ def predict_with_gradient(
     dv, de = np.zeros((noise_rows, size)), np.zeros((noise_rows, size))
     gradient = np.zeros((rows, size)) if noise_lags else dw
     for k in range(rows):
-        if not plan.running[k]:
+        if not running[k]:
             continue
-        if plan.starts[k]:
+        if starts[k]:
             for back in range(1, lags + 1):
                 w[k - back] = y[k - back]
                 dw[k - back] = 0.0

@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import fit_arx
-from reactorwatch.identification.linear_model import LinearModel, fit_percent, plan_run
+from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.regressor import rows_of
 from reactorwatch.identification.scaled_record import ScaledRecord
+from reactorwatch.identification.simulation import plan_run
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 _DIVERGED = 1e6  # a scaled output beyond this, a million times its spread, has diverged
@@ -67,7 +68,7 @@ class NeuralModel:
         u = scaling.inputs(as_columns(inputs, "inputs", structure.inputs))
         y = scaling.outputs(as_columns(outputs, "outputs", 1))
         plan = plan_run(structure, u, y, time)
-        theta = scaling.scale_parameters(structure, self.linear.parameters[0])
+        theta = scaling.scale_parameters(structure, self.linear.parameters)
         weights, constant = (theta[:-1], theta[-1]) if structure.offset else (theta, 0.0)
         spread = scaling.output_spreads[0]
         own, run = y[:, 0].copy(), np.full(y.shape, np.nan)
@@ -114,21 +115,19 @@ class Neural:
         """Fit the networks and choose the one with the best simulation.
 
         Args:
-            structure: lags and delay; one output.
+            structure: lags and delay.
             inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
             outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
             time: shape (rows,); None: gaps are not detected.
 
         Raises:
-            InputError: scikit-learn is not installed, several outputs, or a record that `fit_arx` refuses.
+            InputError: scikit-learn is not installed, or a record that `fit_arx` refuses.
         """
         try:
             from sklearn.exceptions import ConvergenceWarning  # type: ignore[import-untyped]
             from sklearn.neural_network import MLPRegressor  # type: ignore[import-untyped]
         except ImportError as missing:
             raise InputError("the neural model needs scikit-learn: pip install reactorwatch[neural]") from missing
-        if structure.outputs != 1:
-            raise InputError(f"a neural model has one output, got {structure.outputs}: fit one model for each")
         linear = fit_arx(structure, inputs, outputs, time)
         record = ScaledRecord.of(structure, inputs, outputs, time)
         # Without the constant: the network has its own.

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import least_squares, linear_model
+from reactorwatch.identification.batch import least_squares, unscale
 from reactorwatch.identification.descent import ITERATIONS, best_descent, solution_at
 from reactorwatch.identification.instrumental_variable import instrumental_variable, stabilize, stable_arx
 from reactorwatch.identification.linear_model import LinearModel
@@ -47,21 +47,18 @@ def fit_oe(
     """Fit an output-error model of one output.
 
     Args:
-        structure: terms of the model; one output.
+        structure: terms of the model.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.
         choice: rows that the simulation is compared with.
 
     Raises:
-        InputError: several outputs, too few rows, an output that is constant, or rows that don't determine the
-            parameters.
+        InputError: too few rows, an output that is constant, or rows that don't determine the parameters.
     """
-    if structure.outputs != 1:
-        raise InputError(f"an output-error model has one output, got {structure.outputs}: fit one model for each")
     record = ScaledRecord.of(structure, inputs, outputs, time)
     theta, objective = minimise_simulation_error(record, choice)
-    return linear_model(structure, record.scaling, solution_at(objective, theta), simulates=True)
+    return unscale("oe", structure, record.scaling, solution_at(objective, theta))
 
 
 def minimise_simulation_error(
@@ -86,7 +83,7 @@ def minimise_simulation_error(
     starts = [arx, instrumental_variable(record), _steiglitz_mcbride(record, arx)]
     if structure.output_lags > 1 and structure.input_lags > 1:
         lags = structure.output_lags - 1, structure.input_lags - 1
-        lower = Structure(*lags, structure.delay, structure.inputs, 1, structure.offset)
+        lower = Structure(*lags, structure.delay, structure.inputs, offset=structure.offset)
         smaller, _ = minimise_simulation_error(replace(record, structure=lower), choice, iterations)
         starts.append(pad_order(lower, smaller))
     return best_descent(objective, starts, iterations), objective
@@ -96,7 +93,7 @@ def pad_order(structure: Structure, parameters: Array) -> Array:
     """Parameters of the same model with one lag more of output and inputs, which adds a pole at zero.
 
     Args:
-        structure: structure of the model; one output.
+        structure: structure of the model.
         parameters: shape (parameters,).
     """
     lags = structure.output_lags
@@ -119,7 +116,7 @@ def _steiglitz_mcbride(record: ScaledRecord, theta: Array) -> Array:
             solution = least_squares(regressors, rows.outputs)
         except InputError:  # the filtered signals do not determine the parameters: take the last iterate
             break
-        theta = stabilize(structure, solution.parameters[0])
+        theta = stabilize(structure, solution.parameters)
     return theta
 
 

@@ -22,9 +22,10 @@ from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import least_squares
-from reactorwatch.identification.linear_model import RunPlan, plan_run, standard_deviations
+from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.regressor import rows_of
 from reactorwatch.identification.scaled_record import ScaledRecord
+from reactorwatch.identification.simulation import PlanArrays, plan_run
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 DEGREE = 2
@@ -42,7 +43,7 @@ class PolynomialModel:
     """A fitted polynomial NARX model.
 
     Attributes:
-        structure: lags and delay; one output.
+        structure: lags and delay.
         scaling: scaling of the signals.
         products: terms for scaled signals, the constant first.
         values: coefficients of the terms, shape (terms,).
@@ -64,11 +65,6 @@ class PolynomialModel:
         """Number of parameters."""
         return self.values.size
 
-    @property
-    def dynamics(self) -> None:
-        """No recursion that is linear in its state."""
-        return
-
     def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
         """See `LinearModel.predict`."""
         u, y = self._scale(inputs, outputs)
@@ -81,7 +77,7 @@ class PolynomialModel:
         """See `LinearModel.simulate`."""
         u, y = self._scale(inputs, outputs)
         plan = plan_run(self.structure, u, y, time)
-        run = run_products(self.values, factors_of(self.products), self.structure.orders, u, y[:, 0], plan)
+        run = run_products(self.values, factors_of(self.products), self.structure.orders, u, y[:, 0], plan.arrays)
         return (run * self.scaling.output_spreads[0] + self.scaling.output_centres[0])[:, None]
 
     def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
@@ -133,7 +129,7 @@ def fit_narx(
     """Fit a polynomial NARX model of one output.
 
     Args:
-        structure: lags of output and inputs; one output, with an offset.
+        structure: lags of output and inputs, with an offset.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.
@@ -157,8 +153,8 @@ def fit_narx(
 
     def fit(size: int, part: slice) -> PolynomialModel:
         solution = least_squares(regressors[part, order[:size]], target[part])
-        products, values = tuple(candidates[i] for i in order[:size]), solution.parameters[0]
-        covariance = solution.noise_variance[0] * solution.inverse
+        products, values = tuple(candidates[i] for i in order[:size]), solution.parameters
+        covariance = solution.noise_variance * solution.inverse
         return PolynomialModel(structure, record.scaling, products, values, covariance, target[part].size)
 
     def squares(size: int) -> float:
@@ -240,7 +236,7 @@ def run_products(
     orders: tuple[int, int, int],
     u: NDArray[np.float64],
     y: NDArray[np.float64],
-    plan: RunPlan,
+    plan: PlanArrays,
 ) -> NDArray[np.float64]:
     """Simulate a polynomial of scaled signals.
 
@@ -250,19 +246,19 @@ def run_products(
         orders: see `Structure`.
         u: shape (rows, inputs).
         y: shape (rows,).
-        plan: rows that are simulated.
+        plan: rows that are simulated, see `RunPlan.arrays`.
 
     Returns:
         Shape (rows,); NaN where it does not run, inf after it has diverged.
     """
-    output_lags, input_lags, delay = orders
+    (output_lags, input_lags, delay), (starts, running) = orders, plan
     rows, inputs = u.shape
     run, own = np.full(rows, np.nan), np.zeros(rows)
     signals = np.empty(output_lags + input_lags * inputs)
     for k in range(rows):
-        if not plan.running[k]:
+        if not running[k]:
             continue
-        if plan.starts[k]:
+        if starts[k]:
             for back in range(1, output_lags + 1):
                 own[k - back] = y[k - back]
         for lag in range(output_lags):

@@ -21,7 +21,6 @@ from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import least_squares
 from reactorwatch.identification.descent import descend, solution_at
-from reactorwatch.identification.linear_model import RunPlan
 from reactorwatch.identification.polynomial_narx import (
     DIVERGED,
     PolynomialModel,
@@ -30,6 +29,7 @@ from reactorwatch.identification.polynomial_narx import (
     factors_of,
 )
 from reactorwatch.identification.scaled_record import ScaledRecord
+from reactorwatch.identification.simulation import PlanArrays
 from reactorwatch.identification.structure import Structure
 
 DEGREES = (3, 2)
@@ -59,7 +59,9 @@ class _Objective:
     def run(self, theta: Array) -> tuple[Array, Array]:
         """Simulation of all rows, shape (rows,), and its gradient, shape (rows, terms)."""
         record = self._record
-        return run_with_gradient(theta, self._factors, record.structure.orders, record.u, record.y[:, 0], record.plan)
+        return run_with_gradient(
+            theta, self._factors, record.structure.orders, record.u, record.y[:, 0], record.plan.arrays
+        )
 
     def __call__(self, theta: Array) -> tuple[Array, Array]:
         """Errors, shape (compared rows,), and the gradient, shape (compared rows, terms)."""
@@ -80,7 +82,7 @@ def fit_noe(
     """Fit a polynomial output-error model of one output.
 
     Args:
-        structure: lags of output and inputs; one output, with an offset.
+        structure: lags of output and inputs, with an offset.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.
@@ -99,7 +101,7 @@ def fit_noe(
 
     linear = tuple(product for product in candidates if len(product) < 2)
     start = np.zeros(len(linear))
-    arx = least_squares(np.column_stack([np.ones(rows.position.size), rows.regressors]), rows.outputs).parameters[0]
+    arx = least_squares(np.column_stack([np.ones(rows.position.size), rows.regressors]), rows.outputs).parameters
     if objective(linear).admits(arx):
         start = arx
     folds = [block for count in FOLDS for block in np.array_split(compared, count)]
@@ -117,7 +119,7 @@ def fit_noe(
             best, smallest = grown, error
     products, theta = best
     solution = solution_at(objective(products), theta)
-    covariance = solution.noise_variance[0] * solution.inverse
+    covariance = solution.noise_variance * solution.inverse
     return PolynomialModel(structure, record.scaling, products, theta, covariance, solution.rows, simulates=True)
 
 
@@ -183,7 +185,7 @@ def run_with_gradient(
     orders: tuple[int, int, int],
     u: NDArray[np.float64],
     y: NDArray[np.float64],
-    plan: RunPlan,
+    plan: PlanArrays,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Simulate a polynomial of scaled signals, with derivatives.
 
@@ -193,22 +195,22 @@ def run_with_gradient(
         orders: see `Structure`.
         u: shape (rows, inputs).
         y: shape (rows,).
-        plan: rows that are simulated.
+        plan: rows that are simulated, see `RunPlan.arrays`.
 
     Returns:
         The simulation, shape (rows,), NaN where it does not run and inf from where it has diverged, and its gradient,
         shape (rows, terms).
     """
-    output_lags, input_lags, delay = orders
+    (output_lags, input_lags, delay), (starts, running) = orders, plan
     rows, inputs = u.shape
     size, degree = factors.shape
     run, own = np.full(rows, np.nan), np.zeros(rows)
     gradient = np.zeros((rows, size))
     signals, slopes = np.empty(output_lags + input_lags * inputs), np.empty(output_lags)
     for k in range(rows):
-        if not plan.running[k]:
+        if not running[k]:
             continue
-        if plan.starts[k]:
+        if starts[k]:
             for back in range(1, output_lags + 1):
                 own[k - back] = y[k - back]
                 gradient[k - back] = 0.0

@@ -13,22 +13,22 @@ The sum has local minima, so there are several starts: least squares, the output
 regressions as of Hannan and Rissanen (Biometrika 69 (1982) 81), and a model of one order less.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import LeastSquares
+from reactorwatch.identification.batch import unscale
 from reactorwatch.identification.descent import ITERATIONS, best_descent, solution_at
 from reactorwatch.identification.instrumental_variable import mirror_poles, stabilize, stable_arx
-from reactorwatch.identification.linear_model import plan_run, simulate, standard_deviations
+from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.linear_predictor import Kind, LinearPredictor, PredictionErrors
 from reactorwatch.identification.output_error import minimise_simulation_error, pad_order
 from reactorwatch.identification.regressor import rows_of
 from reactorwatch.identification.scaled_record import ScaledRecord
-from reactorwatch.identification.structure import Scaling, Structure, as_columns
+from reactorwatch.identification.structure import Structure
 
 LONG_ORDERS = 3
 """Order of the regression from which the innovations are estimated first, in orders of the model."""
@@ -37,82 +37,12 @@ ROUGH_ITERATIONS = 20
 """Largest number of iterations of a descent that only leads to a start."""
 
 
-@dataclass(frozen=True)
-class PredictionErrorModel:
-    """A fitted ARMAX or Box-Jenkins model, in the signals' own units.
-
-    Attributes:
-        kind: `armax` or `bj`.
-        structure: lags of the plant; the disturbance has as many.
-        parameters: parameters of the plant in the order of the structure, then d of a Box-Jenkins model, then c, shape
-            (parameters,).
-        covariance: shape (parameters, parameters).
-        noise_sd: standard deviation of e.
-        rows: number of rows of the fit.
-    """
-
-    kind: Kind
-    structure: Structure
-    parameters: Array
-    covariance: Array
-    noise_sd: float
-    rows: int
-
-    @property
-    def parameter_count(self) -> int:
-        """Number of parameters."""
-        return self.parameters.size
-
-    @property
-    def standard_deviations(self) -> Array:
-        """Standard deviations of the parameters, shape (parameters,)."""
-        return standard_deviations(self.covariance)
-
-    @property
-    def dynamics(self) -> Array:
-        """Parameters of the plant, shape (1, parameters of the structure)."""
-        return self.parameters[None, : self.structure.parameters]
-
-    def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
-        """One-step-ahead prediction; see `LinearModel.predict`."""
-        u, y = as_columns(inputs, "inputs", self.structure.inputs), as_columns(outputs, "outputs", 1)
-        predictor, plan = LinearPredictor(self.kind, self.structure), plan_run(self.structure, u, y, time)
-        return PredictionErrors(predictor, u, y, plan).predict(self.parameters)[0][:, None]
-
-    def simulate(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
-        """Simulate the plant without its disturbance; see `LinearModel.simulate`."""
-        u, y = as_columns(inputs, "inputs", self.structure.inputs), as_columns(outputs, "outputs", 1)
-        return simulate(self.structure, self.dynamics, u, y, plan_run(self.structure, u, y, time))
-
-    def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
-        """Measured minus one-step prediction, shape (rows, 1)."""
-        return as_columns(outputs, "outputs", 1) - self.predict(inputs, outputs, time)
-
-
-def unscale(kind: Kind, structure: Structure, scaling: Scaling, solution: LeastSquares) -> PredictionErrorModel:
-    """Make a model in the signals' own units from a solution for scaled signals.
-
-    Args:
-        kind: `armax` or `bj`.
-        structure: lags of the plant.
-        scaling: scaling of the signals.
-        solution: solution of one output.
-    """
-    plant, parameters, variance = structure.parameters, solution.parameters[0], float(solution.noise_variance[0])
-    matrix, shift = np.eye(parameters.size), np.zeros(parameters.size)
-    matrix[:plant, :plant], shift[:plant] = scaling.unscaling(structure)
-    known = np.isfinite(variance) and np.all(np.isfinite(solution.inverse))
-    covariance = variance * matrix @ solution.inverse @ matrix.T if known else np.full_like(matrix, np.inf)
-    noise_sd = float(np.sqrt(variance)) * scaling.output_spreads[0]
-    return PredictionErrorModel(kind, structure, matrix @ parameters + shift, covariance, noise_sd, solution.rows)
-
-
 def fit_armax(
     structure: Structure,
     inputs: ArrayLike,
     outputs: ArrayLike,
     time: ArrayLike | None = None,
-) -> PredictionErrorModel:
+) -> LinearModel:
     """Fit an ARMAX model of one output; without inputs it is an ARMA model.
 
     Args:
@@ -133,14 +63,14 @@ def fit_box_jenkins(
     inputs: ArrayLike,
     outputs: ArrayLike,
     time: ArrayLike | None = None,
-) -> PredictionErrorModel:
+) -> LinearModel:
     """Fit a Box-Jenkins model of one output; arguments and errors as for `fit_armax`, and at least one input."""
     if structure.inputs == 0:
         raise InputError("a Box-Jenkins model needs an input, got none; without inputs it is an ARMAX model: use armax")
     return _fit("bj", ScaledRecord.of(structure, inputs, outputs, time))
 
 
-def _fit(kind: Kind, record: ScaledRecord) -> PredictionErrorModel:
+def _fit(kind: Kind, record: ScaledRecord) -> LinearModel:
     record.enough_rows()
     theta, objective = _minimise(kind, record)
     return unscale(kind, record.structure, record.scaling, solution_at(objective, theta))

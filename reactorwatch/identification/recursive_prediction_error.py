@@ -21,11 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
-from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import linear_model, solution_of
+from reactorwatch.identification.batch import solution_of, unscale
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.linear_predictor import Kind, LinearPredictor
-from reactorwatch.identification.prediction_error import PredictionErrorModel, unscale
 from reactorwatch.identification.rls import RecursiveLeastSquares, RlsUpdate
 from reactorwatch.identification.structure import Scaling, Structure
 
@@ -40,13 +38,13 @@ class RecursivePredictionError:
     """Predicts an output, and corrects its parameters by each measured row.
 
     Args:
-        structure: terms of the plant; one output, with an offset for `armax` and `bj`.
+        structure: terms of the plant, with an offset for `armax` and `bj`.
         scaling: scaling of the signals; without it they are taken as they are, which suits signals of the order of 1.
         forgetting: weight of a row relative to its successor, in (0, 1], once it has risen to it.
         kind: `oe` (output error), `armax` or `bj` (Box-Jenkins).
 
     Raises:
-        InputError: several outputs, a Box-Jenkins model without inputs, or a setting out of its range.
+        InputError: a Box-Jenkins model without inputs, or a setting out of its range.
     """
 
     def __init__(
@@ -56,10 +54,8 @@ class RecursivePredictionError:
         forgetting: float = 1.0,
         kind: Kind = "oe",
     ) -> None:
-        if structure.outputs != 1:
-            raise InputError(f"a recursive model has one output, got {structure.outputs}: use one for each")
         self._structure, self._kind = structure, kind
-        self._scaling = Scaling.none(structure.inputs, 1) if scaling is None else scaling
+        self._scaling = Scaling.none(structure.inputs) if scaling is None else scaling
         self._forgetting = forgetting
         self._predictor = LinearPredictor(kind, structure)
         self._estimator = RecursiveLeastSquares(
@@ -135,12 +131,9 @@ class RecursivePredictionError:
         )
 
     @property
-    def model(self) -> LinearModel | PredictionErrorModel:
+    def model(self) -> LinearModel:
         """The learned model, in the signals' own units."""
-        solution = solution_of(self._estimator)
-        if self._kind == "oe":
-            return linear_model(self._structure, self._scaling, solution, simulates=True)
-        return unscale(self._kind, self._structure, self._scaling, solution)
+        return unscale(self._kind, self._structure, self._scaling, solution_of(self._estimator))
 
     def _regressor(self) -> Array:
         structure = self._structure

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import LeastSquares, linear_model
+from reactorwatch.identification.batch import LeastSquares, unscale
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.scaled_record import ScaledRecord
 from reactorwatch.identification.structure import REPORT_ROWS, Structure, as_columns
@@ -42,7 +42,7 @@ def fit_least_squares(
     """Fit the report's ARX model.
 
     Args:
-        structure: terms of the model, with one output.
+        structure: terms of the model.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,); None: gaps are not detected.
@@ -58,14 +58,10 @@ def fit_output_error(
 ) -> LinearModel:
     """Fit the report's output-error model: its ARX model, re-estimated from its own simulation until it settles.
 
-    Args:
-        structure: see `fit_least_squares`.
-        inputs: see `fit_least_squares`.
-        outputs: see `fit_least_squares`.
-        time: see `fit_least_squares`.
+    Arguments are those of `fit_least_squares`.
 
     Raises:
-        InputError: see `fit_least_squares`; or a simulation that diverges.
+        InputError: as for `fit_least_squares`, or a simulation that diverges.
     """
     model = fit_least_squares(structure, inputs, outputs, time)
     for _ in range(MOST_STEPS):
@@ -82,11 +78,8 @@ def re_estimate(
 ) -> LinearModel:
     """Fit a model to the simulation of a model: one step of the report's output-error iteration.
 
-    Args:
-        model: the model that is simulated.
-        inputs: see `fit_least_squares`.
-        outputs: measured outputs, which give the simulation its first rows and the model its noise.
-        time: see `fit_least_squares`.
+    Arguments are the model that is simulated, and those of `fit_least_squares`; the measured outputs give the
+    simulation its first rows and the model its noise.
 
     Raises:
         InputError: the simulation diverges.
@@ -102,8 +95,8 @@ def re_estimate(
     record = ScaledRecord.of(model.structure, u, y, time)
     fitted = _solve(replace(record, y=record.scaling.outputs(run)))
     errors = (y - run)[np.isfinite(y - run)]
-    unknown, noise_sd = np.full_like(fitted.covariance, np.inf), np.array([float(np.std(errors))])
-    return replace(fitted, covariance=unknown, noise_sd=noise_sd, simulates=True)
+    unknown, noise_sd = np.full_like(fitted.covariance, np.inf), float(np.std(errors))
+    return replace(fitted, kind="oe", covariance=unknown, noise_sd=noise_sd)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,18 +167,17 @@ def _solve(record: ScaledRecord) -> LinearModel:
     smallest = max(regressors.shape) * np.finfo(np.float64).eps
     inverse = np.linalg.pinv(regressors, rcond=smallest)
     parameters = inverse @ rows.outputs
-    residuals = rows.outputs - regressors @ parameters
+    squares = np.sum((rows.outputs - regressors @ parameters) ** 2, axis=0)
     rank = int(np.sum(singular > smallest * singular[0]))
     free = len(regressors) - rank
-    variance = np.sum(residuals**2, axis=0) / free if free > 0 else np.full(record.y.shape[1], np.inf)
     whole = rank == regressors.shape[1]
     solution = LeastSquares(
-        parameters=np.pad(parameters.T, ((0, 0), (0, int(structure.offset)))),
+        parameters=np.pad(parameters[:, 0], (0, int(structure.offset))),
         inverse=np.pad(inverse @ inverse.T, (0, int(structure.offset)))
         if whole
         else np.full((structure.parameters,) * 2, np.inf),
-        noise_variance=variance,
+        noise_variance=float(squares[0]) / free if free > 0 else np.inf,
         condition=float(singular[0] / singular[-1]) if singular[-1] > 0.0 else np.inf,
         rows=len(regressors),
     )
-    return linear_model(structure, record.scaling, solution)
+    return unscale("arx", structure, record.scaling, solution)

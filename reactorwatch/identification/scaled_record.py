@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification.linear_model import RunPlan, plan_run
 from reactorwatch.identification.regressor import Rows, rows_of
+from reactorwatch.identification.simulation import RunPlan, plan_run
 from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
 
 
@@ -22,7 +22,7 @@ class ScaledRecord:
         structure: terms of the model.
         scaling: scaling of the signals.
         u: scaled inputs, shape (rows, inputs), NaN where nothing was measured.
-        y: scaled outputs, shape (rows, outputs), NaN where nothing was measured.
+        y: scaled output, shape (rows, 1), NaN where nothing was measured.
         time: times of the rows, shape (rows,), increasing, in any unit; None: gaps are not detected.
     """
 
@@ -40,11 +40,10 @@ class ScaledRecord:
             InputError: shapes that don't fit the structure, or an output whose measured values are all equal.
         """
         u = as_columns(inputs, "inputs", structure.inputs)
-        y = as_columns(outputs, "outputs", structure.outputs)
-        for o, column in enumerate(y.T):
-            values = column[np.isfinite(column)]
-            if values.size and np.ptp(values) == 0.0:
-                raise InputError(f"output {o + 1} is constant, {values[0]:g} in all rows: there is nothing to identify")
+        y = as_columns(outputs, "outputs", 1)
+        values = y[np.isfinite(y)]
+        if values.size and np.ptp(values) == 0.0:
+            raise InputError(f"output 1 is constant, {values[0]:g} in all rows: there is nothing to identify")
         scaling = Scaling.of(u, y, centred=structure.offset)
         return cls(structure, scaling, scaling.inputs(u), scaling.outputs(y), time)
 
