@@ -51,4 +51,4 @@ class LinearFamily(NamedTuple):
     fit: Callable[..., LinearModel]
 
 
-LINEAR_FAMILIES = (LinearFamily("arx", fit_arx), LinearFamily("oe", fit_oe))
+LINEAR_FAMILIES: tuple[Family, ...] = (LinearFamily("arx", fit_arx), LinearFamily("oe", fit_oe))

@@ -61,7 +61,7 @@ def fit_output_error(
     Arguments are those of `fit_least_squares`.
 
     Raises:
-        InputError: as for `fit_least_squares`, or a simulation that diverges.
+        InputError: see `fit_least_squares`; or a simulation that diverges.
     """
     model = fit_least_squares(structure, inputs, outputs, time)
     for _ in range(MOST_STEPS):
