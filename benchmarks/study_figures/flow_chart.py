@@ -28,6 +28,7 @@ from reactorwatch.identification.batch import fit_arx
 from reactorwatch.identification.excitation import Check, check_record, sampling
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.regressor import rows_of
+from reactorwatch.identification.scaled_record import ScaledRecord
 from reactorwatch.identification.structure import Structure, as_columns
 
 OUTSIDE_THREE_SIGMA = 0.0027
@@ -96,7 +97,7 @@ def follow(
     for check in check_record(structure, *training):
         if check.name in ("variation", "excitation") and not check.passed:
             raise InputError(check.result)
-    rate = sampling(structure, *training)
+    rate = sampling(ScaledRecord.of(structure, *training))
     branches = [_branch("is the sampling rate good?", rate.passed, _sampling_text(rate))]
     if not rate.passed:
         return Conclusion("sample again", tuple(branches))
@@ -123,7 +124,7 @@ def follow(
 
     rows = rows_of(structure, *watched)
     regressors = rows.regressors[np.isin(rows.position, np.flatnonzero(outside))]
-    added = np.einsum("ij,jk,ik->i", regressors, model.covariance[0], regressors)
+    added = np.einsum("ij,jk,ik->i", regressors, model.covariance, regressors)
     ratio = math.sqrt(float(np.median(added))) / sigma if sigma > 0.0 else 0.0
     accurate = ratio < 1.0
     why = (

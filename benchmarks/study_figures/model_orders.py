@@ -69,7 +69,7 @@ def _draw(study: Study, drawing: Drawing, family: str, order: int) -> Finding:
     text += f"\n\nWith the report's scheme, order {best['C']} is best for C and order {best['T']} for T."
     if family == "arx":
         gains = {
-            key: [float(np.linalg.norm(study.report_fit("arx", key, o).parameters[0, :key])) for o in OUTPUTS]
+            key: [float(np.linalg.norm(study.report_fit("arx", key, o).parameters[:key])) for o in OUTPUTS]
             for key in ORDERS
         }
         told = ", ".join(f"{gains[key][0]:.2f} and {gains[key][1]:.2f} at order {key}" for key in ORDERS)
@@ -106,6 +106,6 @@ def _largest_change(study: Study, order: int) -> float:
     """Largest change of a parameter by the output-error iteration, as a share of the largest parameter."""
     changes = []
     for output in OUTPUTS:
-        arx, oe = (study.report_fit(family, order, output).parameters[0, :-1] for family in ("arx", "oe"))
+        arx, oe = (study.report_fit(family, order, output).parameters[:-1] for family in ("arx", "oe"))
         changes.append(float(np.abs(oe - arx).max() / np.abs(arx).max()))
     return max(changes)

@@ -30,14 +30,14 @@ def estimate(study: Study, drawing: Drawing) -> Finding:
         assert isinstance(fitted_to_all, LinearModel)
         scale = np.repeat([1.0, study.spread(output) / study.spread("qc")], ORDER)
         x = np.arange(len(names))
-        one.bar(x - 0.2, reported.parameters[0, :-1] / scale, 0.36, color=ORANGE, label="report's scheme")
-        one.bar(x + 0.2, fitted_to_all.parameters[0, :-1] / scale, 0.36, color=BLUE, label="all rows")
+        one.bar(x - 0.2, reported.parameters[:-1] / scale, 0.36, color=ORANGE, label="report's scheme")
+        one.bar(x + 0.2, fitted_to_all.parameters[:-1] / scale, 0.36, color=BLUE, label="all rows")
         one.set_xticks(x, names)
         label(one, "parameter", "of scaled signals", f"ARX({ORDER},{ORDER}) of {output}")
         singular |= reported.condition > SINGULAR_CONDITION
         for name, model in (("report's scheme", reported), ("all rows", fitted_to_all)):
             condition = f"{model.condition:.3g}" if model.condition <= SINGULAR_CONDITION else "singular"
-            values = " | ".join(f"{value:.4g}" for value in model.parameters[0, :-1])
+            values = " | ".join(f"{value:.4g}" for value in model.parameters[:-1])
             rows.append(f"| {output} | {name} | {model.rows} | {condition} | {values} |")
     legend_below(drawing, axes[0], 2)
     text = (

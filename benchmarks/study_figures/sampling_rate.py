@@ -21,6 +21,7 @@ from reactorwatch.identification.excitation import (
     sampling,
 )
 from reactorwatch.identification.regressor import rows_of
+from reactorwatch.identification.scaled_record import ScaledRecord
 from reactorwatch.identification.structure import ALL_ROWS, REPORT_ROWS, RowChoice, Scaling, Structure
 from reactorwatch.records.record import Record
 
@@ -51,10 +52,12 @@ def draw(study: Study, drawing: Drawing) -> Finding:
     for noise, colour, name in ((False, BLUE, "no noise"), (True, ORANGE, "with the sensors' noise")):
         record = study.fast(noise)
         u, y = record.columns["qc"], record.columns[_OUTPUT]
-        conditions[noise] = np.array([conditioning(_STRUCTURE, u[::d], y[::d]).value for d in _DECIMATIONS])
+        conditions[noise] = np.array(
+            [conditioning(ScaledRecord.of(_STRUCTURE, u[::d], y[::d])).value for d in _DECIMATIONS]
+        )
         for_condition.loglog(periods, conditions[noise], "o-", color=colour, markersize=4, label=name)
         if not noise:
-            judged = [sampling(_STRUCTURE, u[::d], y[::d]) for d in _DECIMATIONS]
+            judged = [sampling(ScaledRecord.of(_STRUCTURE, u[::d], y[::d])) for d in _DECIMATIONS]
             really = u[:: _CLOCK * REPORT_ROWS.every], y[:: _CLOCK * REPORT_ROWS.every]
     samples = np.array([check.value for check in judged])
     chosen = {name: report_choice(study.quiet(scenario)) for name, scenario in _DRIVEN_BY.items()}

@@ -10,7 +10,7 @@ from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.dataset import Dataset
-from reactorwatch.identification.families import Arx, Family, OutputError
+from reactorwatch.identification.families import LINEAR_FAMILIES, Family
 from reactorwatch.identification.identify import Coefficients, Identification, ModelForm, identify
 from reactorwatch.identification.selection import Selection, select
 from reactorwatch.records.record import Record
@@ -97,7 +97,7 @@ def compare(
     Raises:
         InputError: as `fit`, or the extra for neural networks is not installed.
     """
-    families: list[Family] = [Arx(), OutputError()]
+    families: list[Family] = [*LINEAR_FAMILIES]
     if neural:
         from reactorwatch.identification.neural import Neural
 

@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from reactorwatch.errors import InputError
 from reactorwatch.identification.adaptation import AdaptiveRegression
 from reactorwatch.identification.linear_model import LinearModel
-from reactorwatch.identification.regressor import Rows, rows_of
+from reactorwatch.identification.linear_predictor import Kind
 from reactorwatch.identification.rls import RecursiveLeastSquares
+from reactorwatch.identification.scaled_record import ScaledRecord
 from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
 
 SINGULAR_CONDITION = 1e13
@@ -24,19 +25,21 @@ SINGULAR_CONDITION = 1e13
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """A least squares solution for one or several outputs.
+    """A least squares solution.
 
     Attributes:
-        parameters: shape (outputs, parameters).
+        parameters: shape (parameters,).
         inverse: shape (parameters, parameters), (X'X)^-1.
-        noise_variance: shape (outputs,), r'r / (rows - parameters); inf for as many rows as parameters.
+        noise_variance: r'r / (rows - parameters); inf for as many rows as parameters.
         condition: condition number of the regressors.
+        rows: number of rows.
     """
 
     parameters: NDArray[np.float64]
     inverse: NDArray[np.float64]
-    noise_variance: NDArray[np.float64]
+    noise_variance: float
     condition: float
+    rows: int
 
 
 def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
@@ -44,13 +47,13 @@ def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
 
     Args:
         regressors: shape (rows, parameters).
-        outputs: shape (rows,) or (rows, outputs).
+        outputs: shape (rows,) or (rows, 1).
 
     Raises:
         InputError: fewer rows than parameters, values that are not finite, or regressors that don't determine the
             parameters.
     """
-    x, y = as_columns(regressors, "regressors"), as_columns(outputs, "outputs")
+    x, y = as_columns(regressors, "regressors"), as_columns(outputs, "outputs", 1)
     rows, parameters = x.shape
     if len(y) != rows:
         raise InputError(f"regressors and outputs must have equally many rows, got {rows} and {len(y)}")
@@ -73,8 +76,8 @@ def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
     residuals = y - x @ theta
     free = rows - parameters
     squares = np.sum(residuals * residuals, axis=0)
-    variance = squares / free if free > 0 else np.full(y.shape[1], np.inf)
-    return LeastSquares(theta.T, inverse_factor @ inverse_factor.T, variance, condition)
+    variance = float(squares[0]) / free if free > 0 else np.inf
+    return LeastSquares(theta[:, 0], inverse_factor @ inverse_factor.T, variance, condition, rows)
 
 
 def fit_arx(
@@ -91,84 +94,43 @@ def fit_arx(
     Args:
         structure: terms of the model.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows,) or (rows, outputs), NaN where nothing was measured.
+        outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.
         choice: rows that are fitted.
 
     Raises:
         InputError: too few rows, an output that is constant, or rows that don't determine the parameters.
     """
-    u = as_columns(inputs, "inputs", structure.inputs)
-    y = as_columns(outputs, "outputs", structure.outputs)
-    check_not_constant(y)
-    scaling = Scaling.of(u, y, centred=structure.offset)
-    rows = check_row_count(rows_of(structure, scaling.inputs(u), scaling.outputs(y), time, choice), len(y))
-    return linear_model(structure, scaling, least_squares(rows.regressors, rows.outputs), rows.position.size)
+    record = ScaledRecord.of(structure, inputs, outputs, time)
+    rows = record.enough_rows(choice)
+    return unscale("arx", structure, record.scaling, least_squares(rows.regressors, rows.outputs))
 
 
-def linear_model(
-    structure: Structure, scaling: Scaling, solution: LeastSquares, rows: int, simulates: bool = False
-) -> LinearModel:
+def unscale(kind: Kind, structure: Structure, scaling: Scaling, solution: LeastSquares) -> LinearModel:
     """Make a model in the signals' own units from a solution for scaled signals.
 
     Args:
-        structure: terms of the model.
+        kind: kind of the model.
+        structure: terms of the plant.
         scaling: scaling of the signals.
-        solution: solution for all outputs.
-        rows: number of rows of the fit.
-        simulates: whether it was fitted by simulation.
+        solution: solution for all parameters.
     """
-    solved, size = solution.parameters.shape
-    parameters = np.empty((solved, size))
-    covariance = np.full((solved, size, size), np.inf)
-    for i in range(solved):
-        matrix, shift = scaling.unscaling(structure, i)
-        parameters[i] = matrix @ solution.parameters[i] + shift
-        if np.isfinite(solution.noise_variance[i]) and np.all(np.isfinite(solution.inverse)):
-            covariance[i] = solution.noise_variance[i] * matrix @ solution.inverse @ matrix.T
-    noise_sd = np.sqrt(solution.noise_variance) * scaling.output_spreads
-    return LinearModel(structure, parameters, covariance, noise_sd, solution.condition, rows, simulates)
+    plant, size, variance = structure.parameters, solution.parameters.size, solution.noise_variance
+    matrix, shift = np.eye(size), np.zeros(size)
+    matrix[:plant, :plant], shift[:plant] = scaling.unscaling(structure)
+    known = np.isfinite(variance) and np.all(np.isfinite(solution.inverse))
+    covariance = variance * matrix @ solution.inverse @ matrix.T if known else np.full((size, size), np.inf)
+    noise_sd = float(np.sqrt(variance)) * scaling.output_spreads[0]
+    parameters = matrix @ solution.parameters + shift
+    return LinearModel(kind, structure, parameters, covariance, noise_sd, solution.condition, solution.rows)
 
 
-def model_of(
-    structure: Structure, scaling: Scaling, estimator: RecursiveLeastSquares | AdaptiveRegression, simulates: bool
-) -> LinearModel:
-    """Make a model of one output from a recursive estimator of scaled signals."""
-    solution = LeastSquares(
-        estimator.parameters[None, :],
+def solution_of(estimator: RecursiveLeastSquares | AdaptiveRegression) -> LeastSquares:
+    """Solution from a recursive estimator."""
+    return LeastSquares(
+        estimator.parameters,
         estimator.unit_covariance,
-        np.array([estimator.noise_variance]),
+        estimator.noise_variance,
         estimator.condition,
+        estimator.rows,
     )
-    return linear_model(structure, scaling, solution, estimator.rows, simulates)
-
-
-def check_not_constant(outputs: NDArray[np.float64]) -> None:
-    """Check that every output changes.
-
-    Raises:
-        InputError: an output whose measured values are all equal.
-    """
-    for o, column in enumerate(outputs.T):
-        values = column[np.isfinite(column)]
-        if values.size and np.ptp(values) == 0.0:
-            raise InputError(f"output {o + 1} is constant, {values[0]:g} in all rows: there is nothing to identify")
-
-
-def check_row_count(rows: Rows, of: int) -> Rows:
-    """Check that there are enough rows to determine the parameters; returns them.
-
-    Args:
-        rows: usable rows of a record.
-        of: number of rows of the record.
-
-    Raises:
-        InputError: fewer rows than parameters.
-    """
-    usable, parameters = rows.regressors.shape
-    if usable < parameters:
-        raise InputError(
-            f"{parameters} parameters need at least {parameters} rows that are complete and follow complete rows "
-            f"without a gap, got {usable} of {of}"
-        )
-    return rows

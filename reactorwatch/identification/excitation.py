@@ -15,6 +15,7 @@ dynamics, and accept every sampling rate.
 """
 
 import math
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -22,9 +23,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.instrumental_variable import instrumental_variable
-from reactorwatch.identification.linear_model import RunPlan, plan_run, simulate
-from reactorwatch.identification.regressor import consecutive_rows, rows_of
-from reactorwatch.identification.structure import Scaling, Structure, as_columns
+from reactorwatch.identification.regressor import consecutive_rows
+from reactorwatch.identification.scaled_record import ScaledRecord
+from reactorwatch.identification.simulation import RunPlan, simulate
+from reactorwatch.identification.structure import Structure, as_columns
 
 INDEPENDENT = 0.01
 """Smallest ratio of the weakest to the strongest direction of the input's lagged copies."""
@@ -73,7 +75,7 @@ def check_record(
     """Run all checks of a record for a structure, in the order in which to cure failures.
 
     Args:
-        structure: structure of the model; one output.
+        structure: structure of the model.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured. Without inputs there is no excitation
             and no step response to check.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
@@ -85,23 +87,14 @@ def check_record(
     varied = variation(outputs)
     if not varied.passed:
         return (varied,)
+    record = ScaledRecord.of(structure, inputs, outputs, time)
     if structure.inputs == 0:
-        return (
-            varied,
-            conditioning(structure, inputs, outputs, time),
-            amplitude(structure, inputs, outputs, time),
-        )
+        return varied, conditioning(record), amplitude(record)
     excited = persistence(inputs, structure.output_lags + structure.input_lags, time)
-    conditioned = conditioning(structure, inputs, outputs, time)
+    conditioned = conditioning(record)
     if not excited.passed or conditioned.value == math.inf:
         return varied, excited, conditioned
-    return (
-        varied,
-        excited,
-        sampling(structure, inputs, outputs, time),
-        conditioned,
-        amplitude(structure, inputs, outputs, time),
-    )
+    return varied, excited, sampling(record), conditioned, amplitude(record)
 
 
 def variation(outputs: ArrayLike) -> Check:
@@ -163,16 +156,13 @@ def _excited_order(copies: list[NDArray[np.float64]]) -> int:
     return 0
 
 
-def conditioning(structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Check:
+def conditioning(record: ScaledRecord) -> Check:
     """Check that the scaled regressors determine the parameters.
 
     Raises:
-        InputError: shapes that don't fit, times that don't increase, or fewer rows than parameters.
+        InputError: signals and times that don't fit, or fewer rows than parameters.
     """
-    u = as_columns(inputs, "inputs", structure.inputs)
-    y = as_columns(outputs, "outputs", structure.outputs)
-    scaling = Scaling.of(u, y, centred=structure.offset)
-    regressors = rows_of(structure, scaling.inputs(u), scaling.outputs(y), time).regressors
+    structure, regressors = record.structure, record.rows().regressors
     if len(regressors) < structure.parameters:
         raise InputError(f"{structure.parameters} parameters need as many complete rows, got {len(regressors)}")
     return condition_check(float(np.linalg.cond(regressors)))
@@ -188,26 +178,13 @@ def condition_check(condition: float) -> Check:
     return Check("conditioning", "ok" if value <= LARGEST_CONDITION else reason, value, LARGEST_CONDITION)
 
 
-def sampling(
-    structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
-) -> SamplingCheck:
+def sampling(record: ScaledRecord) -> SamplingCheck:
     """Check that the sampling is neither too fast nor too slow for the plant.
-
-    Args:
-        structure: structure of the model; one output.
-        inputs: shape (rows,) or (rows, inputs).
-        outputs: shape (rows,) or (rows, 1).
-        time: shape (rows,); None: gaps are not detected.
 
     Raises:
         InputError: too few rows, or rows that don't determine the parameters.
     """
-    u = as_columns(inputs, "inputs", structure.inputs)
-    y = as_columns(outputs, "outputs", 1)
-    scaling = Scaling.of(u, y, centred=structure.offset)
-    scaled_u, scaled_y = scaling.inputs(u), scaling.outputs(y)
-    plan = plan_run(structure, scaled_u, scaled_y, time)
-    samples = response_samples(structure, instrumental_variable(structure, scaled_u, scaled_y, plan, time))
+    samples = response_samples(record.structure, instrumental_variable(record))
     if math.isnan(samples):
         reason = "cannot tell: the model found has no settled step response; a longer or livelier record would help"
         return SamplingCheck("sampling", reason, math.nan, FASTEST_SAMPLES)
@@ -232,7 +209,7 @@ def response_samples(structure: Structure, parameters: NDArray[np.float64]) -> f
     Of several inputs the one with the largest gain counts. NaN if there is no effect, or it does not settle.
 
     Args:
-        structure: structure of the model; one output.
+        structure: structure of the model.
         parameters: shape (parameters,), for scaled signals.
     """
     lags = structure.output_lags
@@ -250,28 +227,21 @@ def response_samples(structure: Structure, parameters: NDArray[np.float64]) -> f
     theta = parameters.copy()
     if structure.offset:
         theta[-1] = 0.0
-    response = simulate(structure, theta[None, :], step, np.zeros((length, 1)), plan)[structure.history :, 0]
+    response = simulate(structure, theta, step, np.zeros((length, 1)), plan)[structure.history :, 0]
     reached = np.flatnonzero(response / final >= 0.95)
     return float(reached[0] - structure.delay + 1) if reached.size else math.nan
 
 
-def amplitude(structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Check:
+def amplitude(record: ScaledRecord) -> Check:
     """Check that the output moves by more than its noise, the residual of an ARX model of twice the order.
 
     Raises:
-        InputError: too few rows, or rows that don't determine the parameters.
+        InputError: signals and times that don't fit.
     """
-    rich = Structure(
-        2 * structure.output_lags,
-        2 * structure.input_lags,
-        structure.delay,
-        structure.inputs,
-        1,
-        structure.offset,
-    )
-    u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
-    scaling = Scaling.of(u, y, centred=structure.offset)
-    rows = rows_of(rich, scaling.inputs(u), scaling.outputs(y), time)
+    structure = record.structure
+    lags = 2 * structure.output_lags, 2 * structure.input_lags
+    rich = Structure(*lags, structure.delay, structure.inputs, offset=structure.offset)
+    rows = replace(record, structure=rich).rows()
     # Nearly dependent columns do not affect the residual.
     theta = np.linalg.lstsq(rows.regressors, rows.outputs)[0]
     residuals = rows.outputs - rows.regressors @ theta

@@ -1,7 +1,7 @@
 """Model families for comparison: anything that can be fitted, predict and simulate."""
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,30 +44,11 @@ class Family(Protocol):
         """
 
 
-@dataclass(frozen=True)
-class Arx:
-    """Linear, fitted by one-step-ahead prediction."""
+class LinearFamily(NamedTuple):
+    """Linear models by their fit, see `Family`."""
 
-    name: str = "arx"
-
-    def fit(
-        self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
-    ) -> LinearModel:
-        """See `fit_arx`."""
-        return fit_arx(structure, inputs, outputs, time)
+    name: str
+    fit: Callable[..., LinearModel]
 
 
-@dataclass(frozen=True)
-class OutputError:
-    """Linear, fitted by simulation."""
-
-    name: str = "oe"
-
-    def fit(
-        self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
-    ) -> LinearModel:
-        """See `fit_oe`."""
-        return fit_oe(structure, inputs, outputs, time)
-
-
-LINEAR_FAMILIES: tuple[Family, ...] = (Arx(), OutputError())
+LINEAR_FAMILIES: tuple[Family, ...] = (LinearFamily("arx", fit_arx), LinearFamily("oe", fit_oe))

@@ -5,33 +5,19 @@ estimated: for a linear model the simulation is linear in its n initial outputs,
 least squares. A model that is not linear starts from the last rows of these.
 """
 
-from typing import Protocol
-
 import numpy as np
-from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
 from reactorwatch.identification.dataset import Dataset
-from reactorwatch.identification.linear_model import RunPlan, plan_run, simulate
+from reactorwatch.identification.linear_model import LinearModel
+from reactorwatch.identification.polynomial_narx import PolynomialModel
+from reactorwatch.identification.simulation import RunPlan, plan_run, simulate
 from reactorwatch.identification.structure import Structure
 
-
-class FreeRunning(Protocol):
-    """A model that can be simulated."""
-
-    @property
-    def structure(self) -> Structure:
-        """Lags of the model."""
-
-    @property
-    def dynamics(self) -> Array | None:
-        """Parameters of a linear recursion, shape (1, parameters); None for another model."""
-
-    def simulate(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
-        """Simulation from the first complete rows, shape (rows, 1)."""
+FittedModel = LinearModel | PolynomialModel
 
 
-def free_run(model: FreeRunning, data: Dataset, settle: int = 0) -> Array:
+def free_run(model: FittedModel, data: Dataset, settle: int = 0) -> Array:
     """Simulate a model along a data set.
 
     Args:
@@ -44,13 +30,13 @@ def free_run(model: FreeRunning, data: Dataset, settle: int = 0) -> Array:
         Shape (rows,); NaN where there is no simulated value, inf after it has diverged.
     """
     history = model.structure.history
-    if model.dynamics is None and settle > history:
+    if settle > history and not isinstance(model, LinearModel):
         _, later = data.split(settle - history)
         run = np.full(data.rows, np.nan)
         run[settle - history :] = model.simulate(*later.arrays)[:, 0]
     else:
         run = model.simulate(*data.arrays)[:, 0]
-        if model.dynamics is not None and settle > history:
+        if settle > history and isinstance(model, LinearModel):
             run += _state_correction(model.structure, model.dynamics, data, run, settle)
     run[:settle] = np.nan
     return run
@@ -69,7 +55,7 @@ def _state_correction(structure: Structure, dynamics: Array, data: Dataset, run:
     alone = np.zeros_like(plan.running)
     alone[start:end] = True
     homogeneous = np.zeros_like(dynamics)
-    homogeneous[0, :lags] = dynamics[0, :lags]
+    homogeneous[:lags] = dynamics[:lags]
     responses = np.zeros((data.rows, lags))
     for lag in range(1, lags + 1):
         unit = np.zeros((data.rows, 1))

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
@@ -13,22 +13,21 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification import report_scheme
 from reactorwatch.identification.adaptation import GAINS, AdaptiveRegression
-from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, model_of
+from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, solution_of, unscale
 from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.excitation import check_record
-from reactorwatch.identification.free_run import free_run
+from reactorwatch.identification.free_run import FittedModel, free_run
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
+from reactorwatch.identification.linear_predictor import Kind
 from reactorwatch.identification.output_error import fit_oe
 from reactorwatch.identification.polynomial_narx import PolynomialModel, fit_narx, name_product
 from reactorwatch.identification.polynomial_oe import fit_noe
-from reactorwatch.identification.prediction_error import Kind, PredictionErrorModel, fit_armax, fit_box_jenkins
+from reactorwatch.identification.prediction_error import fit_armax, fit_box_jenkins
 from reactorwatch.identification.recursive_prediction_error import RecursivePredictionError
 from reactorwatch.identification.regressor import consecutive_rows, rows_of
 from reactorwatch.identification.residual_tests import DEFAULT_LAGS, independence, whiteness
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
-
-FittedModel = LinearModel | PredictionErrorModel | PolynomialModel
 
 MODELS: dict[str, Callable[..., FittedModel]] = {
     "arx": fit_arx,
@@ -48,8 +47,8 @@ SCHEMES: Mapping[str, Mapping[str, Callable[..., FittedModel]]] = {
 
 FORGETTING = "forgetting"
 
-RECURSIVE_MODELS: Mapping[str, Kind | None] = {"arx": None, "oe": None, "armax": "armax", "bj": "bj"}
-"""Models that can be learned row by row, with their model of the disturbance."""
+RECURSIVE_MODELS: Mapping[str, Kind] = {kind: kind for kind in get_args(Kind)}
+"""Models that can be learned row by row."""
 
 WORST_MINUS_LOG10_P = 6.0
 
@@ -280,7 +279,7 @@ def identify_and_run(
     predicted, run = model.predict(*held_out.arrays)[:, 0], free_run(model, held_out, settle)
     predicted[:settle] = np.nan
     y = held_out.output[:, 0]
-    values, deviations = _coefficients(model, form, data)
+    values, deviations = _coefficients(model, data)
     found = Identification(
         model=form.model,
         order=form.order,
@@ -326,21 +325,20 @@ def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
             if unbroken_rows:
                 running.update(u[k], float(y[k, 0]))
         return running.model
+    estimator: RecursiveLeastSquares | AdaptiveRegression
+    if form.adaptation == FORGETTING:
+        estimator = RecursiveLeastSquares(structure.parameters, form.forgetting)
+    else:
+        estimator = AdaptiveRegression(structure.parameters, form.adaptation, form.gain)
     rows = rows_of(structure, scaling.inputs(u), scaling.outputs(y), t)
-    if form.adaptation != FORGETTING:
-        adaptive = AdaptiveRegression(structure.parameters, form.adaptation, form.gain)
-        for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
-            adaptive.update(regressor, float(value))
-        return model_of(structure, scaling, adaptive, simulates=False)
-    estimator = RecursiveLeastSquares(structure.parameters, form.forgetting)
     for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
-        estimator.update(regressor, value)
-    if not estimator.condition < SINGULAR_CONDITION:
+        estimator.update(regressor, float(value))
+    if estimator.condition >= SINGULAR_CONDITION:
         raise InputError(f"the rows don't determine {structure.parameters} parameters")
-    return model_of(structure, scaling, estimator, simulates=False)
+    return unscale("arx", structure, scaling, solution_of(estimator))
 
 
-def _coefficients(model: FittedModel, form: ModelForm, data: Dataset) -> tuple[dict[str, Any], dict[str, Any]]:
+def _coefficients(model: FittedModel, data: Dataset) -> tuple[dict[str, Any], dict[str, Any]]:
     """Parameters and their standard deviations by the names of the result."""
     if isinstance(model, PolynomialModel):
         products, values, deviations = model.expand()
@@ -351,19 +349,13 @@ def _coefficients(model: FittedModel, form: ModelForm, data: Dataset) -> tuple[d
             "b": dict.fromkeys(data.input_names, ()) if len(data.input_names) > 1 else (),
         }
         return none | {"offset": terms[0].value, "terms": terms[1:]}, none | {"offset": terms[0].sd}
-    if isinstance(model, LinearModel):
-        parts = model.parameters[0], model.standard_deviations[0]
-    else:
-        parts = model.parameters, model.standard_deviations
-    named, deviations_named = (_name(model, form, data.input_names, part) for part in parts)
-    return named, deviations_named
+    named = _name(model, data.input_names, model.parameters)
+    return named, _name(model, data.input_names, model.standard_deviations)
 
 
-def _name(
-    model: LinearModel | PredictionErrorModel, form: ModelForm, inputs: tuple[str, ...], values: Array
-) -> dict[str, Any]:
+def _name(model: LinearModel, inputs: tuple[str, ...], values: Array) -> dict[str, Any]:
     """Parameters by the names of the result."""
-    order, count, plant = form.order, len(inputs), model.structure.parameters
+    order, count, plant = model.structure.output_lags, len(inputs), model.structure.parameters
     by_input = {name: _floats(values[order + i : plant - 1 : count]) for i, name in enumerate(inputs)}
     past = _floats(values[:order])
     parts: dict[str, Any] = {
@@ -371,9 +363,9 @@ def _name(
         "b": by_input if count > 1 else next(iter(by_input.values()), ()),
         "offset": float(values[plant - 1]),
     }
-    if form.model == "armax":
+    if model.kind == "armax":
         parts["c"] = _floats(values[plant:])
-    if form.model == "bj":
+    if model.kind == "bj":
         parts |= {
             "a": (),
             "f": past,

@@ -6,46 +6,40 @@ with Z the regressors of that run (Soderstrom and Stoica, System Identification,
 Young, Automatica 6 (1970) 271). Z = Q S, so Q'X p = Q'y is solved, whose condition is not squared.
 """
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from dataclasses import replace
 
+import numpy as np
+
+from reactorwatch.arrays import Array
 from reactorwatch.identification.batch import least_squares
-from reactorwatch.identification.linear_model import RunPlan, simulate
-from reactorwatch.identification.regressor import rows_of
+from reactorwatch.identification.scaled_record import ScaledRecord
+from reactorwatch.identification.simulation import simulate
 from reactorwatch.identification.structure import Structure
 
 _ITERATIONS = 5
 
 
-def instrumental_variable(
-    structure: Structure,
-    inputs: NDArray[np.float64],
-    outputs: NDArray[np.float64],
-    plan: RunPlan,
-    time: ArrayLike | None = None,
-) -> NDArray[np.float64]:
-    """The instrumental variable estimate, its poles inside the unit circle.
-
-    Args:
-        structure: structure of the model; one output.
-        inputs: shape (rows, inputs), scaled.
-        outputs: shape (rows, 1), scaled.
-        plan: plan of the simulations.
-        time: shape (rows,); None: gaps are not detected.
-
-    Returns:
-        Shape (parameters,).
+def stable_arx(record: ScaledRecord) -> Array:
+    """Parameters of the ARX model of a record of one output, its poles mirrored into the unit circle.
 
     Raises:
         InputError: too few rows, or rows that don't determine the parameters.
     """
-    rows = rows_of(structure, inputs, outputs, time)
-    theta = stabilize(structure, least_squares(rows.regressors, rows.outputs).parameters[0])
+    rows = record.rows()
+    return stabilize(record.structure, least_squares(rows.regressors, rows.outputs).parameters)
+
+
+def instrumental_variable(record: ScaledRecord) -> Array:
+    """The instrumental variable estimate of a record of one output, shape (parameters,), its poles as of `stable_arx`.
+
+    Raises:
+        InputError: too few rows, or rows that don't determine the parameters.
+    """
+    structure, rows, theta = record.structure, record.rows(), stable_arx(record)
     for _ in range(_ITERATIONS):
-        run = simulate(structure, theta[None, :], inputs, outputs, plan)
+        run = simulate(structure, theta, record.u, record.y, record.plan)
         # A simulation starts from measured rows.
-        clean = np.where(np.isfinite(run), run, outputs)
-        instruments = rows_of(structure, inputs, clean, time)
+        instruments = replace(record, y=np.where(np.isfinite(run), run, record.y)).rows()
         both = np.intersect1d(rows.position, instruments.position, assume_unique=True)
         x, y = (part[np.searchsorted(rows.position, both)] for part in (rows.regressors, rows.outputs[:, 0]))
         q, _ = np.linalg.qr(instruments.regressors[np.searchsorted(instruments.position, both)])
@@ -56,7 +50,7 @@ def instrumental_variable(
     return theta
 
 
-def stabilize(structure: Structure, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+def stabilize(structure: Structure, parameters: Array) -> Array:
     """Mirror poles on or outside the unit circle into it, with a small margin.
 
     Args:
@@ -69,7 +63,7 @@ def stabilize(structure: Structure, parameters: NDArray[np.float64]) -> NDArray[
     return inside
 
 
-def mirror_poles(a: NDArray[np.float64]) -> NDArray[np.float64]:
+def mirror_poles(a: Array) -> Array:
     """Coefficients of y[k] = a1 y[k-1] + ... with the poles on or outside the unit circle mirrored into it.
 
     Args:

@@ -1,8 +1,8 @@
-"""A fitted linear model: one-step-ahead prediction and simulation.
+"""A fitted linear model of one output: one-step-ahead prediction and simulation.
 
-Both an ARX and an output-error model are the recursion of `structure.Structure`. An ARX model is fitted by its
-one-step-ahead prediction, an output-error model by its simulation, and these are the residuals that should be white:
-`simulates` tells them apart.
+An ARX and an output-error model are the recursion of `structure.Structure`, ARMAX and Box-Jenkins models have a model
+of the disturbance too (`linear_predictor`). An output-error model is fitted by its simulation, the others by their
+one-step-ahead prediction, and these are the residuals that should be white.
 """
 
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.identification.regressor import consecutive_rows, rows_of
+from reactorwatch.arrays import Array
+from reactorwatch.identification.linear_predictor import Kind, LinearPredictor, PredictionErrors
+from reactorwatch.identification.regressor import rows_of
+from reactorwatch.identification.simulation import plan_run, simulate
 from reactorwatch.identification.structure import Structure, as_columns
-
-_DIVERGED = 1e100  # a simulation beyond this has diverged
 
 
 def standard_deviations(
@@ -44,80 +44,79 @@ def standard_deviations(
 
 @dataclass(frozen=True)
 class LinearModel:
-    """A fitted linear model, in the signals' own units.
+    """A fitted linear model of one output, in the signals' own units.
 
     Attributes:
-        structure: terms of the model.
-        parameters: shape (outputs, parameters), in the order of `structure.parameter_names`.
-        covariance: shape (outputs, parameters, parameters); inf where the data do not determine it.
-        noise_sd: standard deviation of the residuals of the fit, shape (outputs,).
+        kind: kind of the model.
+        structure: terms of the plant.
+        parameters: those of the plant in the order of `structure.parameter_names`, then d of a Box-Jenkins model, then
+            c of it or of an ARMAX model; shape (parameters,).
+        covariance: shape (parameters, parameters); inf where the data do not determine it.
+        noise_sd: standard deviation of the residuals of the fit.
         condition: condition number of the scaled regressors (or gradients).
         rows: number of rows of the fit.
-        simulates: True if it was fitted by simulation (output error), False if by one-step-ahead prediction (ARX).
     """
 
+    kind: Kind
     structure: Structure
-    parameters: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    noise_sd: NDArray[np.float64]
+    parameters: Array
+    covariance: Array
+    noise_sd: float
     condition: float
     rows: int
-    simulates: bool
 
     @property
     def parameter_count(self) -> int:
-        """Number of parameters of all outputs."""
-        return int(self.parameters.size)
+        """Number of parameters."""
+        return self.parameters.size
 
     @property
-    def dynamics(self) -> NDArray[np.float64]:
-        """Parameters of the recursion, shape (outputs, parameters)."""
-        return self.parameters
+    def dynamics(self) -> Array:
+        """Parameters of the plant, shape (parameters of the structure,)."""
+        return self.parameters[: self.structure.parameters]
 
     @property
-    def standard_deviations(self) -> NDArray[np.float64]:
-        """Standard deviations of the parameters, shape (outputs, parameters)."""
-        return np.array([standard_deviations(covariance) for covariance in self.covariance])
+    def standard_deviations(self) -> Array:
+        """Standard deviations of the parameters, shape (parameters,)."""
+        return standard_deviations(self.covariance)
 
-    def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
+    def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
         """Predict each row one step ahead from the measured rows before it.
 
         Args:
             inputs: shape (rows,) or (rows, inputs).
-            outputs: shape (rows,) or (rows, outputs).
+            outputs: shape (rows,) or (rows, 1).
             time: shape (rows,); None: gaps are not detected.
 
         Returns:
-            Shape (rows, outputs); NaN where the rows before are incomplete.
+            Shape (rows, 1); NaN where the rows before are incomplete.
         """
-        rows = rows_of(self.structure, inputs, outputs, time)
-        predicted = np.full(as_columns(outputs, "outputs").shape, np.nan)
-        predicted[rows.position] = rows.regressors @ self.parameters.T
+        u, y = as_columns(inputs, "inputs", self.structure.inputs), as_columns(outputs, "outputs", 1)
+        predictor = LinearPredictor(self.kind, self.structure)
+        if predictor.noise_lags:
+            errors = PredictionErrors(predictor, u, y, plan_run(self.structure, u, y, time))
+            return errors.predict(self.parameters)[0][:, None]
+        rows = rows_of(self.structure, u, y, time)
+        predicted = np.full(y.shape, np.nan)
+        predicted[rows.position, 0] = rows.regressors @ self.parameters
         return predicted
 
-    def simulate(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Simulate: run the recursion on its own outputs, driven by the measured inputs.
+    def simulate(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+        """Simulate the plant, without its disturbance: run its recursion on its own outputs.
 
         It starts from the first complete consecutive rows, as many as its history has, and continues over missing
-        outputs. At a missing input or a gap in time it stops and restarts.
-
-        Args:
-            inputs: see `predict`.
-            outputs: see `predict`.
-            time: see `predict`.
+        outputs. At a missing input or a gap in time it stops and restarts. Arguments are those of `predict`.
 
         Returns:
-            Shape (rows, outputs); NaN in the rows it starts from and where it cannot run; inf after it has diverged.
+            Shape (rows, 1); NaN in the rows it starts from and where it cannot run; inf after it has diverged.
         """
-        structure = self.structure
-        u = as_columns(inputs, "inputs", structure.inputs)
-        y = as_columns(outputs, "outputs", structure.outputs)
-        return simulate(structure, self.parameters, u, y, plan_run(structure, u, y, time))
+        u, y = as_columns(inputs, "inputs", self.structure.inputs), as_columns(outputs, "outputs", 1)
+        return simulate(self.structure, self.dynamics, u, y, plan_run(self.structure, u, y, time))
 
-    def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Measured minus predicted or simulated, as in the fit; shape (rows, outputs)."""
-        predict = self.simulate if self.simulates else self.predict
-        return as_columns(outputs, "outputs") - predict(inputs, outputs, time)
+    def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+        """Measured minus predicted or simulated, as in the fit; shape (rows, 1)."""
+        predict = self.simulate if self.kind == "oe" else self.predict
+        return as_columns(outputs, "outputs", 1) - predict(inputs, outputs, time)
 
 
 def fit_percent(measured: ArrayLike, predicted: ArrayLike) -> float:
@@ -140,121 +139,3 @@ def fit_percent(measured: ArrayLike, predicted: ArrayLike) -> float:
     if not np.all(np.isfinite(yhat)):
         return float("-inf")
     return float(100.0 * (1.0 - np.linalg.norm(y - yhat) / np.linalg.norm(y - np.mean(y))))
-
-
-@dataclass(frozen=True)
-class RunPlan:
-    """Rows of a record that a simulation covers.
-
-    Attributes:
-        starts: rows at which the simulation restarts from the measured rows before, shape (rows,).
-        running: rows that it covers, shape (rows,).
-    """
-
-    starts: NDArray[np.bool_]
-    running: NDArray[np.bool_]
-
-
-def plan_run(
-    structure: Structure,
-    inputs: NDArray[np.float64],
-    outputs: NDArray[np.float64],
-    time: ArrayLike | None = None,
-) -> RunPlan:
-    """Plan the simulation of a record.
-
-    Args:
-        structure: structure of the model.
-        inputs: shape (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows, outputs), NaN where nothing was measured.
-        time: shape (rows,); None: gaps are not detected.
-    """
-    starts, running = _plan(
-        structure.history,
-        consecutive_rows(inputs, time),
-        consecutive_rows(np.concatenate([inputs, outputs], axis=1), time),
-        consecutive_rows(np.zeros((len(inputs), 1)), time) == 1,
-    )
-    return RunPlan(starts, running)
-
-
-def simulate(
-    structure: Structure,
-    parameters: NDArray[np.float64],
-    inputs: NDArray[np.float64],
-    outputs: NDArray[np.float64],
-    plan: RunPlan,
-) -> NDArray[np.float64]:
-    """`LinearModel.simulate` for parameters and signals of any scale.
-
-    Args:
-        structure: structure of the model.
-        parameters: shape (outputs, parameters).
-        inputs: shape (rows, inputs).
-        outputs: shape (rows, outputs).
-        plan: plan for this record and structure.
-    """
-    return _run(
-        np.ascontiguousarray(parameters),
-        structure.output_lags,
-        structure.input_lags,
-        structure.delay,
-        structure.offset,
-        np.ascontiguousarray(inputs),
-        np.ascontiguousarray(outputs),
-        plan.starts,
-        plan.running,
-    )
-
-
-@jit
-def _plan(
-    reach: int, driven: NDArray[np.int64], complete: NDArray[np.int64], after_gap: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Plan from the counts of consecutive rows with inputs (`driven`) and with all values (`complete`)."""
-    rows = driven.size
-    starts, running = np.zeros(rows, np.bool_), np.zeros(rows, np.bool_)
-    for k in range(1, rows):
-        # Row k needs the inputs of the rows before it, not its own.
-        if after_gap[k] or driven[k - 1] < reach:
-            continue
-        starts[k] = not running[k - 1] and complete[k - 1] >= reach
-        running[k] = running[k - 1] or starts[k]
-    return starts, running
-
-
-@jit
-def _run(
-    parameters: NDArray[np.float64],
-    output_lags: int,
-    input_lags: int,
-    delay: int,
-    offset: bool,
-    u: NDArray[np.float64],
-    y: NDArray[np.float64],
-    starts: NDArray[np.bool_],
-    running: NDArray[np.bool_],
-) -> NDArray[np.float64]:
-    rows, outputs = y.shape
-    inputs = u.shape[1]
-    run = np.full((rows, outputs), np.nan)
-    own = np.empty((rows, outputs))
-    for k in range(rows):
-        if not running[k]:
-            continue
-        if starts[k]:
-            for back in range(1, output_lags + 1):
-                for o in range(outputs):  # a slice would take two seconds to compile
-                    own[k - back, o] = y[k - back, o]
-        for o in range(outputs):
-            total = parameters[o, parameters.shape[1] - 1] if offset else 0.0
-            for lag in range(output_lags):
-                for i in range(outputs):
-                    total += parameters[o, lag * outputs + i] * own[k - 1 - lag, i]
-            for lag in range(input_lags):
-                for i in range(inputs):
-                    total += parameters[o, output_lags * outputs + lag * inputs + i] * u[k - delay - lag, i]
-            # A diverged simulation stays so: NaN would look like a row without a prediction.
-            own[k, o] = min(max(total, -_DIVERGED), _DIVERGED) if total == total else _DIVERGED
-            run[k, o] = own[k, o] if abs(own[k, o]) < _DIVERGED else np.inf
-    return run

@@ -11,15 +11,17 @@ initial weights the one with the best simulation of the fitted rows is chosen.
 """
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import check_row_count, fit_arx
-from reactorwatch.identification.linear_model import LinearModel, fit_percent, plan_run
-from reactorwatch.identification.regressor import Rows, rows_of
+from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.linear_model import LinearModel, fit_percent
+from reactorwatch.identification.regressor import rows_of
+from reactorwatch.identification.scaled_record import ScaledRecord
+from reactorwatch.identification.simulation import plan_run
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 _DIVERGED = 1e6  # a scaled output beyond this, a million times its spread, has diverged
@@ -55,7 +57,8 @@ class NeuralModel:
     def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
         """See `LinearModel.predict`."""
         predicted = self.linear.predict(inputs, outputs, time)
-        rows = _network_rows(self.linear.structure, self.scaling, inputs, outputs, time)
+        u, y = self.scaling.inputs(as_columns(inputs, "inputs")), self.scaling.outputs(as_columns(outputs, "outputs"))
+        rows = rows_of(self.linear.structure.without_offset(), u, y, time)
         predicted[rows.position, 0] += self._correction(rows.regressors)
         return predicted
 
@@ -65,7 +68,7 @@ class NeuralModel:
         u = scaling.inputs(as_columns(inputs, "inputs", structure.inputs))
         y = scaling.outputs(as_columns(outputs, "outputs", 1))
         plan = plan_run(structure, u, y, time)
-        theta = scaling.scale_parameters(structure, self.linear.parameters[0])
+        theta = scaling.scale_parameters(structure, self.linear.parameters)
         weights, constant = (theta[:-1], theta[-1]) if structure.offset else (theta, 0.0)
         spread = scaling.output_spreads[0]
         own, run = y[:, 0].copy(), np.full(y.shape, np.nan)
@@ -112,25 +115,23 @@ class Neural:
         """Fit the networks and choose the one with the best simulation.
 
         Args:
-            structure: lags and delay; one output.
+            structure: lags and delay.
             inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
             outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
             time: shape (rows,); None: gaps are not detected.
 
         Raises:
-            InputError: scikit-learn is not installed, several outputs, or a record that `fit_arx` refuses.
+            InputError: scikit-learn is not installed, or a record that `fit_arx` refuses.
         """
         try:
             from sklearn.exceptions import ConvergenceWarning  # type: ignore[import-untyped]
             from sklearn.neural_network import MLPRegressor  # type: ignore[import-untyped]
         except ImportError as missing:
             raise InputError("the neural model needs scikit-learn: pip install reactorwatch[neural]") from missing
-        if structure.outputs != 1:
-            raise InputError(f"a neural model has one output, got {structure.outputs}: fit one model for each")
         linear = fit_arx(structure, inputs, outputs, time)
-        scaling = Scaling.of(inputs, outputs, centred=structure.offset)
-        rows = _network_rows(structure, scaling, inputs, outputs, time)
-        check_row_count(rows, len(as_columns(outputs, "outputs")))
+        record = ScaledRecord.of(structure, inputs, outputs, time)
+        # Without the constant: the network has its own.
+        rows = replace(record, structure=structure.without_offset()).enough_rows()
         residuals = linear.residuals(inputs, outputs, time)[rows.position, 0]
         spread = float(np.std(residuals)) or 1.0
         models = []
@@ -150,18 +151,7 @@ class Neural:
                 network.fit(rows.regressors, residuals / spread)
             (hidden, output), (hidden_bias, output_bias) = network.coefs_, network.intercepts_
             models.append(
-                NeuralModel(linear, scaling, spread, hidden, hidden_bias, output[:, 0], float(output_bias[0]))
+                NeuralModel(linear, record.scaling, spread, hidden, hidden_bias, output[:, 0], float(output_bias[0]))
             )
         measured = as_columns(outputs, "outputs")[:, 0]
         return max(models, key=lambda model: fit_percent(measured, model.simulate(inputs, outputs, time)[:, 0]))
-
-
-def _network_rows(
-    structure: Structure, scaling: Scaling, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None
-) -> Rows:
-    """The scaled regressors, without the constant: the network has its own."""
-    lags = Structure(
-        structure.output_lags, structure.input_lags, structure.delay, structure.inputs, structure.outputs, offset=False
-    )
-    u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", structure.outputs)
-    return rows_of(lags, scaling.inputs(u), scaling.outputs(y), time)

@@ -12,7 +12,7 @@ Products are formed of scaled signals, since those of signals far from zero are 
 the signals' own units at the end.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -21,9 +21,11 @@ from numpy.typing import ArrayLike, NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import check_not_constant, check_row_count, least_squares
-from reactorwatch.identification.linear_model import plan_run, standard_deviations
+from reactorwatch.identification.batch import least_squares
+from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.regressor import rows_of
+from reactorwatch.identification.scaled_record import ScaledRecord
+from reactorwatch.identification.simulation import PlanArrays, plan_run
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 DEGREE = 2
@@ -41,7 +43,7 @@ class PolynomialModel:
     """A fitted polynomial NARX model.
 
     Attributes:
-        structure: lags and delay; one output.
+        structure: lags and delay.
         scaling: scaling of the signals.
         products: terms for scaled signals, the constant first.
         values: coefficients of the terms, shape (terms,).
@@ -63,15 +65,10 @@ class PolynomialModel:
         """Number of parameters."""
         return self.values.size
 
-    @property
-    def dynamics(self) -> None:
-        """No recursion that is linear in its state."""
-        return
-
     def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
         """See `LinearModel.predict`."""
         u, y = self._scale(inputs, outputs)
-        rows = rows_of(lagged_signals(self.structure), u, y, time)
+        rows = rows_of(self.structure.without_offset(), u, y, time)
         predicted = np.full(y.shape, np.nan)
         predicted[rows.position, 0] = _multiply(rows.regressors, self.products) @ self.values
         return predicted * self.scaling.output_spreads[0] + self.scaling.output_centres[0]
@@ -80,10 +77,7 @@ class PolynomialModel:
         """See `LinearModel.simulate`."""
         u, y = self._scale(inputs, outputs)
         plan = plan_run(self.structure, u, y, time)
-        s, factors = self.structure, factors_of(self.products)
-        run = run_products(
-            self.values, factors, s.output_lags, s.input_lags, s.delay, u, y[:, 0], plan.starts, plan.running
-        )
+        run = run_products(self.values, factors_of(self.products), self.structure.orders, u, y[:, 0], plan.arrays)
         return (run * self.scaling.output_spreads[0] + self.scaling.output_centres[0])[:, None]
 
     def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
@@ -135,7 +129,7 @@ def fit_narx(
     """Fit a polynomial NARX model of one output.
 
     Args:
-        structure: lags of output and inputs; one output, with an offset.
+        structure: lags of output and inputs, with an offset.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.
@@ -144,10 +138,8 @@ def fit_narx(
         InputError: an output that is constant, or fewer rows than candidates.
     """
     u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
-    check_not_constant(y)
-    scaling = Scaling.of(u, y)
-    rows = rows_of(lagged_signals(structure), scaling.inputs(u), scaling.outputs(y), time)
-    check_row_count(rows, len(y))
+    record = ScaledRecord.of(structure, u, y, time)
+    rows = replace(record, structure=structure.without_offset()).enough_rows()
     candidates = candidate_products(structure)
     if rows.position.size < len(candidates):
         raise InputError(
@@ -161,9 +153,9 @@ def fit_narx(
 
     def fit(size: int, part: slice) -> PolynomialModel:
         solution = least_squares(regressors[part, order[:size]], target[part])
-        products, values = tuple(candidates[i] for i in order[:size]), solution.parameters[0]
-        covariance = solution.noise_variance[0] * solution.inverse
-        return PolynomialModel(structure, scaling, products, values, covariance, target[part].size)
+        products, values = tuple(candidates[i] for i in order[:size]), solution.parameters
+        covariance = solution.noise_variance * solution.inverse
+        return PolynomialModel(structure, record.scaling, products, values, covariance, target[part].size)
 
     def squares(size: int) -> float:
         """Sum of squares of the simulation errors of each half by a model of the other."""
@@ -186,7 +178,7 @@ def fit_narx(
 
 def candidate_products(structure: Structure, degree: int = DEGREE) -> tuple[Product, ...]:
     """All products of the lagged signals up to the degree, the constant and the linear ones first."""
-    signals = range(lagged_signals(structure).parameters)
+    signals = range(structure.parameters - int(structure.offset))
     return tuple(product for size in range(degree + 1) for product in combinations_with_replacement(signals, size))
 
 
@@ -200,13 +192,6 @@ def name_product(product: Product, structure: Structure, inputs: tuple[str, ...]
             lag, i = divmod(factor - structure.output_lags, structure.inputs)
             names.append(f"{inputs[i]}{structure.delay + lag}")
     return "*".join(names)
-
-
-def lagged_signals(structure: Structure) -> Structure:
-    """The lagged signals alone, without the constant."""
-    return Structure(
-        structure.output_lags, structure.input_lags, structure.delay, structure.inputs, structure.outputs, offset=False
-    )
 
 
 def _multiply(signals: Array, products: tuple[Product, ...]) -> Array:
@@ -248,30 +233,25 @@ def factors_of(products: tuple[Product, ...]) -> NDArray[np.int64]:
 def run_products(
     values: NDArray[np.float64],
     factors: NDArray[np.int64],
-    output_lags: int,
-    input_lags: int,
-    delay: int,
+    orders: tuple[int, int, int],
     u: NDArray[np.float64],
     y: NDArray[np.float64],
-    starts: NDArray[np.bool_],
-    running: NDArray[np.bool_],
+    plan: PlanArrays,
 ) -> NDArray[np.float64]:
     """Simulate a polynomial of scaled signals.
 
     Args:
         values: coefficients, shape (terms,).
         factors: indices of each term's factors among the lagged signals, shape (terms, degree); -1: none.
-        output_lags: see `Structure`.
-        input_lags: see `Structure`.
-        delay: see `Structure`.
+        orders: see `Structure`.
         u: shape (rows, inputs).
         y: shape (rows,).
-        starts: see `RunPlan`.
-        running: see `RunPlan`.
+        plan: rows that are simulated, see `RunPlan.arrays`.
 
     Returns:
         Shape (rows,); NaN where it does not run, inf after it has diverged.
     """
+    (output_lags, input_lags, delay), (starts, running) = orders, plan
     rows, inputs = u.shape
     run, own = np.full(rows, np.nan), np.zeros(rows)
     signals = np.empty(output_lags + input_lags * inputs)

@@ -2,7 +2,7 @@
 
     y[k] = w[k] + e[k],    w[k] = sum of value * product of w[k-i] and u[k-j], up to a degree, plus an offset.
 
-The coefficients minimise the simulation error, by the descent of `output_error`; a polynomial fitted by its one-step
+The coefficients minimise the simulation error, by the search of `descent`; a polynomial fitted by its one-step
 error (`polynomial_narx`) is as good there, and often diverges in simulation. Terms are added one by one to the linear
 ones (Piroddi and Spinelli, Int. J. Control 76 (2003) 1767): the sensitivities of the simulation to all candidates at
 value 0 tell which ones may lower the error most; of the best few, each fitted with the terms so far, the one with the
@@ -11,6 +11,7 @@ of the record. A model that diverges on rows left out of its fit ends the search
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,19 +19,18 @@ from numpy.typing import ArrayLike, NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import check_not_constant, check_row_count, least_squares
-from reactorwatch.identification.linear_model import RunPlan, plan_run
-from reactorwatch.identification.output_error import descend, error_variance
+from reactorwatch.identification.batch import least_squares
+from reactorwatch.identification.descent import descend, solution_at
 from reactorwatch.identification.polynomial_narx import (
     DIVERGED,
     PolynomialModel,
     Product,
     candidate_products,
     factors_of,
-    lagged_signals,
 )
-from reactorwatch.identification.regressor import rows_of
-from reactorwatch.identification.structure import Scaling, Structure, as_columns
+from reactorwatch.identification.scaled_record import ScaledRecord
+from reactorwatch.identification.simulation import PlanArrays
+from reactorwatch.identification.structure import Structure
 
 DEGREES = (3, 2)
 """Degree of the polynomials, and the one for so many signals that there would be more candidates than rows."""
@@ -53,30 +53,20 @@ _DEPENDENT = 1e-9  # share of a sensitivity's square that is not a combination o
 class _Objective:
     """Simulation errors of some rows and their gradient."""
 
-    def __init__(
-        self,
-        products: tuple[Product, ...],
-        structure: Structure,
-        u: Array,
-        y: Array,
-        plan: RunPlan,
-        rows: NDArray[np.int64],
-    ) -> None:
-        self._factors = factors_of(products)
-        self._structure, self._u, self._y, self._plan, self._rows = structure, u, y, plan, rows
+    def __init__(self, products: tuple[Product, ...], record: ScaledRecord, rows: NDArray[np.int64]) -> None:
+        self._factors, self._record, self._rows = factors_of(products), record, rows
 
     def run(self, theta: Array) -> tuple[Array, Array]:
         """Simulation of all rows, shape (rows,), and its gradient, shape (rows, terms)."""
-        s = self._structure
+        record = self._record
         return run_with_gradient(
-            theta, self._factors, s.output_lags, s.input_lags, s.delay,
-            self._u, self._y, self._plan.starts, self._plan.running,
-        )  # fmt: skip
+            theta, self._factors, record.structure.orders, record.u, record.y[:, 0], record.plan.arrays
+        )
 
     def __call__(self, theta: Array) -> tuple[Array, Array]:
         """Errors, shape (compared rows,), and the gradient, shape (compared rows, terms)."""
         run, gradient = self.run(theta)
-        return (self._y - run)[self._rows], gradient[self._rows]
+        return (self._record.y[:, 0] - run)[self._rows], gradient[self._rows]
 
     def admits(self, theta: Array) -> bool:
         """True if the simulation does not diverge."""
@@ -92,7 +82,7 @@ def fit_noe(
     """Fit a polynomial output-error model of one output.
 
     Args:
-        structure: lags of output and inputs; one output, with an offset.
+        structure: lags of output and inputs, with an offset.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.
@@ -100,42 +90,37 @@ def fit_noe(
     Raises:
         InputError: an output that is constant, or fewer rows than candidates.
     """
-    u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
-    check_not_constant(y)
-    scaling = Scaling.of(u, y)
-    scaled_u = np.ascontiguousarray(scaling.inputs(u))
-    scaled_y = np.ascontiguousarray(scaling.outputs(y))
-    rows = check_row_count(rows_of(lagged_signals(structure), scaled_u, scaled_y, time), len(y))
-    plan = plan_run(structure, scaled_u, scaled_y, time)
-    compared = np.flatnonzero(plan.running & np.isfinite(scaled_y[:, 0]))
+    record = ScaledRecord.of(structure, inputs, outputs, time)
+    record = replace(record, u=np.ascontiguousarray(record.u), y=np.ascontiguousarray(record.y))
+    rows = replace(record, structure=structure.without_offset()).enough_rows()
+    compared = np.flatnonzero(record.plan.running & np.isfinite(record.y[:, 0]))
     candidates = _choose_candidates(structure, compared.size)
 
     def objective(products: tuple[Product, ...], chosen: NDArray[np.int64] = compared) -> _Objective:
-        return _Objective(products, structure, scaled_u, scaled_y[:, 0], plan, chosen)
+        return _Objective(products, record, chosen)
 
     linear = tuple(product for product in candidates if len(product) < 2)
     start = np.zeros(len(linear))
-    arx = least_squares(np.column_stack([np.ones(rows.position.size), rows.regressors]), rows.outputs).parameters[0]
+    arx = least_squares(np.column_stack([np.ones(rows.position.size), rows.regressors]), rows.outputs).parameters
     if objective(linear).admits(arx):
         start = arx
     folds = [block for count in FOLDS for block in np.array_split(compared, count)]
     best = grown = linear, descend(objective(linear), start)[0]
-    smallest = _held_out_error(objective, *grown, folds, compared, scaled_y[:, 0])
+    smallest = _held_out_error(objective, *grown, folds, compared, record.y[:, 0])
     while len(grown[0]) < min(LARGEST_SIZE, len(candidates)):
         larger = _grow(objective, candidates, *grown)
         if larger is None:
             break
         grown = larger
-        error = _held_out_error(objective, *grown, folds, compared, scaled_y[:, 0])
+        error = _held_out_error(objective, *grown, folds, compared, record.y[:, 0])
         if not np.isfinite(error):
             break
         if error < smallest:
             best, smallest = grown, error
     products, theta = best
-    errors, gradient = objective(products)(theta)
-    # As for least squares: at the minimum the gradient takes the place of the regressors.
-    covariance = error_variance(errors, theta.size)[0] * least_squares(gradient, errors).inverse
-    return PolynomialModel(structure, scaling, products, theta, covariance, errors.size, simulates=True)
+    solution = solution_at(objective(products), theta)
+    covariance = solution.noise_variance * solution.inverse
+    return PolynomialModel(structure, record.scaling, products, theta, covariance, solution.rows, simulates=True)
 
 
 def _choose_candidates(structure: Structure, rows: int) -> tuple[Product, ...]:
@@ -197,31 +182,26 @@ def _held_out_error(
 def run_with_gradient(
     theta: NDArray[np.float64],
     factors: NDArray[np.int64],
-    output_lags: int,
-    input_lags: int,
-    delay: int,
+    orders: tuple[int, int, int],
     u: NDArray[np.float64],
     y: NDArray[np.float64],
-    starts: NDArray[np.bool_],
-    running: NDArray[np.bool_],
+    plan: PlanArrays,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Simulate a polynomial of scaled signals, with derivatives.
 
     Args:
         theta: coefficients, shape (terms,).
         factors: see `polynomial_narx.run_products`.
-        output_lags: see `Structure`.
-        input_lags: see `Structure`.
-        delay: see `Structure`.
+        orders: see `Structure`.
         u: shape (rows, inputs).
         y: shape (rows,).
-        starts: see `RunPlan`.
-        running: see `RunPlan`.
+        plan: rows that are simulated, see `RunPlan.arrays`.
 
     Returns:
         The simulation, shape (rows,), NaN where it does not run and inf from where it has diverged, and its gradient,
         shape (rows, terms).
     """
+    (output_lags, input_lags, delay), (starts, running) = orders, plan
     rows, inputs = u.shape
     size, degree = factors.shape
     run, own = np.full(rows, np.nan), np.zeros(rows)

@@ -1,12 +1,9 @@
 """Recursive identification of output-error, ARMAX and Box-Jenkins models.
 
 The recursive prediction error method (Ljung and Soderstrom, Theory and Practice of Recursive Identification, 1983,
-chapter 3, with the projection of chapter 6). The model is that of `prediction_error`, a plant w and its disturbance v,
-
-    w[k] = f w[k-1] + ... + b u[k-d] + ... + offset,    yhat[k] = w[k] + d v[k-1] + ... + c e[k-1] + ...,    v = y - w,
-
-of which an output-error model has neither d nor c, and an ARMAX model f = d = a. The parameters p follow the gradient g
-of the prediction, from the same recursions differentiated,
+chapter 3, with the projection of chapter 6). The models, a plant w and its disturbance v,
+are those of `linear_predictor`. The parameters p follow the gradient g of the prediction, from the same recursions
+differentiated,
 
     p <- p + P g (y[k] - yhat[k]),
 
@@ -24,11 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
-from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import model_of
+from reactorwatch.identification.batch import solution_of, unscale
 from reactorwatch.identification.linear_model import LinearModel
-from reactorwatch.identification.output_error import is_stable
-from reactorwatch.identification.prediction_error import Kind, PredictionErrorModel, full_index, unscale
+from reactorwatch.identification.linear_predictor import Kind, LinearPredictor
 from reactorwatch.identification.rls import RecursiveLeastSquares, RlsUpdate
 from reactorwatch.identification.structure import Scaling, Structure
 
@@ -43,13 +38,13 @@ class RecursivePredictionError:
     """Predicts an output, and corrects its parameters by each measured row.
 
     Args:
-        structure: terms of the plant; one output, with an offset for `armax` and `bj`.
+        structure: terms of the plant, with an offset for `armax` and `bj`.
         scaling: scaling of the signals; without it they are taken as they are, which suits signals of the order of 1.
         forgetting: weight of a row relative to its successor, in (0, 1], once it has risen to it.
-        kind: `armax`, `bj` (Box-Jenkins), or None for an output-error model.
+        kind: `oe` (output error), `armax` or `bj` (Box-Jenkins).
 
     Raises:
-        InputError: several outputs, a Box-Jenkins model without inputs, or a setting out of its range.
+        InputError: a Box-Jenkins model without inputs, or a setting out of its range.
     """
 
     def __init__(
@@ -57,30 +52,27 @@ class RecursivePredictionError:
         structure: Structure,
         scaling: Scaling | None = None,
         forgetting: float = 1.0,
-        kind: Kind | None = None,
+        kind: Kind = "oe",
     ) -> None:
-        if structure.outputs != 1:
-            raise InputError(f"a recursive model has one output, got {structure.outputs}: use one for each")
         self._structure, self._kind = structure, kind
-        self._scaling = Scaling.none(structure.inputs, 1) if scaling is None else scaling
+        self._scaling = Scaling.none(structure.inputs) if scaling is None else scaling
         self._forgetting = forgetting
-        self._index = np.arange(structure.parameters) if kind is None else full_index(kind, structure)
-        self._noise_lags = 0 if kind is None else structure.output_lags
+        self._predictor = LinearPredictor(kind, structure)
         self._estimator = RecursiveLeastSquares(
-            int(self._index.max()) + 1, min(START_FORGETTING, forgetting), COVARIANCE_LIMIT
+            self._predictor.size, min(START_FORGETTING, forgetting), COVARIANCE_LIMIT
         )
         self.restart()
 
     def restart(self) -> None:
         """Clear the run, as after a gap in the rows; keep the parameters."""
-        history, plant = self._structure.history, self._structure.parameters
+        history, plant, noise_lags = self._structure.history, self._structure.parameters, self._predictor.noise_lags
         self._filled = 0
         self._own = np.zeros(history)
         self._inputs = np.zeros((history, self._structure.inputs))
         self._plant_gradients = np.zeros((history, plant))
-        self._disturbance = np.zeros(self._noise_lags)
-        self._errors = np.zeros(self._noise_lags)
-        self._gradients = np.zeros((self._noise_lags, self._index.size))
+        self._disturbance = np.zeros(noise_lags)
+        self._errors = np.zeros(noise_lags)
+        self._gradients = np.zeros((noise_lags, self._predictor.index.size))
 
     def update(self, inputs: ArrayLike, output: float) -> RlsUpdate | None:
         """Predict the output, then learn from its measurement.
@@ -109,15 +101,16 @@ class RecursivePredictionError:
             return None
         regressor = self._regressor()
         old = self._estimator.parameters
-        plant, d, c = self._split(old)
+        (plant, d, c), predictor = self._predictor.split(old), self._predictor
         prediction = float(regressor @ plant + d @ self._disturbance + c @ self._errors)
-        of_plant = regressor + plant[: self._structure.output_lags] @ self._past_plant_gradients()
-        through_noise = of_plant - d @ self._plant_gradients[: self._noise_lags]
-        full = np.concatenate([through_noise, self._disturbance, self._errors])[: self._index.size]
+        lags = self._structure.output_lags
+        of_plant = regressor + plant[:lags] @ self._plant_gradients[:lags]
+        through_noise = of_plant - d @ self._plant_gradients[: predictor.noise_lags]
+        full = np.concatenate([through_noise, self._disturbance, self._errors])[: predictor.index.size]
         full -= c @ self._gradients
-        gradient = np.bincount(self._index, weights=full)
+        gradient = np.bincount(predictor.index, weights=full)
         result = self._estimator.update(gradient, measured - prediction + float(gradient @ old))
-        plant, d, c = self._split(self._project(old))
+        plant, d, c = predictor.split(self._project(old))
         if self._estimator.forgetting < self._forgetting:
             risen = FORGETTING_RISE * self._estimator.forgetting + (1.0 - FORGETTING_RISE)
             self._estimator.raise_forgetting(min(risen, self._forgetting))
@@ -138,28 +131,9 @@ class RecursivePredictionError:
         )
 
     @property
-    def model(self) -> LinearModel | PredictionErrorModel:
+    def model(self) -> LinearModel:
         """The learned model, in the signals' own units."""
-        if self._kind is None:
-            return model_of(self._structure, self._scaling, self._estimator, simulates=True)
-        estimator = self._estimator
-        return unscale(
-            self._kind,
-            self._structure,
-            self._scaling,
-            estimator.parameters,
-            estimator.unit_covariance,
-            variance=estimator.noise_variance,
-            rows=estimator.rows,
-        )
-
-    def _past_plant_gradients(self) -> Array:
-        return self._plant_gradients[: self._structure.output_lags]
-
-    def _split(self, parameters: Array) -> tuple[Array, Array, Array]:
-        """Parameters of the plant, and d and c; the last two are empty for an output-error model."""
-        full, plant, lags = parameters[self._index], self._structure.parameters, self._noise_lags
-        return full[:plant], full[plant : plant + lags], full[plant + lags :]
+        return unscale(self._kind, self._structure, self._scaling, solution_of(self._estimator))
 
     def _regressor(self) -> Array:
         structure = self._structure
@@ -170,22 +144,17 @@ class RecursivePredictionError:
     def _project(self, old: Array) -> Array:
         """Halve the step that was made from `old` until poles and zeros are inside the unit circle."""
         new = self._estimator.parameters
-        if self._admits(new):
+        if self._predictor.is_stable(new):
             return new
         step = new - old
         for _ in range(_HALVINGS):
             step = 0.5 * step
-            if self._admits(old + step):
+            if self._predictor.is_stable(old + step):
                 break
         else:
             step = np.zeros_like(old)
         self._estimator.set_parameters(old + step)
         return self._estimator.parameters
-
-    def _admits(self, parameters: Array) -> bool:
-        plant, d, c = self._split(parameters)
-        polynomials = (plant[: self._structure.output_lags], d, -c)
-        return all(bool(is_stable(np.ascontiguousarray(polynomial))) for polynomial in polynomials)
 
 
 def _push(memory: Array, value: ArrayLike) -> None:

@@ -25,8 +25,8 @@ class BufferState(StoredState, frozen=True):
 
     Attributes:
         structure: structure of the model.
-        period_ns: sampling period; None: gaps are not detected.
-        choice: rows that are fitted.
+        period_ns: None; stored states have it.
+        choice: all rows; stored states have it.
         outputs: output rows that the next regressor needs, newest first; fewer while the history fills.
         inputs: input rows that the next regressor needs, newest first.
         last_time_ns: time of the newest row; None before the first.
@@ -34,8 +34,8 @@ class BufferState(StoredState, frozen=True):
     """
 
     structure: Structure
-    period_ns: int | None
-    choice: RowChoice
+    period_ns: int | None = None
+    choice: RowChoice = ALL_ROWS
     outputs: tuple[tuple[float, ...], ...] = ()
     inputs: tuple[tuple[float, ...], ...] = ()
     last_time_ns: int | None = None
@@ -53,19 +53,10 @@ class RegressorBuffer:
 
     Args:
         structure: structure of the model.
-        period_ns: sampling period; None: gaps are not detected.
-        choice: rows that are fitted; rows are counted from the first one.
-
-    Raises:
-        ValueError: a period that is not above 0.
     """
 
-    def __init__(self, structure: Structure, period_ns: int | None = None, choice: RowChoice = ALL_ROWS) -> None:
-        if period_ns is not None and period_ns <= 0:
-            raise ValueError(f"period_ns must be above 0, got {period_ns}")
+    def __init__(self, structure: Structure) -> None:
         self._structure = structure
-        self._period_ns = period_ns
-        self._choice = choice
         # Flat lists, newest row first: a regressor is a dozen numbers, and slicing a list of a dozen takes a fraction
         # of the overhead of a NumPy call.
         self._outputs: list[float] = []
@@ -80,7 +71,7 @@ class RegressorBuffer:
         Raises:
             ValueError: the state does not fit its structure.
         """
-        buffer = cls(state.structure, state.period_ns, state.choice)
+        buffer = cls(state.structure)
         filled = len(state.outputs)
         if len(state.inputs) != filled or filled > state.structure.history:
             raise ValueError(f"state must hold at most {state.structure.history} equal rows, got {filled}")
@@ -93,25 +84,23 @@ class RegressorBuffer:
     @property
     def state(self) -> BufferState:
         """A copy of the full state."""
-        rows = len(self._outputs) // self._structure.outputs
+        rows, count = len(self._outputs), self._structure.inputs
         return BufferState(
             self._structure,
-            self._period_ns,
-            self._choice,
-            _rows(self._outputs, self._structure.outputs, rows),
-            _rows(self._inputs, self._structure.inputs, rows),
-            self._last_time_ns,
-            self._row,
+            outputs=tuple((value,) for value in self._outputs),
+            inputs=tuple(tuple(self._inputs[row * count : (row + 1) * count]) for row in range(rows)),
+            last_time_ns=self._last_time_ns,
+            row=self._row,
         )
 
     @property
     def upcoming(self) -> NDArray[np.float64] | None:
         """Regressor of the next row, shape (parameters,); None while the history fills."""
         structure = self._structure
-        if len(self._outputs) < structure.history * structure.outputs:
+        if len(self._outputs) < structure.history:
             return None
         first, last = (structure.delay - 1) * structure.inputs, (structure.delay - 1 + structure.input_lags)
-        values = self._outputs[: structure.output_lags * structure.outputs]
+        values = self._outputs[: structure.output_lags]
         values += self._inputs[first : last * structure.inputs]
         if structure.offset:
             values.append(1.0)
@@ -127,31 +116,26 @@ class RegressorBuffer:
         Args:
             time_ns: time of the row.
             inputs: shape (inputs,), NaN for what was not measured.
-            outputs: shape (outputs,), NaN for what was not measured.
+            outputs: shape (1,), NaN for what was not measured.
 
         Returns: The regressor of this row, from the rows before it, shape (parameters,). None for a row that cannot be
-            predicted (its history is incomplete), has a missing value, or is not chosen.
+            predicted (its history is incomplete) or has a missing value.
 
         Raises:
             ValueError: a time not after the last one's, or a wrong number of values; nothing is changed then.
         """
         structure = self._structure
         new_inputs, new_outputs = list(map(float, inputs)), list(map(float, outputs))
-        if len(new_inputs) != structure.inputs or len(new_outputs) != structure.outputs:
+        if len(new_inputs) != structure.inputs or len(new_outputs) != 1:
             raise ValueError(
-                f"a row must have {structure.inputs} inputs and {structure.outputs} outputs, "
-                f"got {len(new_inputs)} and {len(new_outputs)}"
+                f"a row must have {structure.inputs} inputs and 1 outputs, got {len(new_inputs)} and {len(new_outputs)}"
             )
-        if self._last_time_ns is not None:
-            interval = time_ns - self._last_time_ns
-            if interval <= 0:
-                raise ValueError(f"time_ns must increase, got {time_ns} after {self._last_time_ns}")
-            if self._period_ns is not None and abs(interval - self._period_ns) > GAP_TOLERANCE * self._period_ns:
-                self.restart()
+        if self._last_time_ns is not None and time_ns <= self._last_time_ns:
+            raise ValueError(f"time_ns must increase, got {time_ns} after {self._last_time_ns}")
         complete = all(map(isfinite, new_inputs)) and all(map(isfinite, new_outputs))
-        regressor = self.upcoming if complete and self._choice.takes(self._row) else None
+        regressor = self.upcoming if complete else None
         if complete:
-            self._outputs = new_outputs + self._outputs[: (structure.history - 1) * structure.outputs]
+            self._outputs = new_outputs + self._outputs[: structure.history - 1]
             self._inputs = new_inputs + self._inputs[: (structure.history - 1) * structure.inputs]
         else:
             self.restart()
@@ -160,18 +144,13 @@ class RegressorBuffer:
         return regressor
 
 
-def _rows(values: list[float], signals: int, rows: int) -> tuple[tuple[float, ...], ...]:
-    """Split a flat list into rows."""
-    return tuple(tuple(values[row * signals : (row + 1) * signals]) for row in range(rows))
-
-
 @dataclass(frozen=True)
 class Rows:
     """The rows of a record that a model can be fitted to.
 
     Attributes:
         regressors: shape (rows, parameters).
-        outputs: shape (rows, outputs).
+        outputs: shape (rows, 1).
         position: index of each row in the record, from 0, shape (rows,).
     """
 
@@ -192,7 +171,7 @@ def rows_of(
     Args:
         structure: structure of the model.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows,) or (rows, outputs), NaN where nothing was measured.
+        outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.
         choice: rows that are fitted.
 
@@ -200,7 +179,7 @@ def rows_of(
         InputError: shapes that don't fit, or times that don't increase.
     """
     u = as_columns(inputs, "inputs", structure.inputs)
-    y = as_columns(outputs, "outputs", structure.outputs)
+    y = as_columns(outputs, "outputs", 1)
     if len(u) != len(y):
         raise InputError(f"inputs and outputs must have equally many rows, got {len(u)} and {len(y)}")
     count, reach = len(y), structure.history

@@ -15,17 +15,17 @@ A fault is reported where the residual leaves mean +- 3 sigma of the training's 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import LeastSquares, check_not_constant, linear_model
+from reactorwatch.identification.batch import LeastSquares, unscale
 from reactorwatch.identification.linear_model import LinearModel
-from reactorwatch.identification.regressor import rows_of
-from reactorwatch.identification.structure import REPORT_ROWS, Scaling, Structure, as_columns
+from reactorwatch.identification.scaled_record import ScaledRecord
+from reactorwatch.identification.structure import REPORT_ROWS, Structure, as_columns
 
 ORDER = 3
 """Order of the model that the report finds best."""
@@ -42,7 +42,7 @@ def fit_least_squares(
     """Fit the report's ARX model.
 
     Args:
-        structure: terms of the model, with one output.
+        structure: terms of the model.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,); None: gaps are not detected.
@@ -50,10 +50,7 @@ def fit_least_squares(
     Raises:
         InputError: no complete row among those that the report takes, or an output that is constant.
     """
-    u = as_columns(inputs, "inputs", structure.inputs)
-    y = as_columns(outputs, "outputs", 1)
-    check_not_constant(y)
-    return _solve(structure, Scaling.of(u, y), u, y, time)
+    return _solve(ScaledRecord.of(structure, inputs, outputs, time))
 
 
 def fit_output_error(
@@ -61,11 +58,7 @@ def fit_output_error(
 ) -> LinearModel:
     """Fit the report's output-error model: its ARX model, re-estimated from its own simulation until it settles.
 
-    Args:
-        structure: see `fit_least_squares`.
-        inputs: see `fit_least_squares`.
-        outputs: see `fit_least_squares`.
-        time: see `fit_least_squares`.
+    Arguments are those of `fit_least_squares`.
 
     Raises:
         InputError: see `fit_least_squares`; or a simulation that diverges.
@@ -85,11 +78,8 @@ def re_estimate(
 ) -> LinearModel:
     """Fit a model to the simulation of a model: one step of the report's output-error iteration.
 
-    Args:
-        model: the model that is simulated.
-        inputs: see `fit_least_squares`.
-        outputs: measured outputs, which give the simulation its first rows and the model its noise.
-        time: see `fit_least_squares`.
+    Arguments are the model that is simulated, and those of `fit_least_squares`; the measured outputs give the
+    simulation its first rows and the model its noise.
 
     Raises:
         InputError: the simulation diverges.
@@ -102,17 +92,11 @@ def re_estimate(
             "the report's output-error iteration simulates its ARX model, and that simulation diverges: take a lower "
             "order or a record with less noise"
         )
-    fitted = _solve(model.structure, Scaling.of(u, y), u, run, time)
+    record = ScaledRecord.of(model.structure, u, y, time)
+    fitted = _solve(replace(record, y=record.scaling.outputs(run)))
     errors = (y - run)[np.isfinite(y - run)]
-    return LinearModel(
-        structure=fitted.structure,
-        parameters=fitted.parameters,
-        covariance=np.full_like(fitted.covariance, np.inf),
-        noise_sd=np.array([float(np.std(errors))]),
-        condition=fitted.condition,
-        rows=fitted.rows,
-        simulates=True,
-    )
+    unknown, noise_sd = np.full_like(fitted.covariance, np.inf), float(np.std(errors))
+    return replace(fitted, kind="oe", covariance=unknown, noise_sd=noise_sd)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,32 +154,30 @@ def chart_output(
     return ReportChart(fitted, mean, sd, residuals, np.abs(residuals - mean) > WIDTH * sd)
 
 
-def _solve(
-    structure: Structure, scaling: Scaling, inputs: Array, outputs: Array, time: ArrayLike | None
-) -> LinearModel:
+def _solve(record: ScaledRecord) -> LinearModel:
     """Least squares of least norm on the report's rows, as a model in the signals' own units."""
-    rows = rows_of(structure, scaling.inputs(inputs), scaling.outputs(outputs), time, REPORT_ROWS)
+    structure, rows = record.structure, record.rows(REPORT_ROWS)
     regressors = rows.regressors[:, : structure.parameters - int(structure.offset)]
     if not len(regressors):
         raise InputError(
             f"the report's scheme takes every {REPORT_ROWS.every}th row from row {REPORT_ROWS.skip + 1} on, and "
-            f"none of these is complete with the {structure.history} rows before it: {len(outputs)} rows are too few"
+            f"none of these is complete with the {structure.history} rows before it: {len(record.y)} rows are too few"
         )
     singular = np.linalg.svd(regressors, compute_uv=False)
     smallest = max(regressors.shape) * np.finfo(np.float64).eps
     inverse = np.linalg.pinv(regressors, rcond=smallest)
     parameters = inverse @ rows.outputs
-    residuals = rows.outputs - regressors @ parameters
+    squares = np.sum((rows.outputs - regressors @ parameters) ** 2, axis=0)
     rank = int(np.sum(singular > smallest * singular[0]))
     free = len(regressors) - rank
-    variance = np.sum(residuals**2, axis=0) / free if free > 0 else np.full(outputs.shape[1], np.inf)
     whole = rank == regressors.shape[1]
     solution = LeastSquares(
-        parameters=np.pad(parameters.T, ((0, 0), (0, int(structure.offset)))),
+        parameters=np.pad(parameters[:, 0], (0, int(structure.offset))),
         inverse=np.pad(inverse @ inverse.T, (0, int(structure.offset)))
         if whole
         else np.full((structure.parameters,) * 2, np.inf),
-        noise_variance=variance,
+        noise_variance=float(squares[0]) / free if free > 0 else np.inf,
         condition=float(singular[0] / singular[-1]) if singular[-1] > 0.0 else np.inf,
+        rows=len(regressors),
     )
-    return linear_model(structure, scaling, solution, len(regressors))
+    return unscale("arx", structure, record.scaling, solution)

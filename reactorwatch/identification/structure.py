@@ -12,12 +12,9 @@ from reactorwatch.errors import InputError
 class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Terms of a linear model.
 
-    For each output
-
         y[k] = a1 y[k-1] + ... + a_na y[k-na] + b1 u[k-d] + ... + b_nb u[k-d-nb+1] + c.
 
-    With several outputs y[k-i] is their vector, and a_i has one value for each; the same holds for inputs. A model
-    without inputs has no b.
+    With several inputs u[k-i] is their vector, and b_i has one value for each. A model without inputs has no b.
 
     Attributes:
         output_lags: na, number of past outputs.
@@ -25,11 +22,11 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         delay: d, samples from a move of the input to its first effect. An input held over [t_k, t_k+1) first shows
             in row k+1: delay 1.
         inputs: number of inputs.
-        outputs: number of outputs.
+        outputs: 1; stored states have it.
         offset: whether there is a term c.
 
     Raises:
-        InputError: an order or the delay below 1, or no output.
+        InputError: an order or the delay below 1, or another number of outputs than 1.
     """
 
     output_lags: int
@@ -44,9 +41,11 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             value, least = getattr(self, name), 0 if name == "inputs" else 1
             if value < least:
                 raise InputError(f"{title} must be at least {least}, got {value}")
+        if self.outputs != 1:
+            raise InputError(f"a model has one output, got {self.outputs}: use one for each")
 
     @classmethod
-    def of_order(cls, order: int, delay: int = 1, inputs: int = 1, outputs: int = 1, offset: bool = True) -> Self:
+    def of_order(cls, order: int, delay: int = 1, inputs: int = 1) -> Self:
         """Make a structure with equally many lags of output and input.
 
         Raises:
@@ -54,28 +53,38 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         if order < 1:
             raise InputError(f"order must be at least 1, got {order}")
-        return cls(order, order, delay, inputs, outputs, offset)
+        return cls(order, order, delay, inputs)
 
     @property
     def parameters(self) -> int:
-        """Number of parameters of one output's equation."""
-        return self.output_lags * self.outputs + self.input_lags * self.inputs + int(self.offset)
+        """Number of parameters."""
+        return self.output_lags + self.input_lags * self.inputs + int(self.offset)
 
     @property
     def history(self) -> int:
         """Number of rows before row k that its equation needs."""
         return max(self.output_lags, self.delay + self.input_lags - 1 if self.inputs else 0)
 
+    @property
+    def orders(self) -> tuple[int, int, int]:
+        """Lags of the output and of the inputs, and the delay."""
+        return self.output_lags, self.input_lags, self.delay
+
+    def without_offset(self) -> Self:
+        """The lagged signals alone."""
+        return msgspec.structs.replace(self, offset=False)
+
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of one equation's parameters, in order; signals are numbered only where there are several.
+        """Names of the parameters, in order; inputs are numbered only where there are several.
 
         >>> Structure.of_order(2).parameter_names()
         ('a1', 'a2', 'b1', 'b2', 'c')
-        >>> Structure.of_order(1, outputs=2).parameter_names()
-        ('a1_1', 'a1_2', 'b1', 'c')
+        >>> Structure.of_order(1, inputs=2).parameter_names()
+        ('a1', 'b1_1', 'b1_2', 'c')
         """
-        names = [f"a{lag}{suffix}" for lag in range(1, self.output_lags + 1) for suffix in _suffixes(self.outputs)]
-        names += [f"b{lag}{suffix}" for lag in range(1, self.input_lags + 1) for suffix in _suffixes(self.inputs)]
+        suffixes = [""] if self.inputs == 1 else [f"_{i + 1}" for i in range(self.inputs)]
+        names = [f"a{lag}" for lag in range(1, self.output_lags + 1)]
+        names += [f"b{lag}{suffix}" for lag in range(1, self.input_lags + 1) for suffix in suffixes]
         return tuple([*names, "c"] if self.offset else names)
 
 
@@ -84,7 +93,6 @@ _TITLES = {
     "input_lags": "order (lags of the input)",
     "delay": "delay (samples)",
     "inputs": "number of inputs",
-    "outputs": "number of outputs",
 }
 
 
@@ -107,10 +115,6 @@ class RowChoice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise InputError(f"skip must be at least 0, got {self.skip}")
         if self.every < 1:
             raise InputError(f"every must be at least 1, got {self.every}")
-
-    def takes(self, row: int) -> bool:
-        """True if the row of this index, from 0, is fitted."""
-        return row >= self.skip and (row - self.skip) % self.every == 0
 
 
 ALL_ROWS = RowChoice()
@@ -145,9 +149,9 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise InputError(f"centre of a signal must be finite, got {centre}")
 
     @classmethod
-    def none(cls, inputs: int = 1, outputs: int = 1) -> Self:
+    def none(cls, inputs: int = 1) -> Self:
         """Make the identity."""
-        return cls((0.0,) * inputs, (1.0,) * inputs, (0.0,) * outputs, (1.0,) * outputs)
+        return cls((0.0,) * inputs, (1.0,) * inputs, (0.0,), (1.0,))
 
     @classmethod
     def of(cls, inputs: ArrayLike, outputs: ArrayLike, centred: bool = True) -> Self:
@@ -185,12 +189,11 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Scale outputs along the last axis."""
         return (np.asarray(values, dtype=np.float64) - self.output_centres) / self.output_spreads
 
-    def unscaling(self, structure: Structure, output: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def unscaling(self, structure: Structure) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Transform M p + m of parameters for scaled signals to those for the signals' own units.
 
         Args:
             structure: structure of the model.
-            output: index of the output of the equation.
 
         Returns:
             M, shape (parameters, parameters), and m, shape (parameters,). A covariance becomes M cov M'.
@@ -198,7 +201,7 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Raises:
             InputError: a model without offset whose signals were centred.
         """
-        spread, centre = self.output_spreads[output], self.output_centres[output]
+        spread, centre = self.output_spreads[0], self.output_centres[0]
         factors = spread / np.concatenate(
             [
                 np.tile(self.output_spreads, structure.output_lags),
@@ -222,20 +225,17 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         shift[-1] = centre
         return matrix, shift
 
-    def scale_parameters(
-        self, structure: Structure, parameters: NDArray[np.float64], output: int = 0
-    ) -> NDArray[np.float64]:
+    def scale_parameters(self, structure: Structure, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         """Transform parameters for the signals' own units to those for scaled signals, the inverse of `unscaling`.
 
         Args:
             structure: structure of the model.
             parameters: shape (parameters,).
-            output: index of the output of the equation.
 
         Raises:
             InputError: a model without offset whose signals were centred.
         """
-        matrix, shift = self.unscaling(structure, output)
+        matrix, shift = self.unscaling(structure)
         return np.asarray(np.linalg.solve(matrix, parameters - shift))
 
 
@@ -257,7 +257,3 @@ def as_columns(values: ArrayLike, name: str, count: int | None = None) -> NDArra
         wanted = "signals" if count is None else str(count)
         raise InputError(f"{name} must have the shape (rows, {wanted}), got {columns.shape}")
     return columns
-
-
-def _suffixes(count: int) -> tuple[str, ...]:
-    return ("",) if count == 1 else tuple(f"_{i + 1}" for i in range(count))

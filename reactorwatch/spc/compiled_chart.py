@@ -15,13 +15,25 @@ from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reactorwatch.codegen.numba_kernel import Entry
+from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Shown, SignalChart, finite
 
 # The first rows of a chart's column: what comes in and what goes out. After them come its settings, where its memory
 # starts, and its memory.
 X, PRESENT, STATISTIC, CENTRE, LOWER, UPPER, OUT, SETTINGS = range(8)
+
+
+@jit
+def write_point(
+    columns: Array, p: int, statistic: float, centre: float, lower: float, upper: float, out: float
+) -> None:
+    """Write the point of the chart of plant `p`: the numbers of a `Judgement`, with `out` above 0 if it is out."""
+    columns[STATISTIC, p] = statistic
+    columns[CENTRE, p] = centre
+    columns[LOWER, p] = lower
+    columns[UPPER, p] = upper
+    columns[OUT, p] = out
 
 
 class Judgements(NamedTuple):

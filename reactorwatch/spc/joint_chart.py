@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.base import Array, Chart, Judgement, Shown
+from reactorwatch.spc.charts.base import Array, Chart, Shown
 from reactorwatch.spc.estimated_t2 import estimated_t2_quantile
 from reactorwatch.spc.false_alarm_budget import degrees_of_freedom
 from reactorwatch.spc.prewhitening import Prewhitening
@@ -44,10 +44,6 @@ class JointChart(Chart):
             errors: errors of these signals.
         """
         return joint_rates(1.0 / baseline.arl0 if cls.has_memory else baseline.point_probability, 1.0, baseline, errors)
-
-    @abstractmethod
-    def update(self, x: ArrayLike) -> Judgement:
-        """See `Chart`; x has shape (p,)."""
 
     @abstractmethod
     def contributions(self, x: ArrayLike) -> Array:

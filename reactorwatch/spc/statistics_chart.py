@@ -14,7 +14,7 @@ is no lasting change; an average stays below `RELEASE` limits, so the alarm of a
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from math import sqrt
+from math import inf, sqrt
 from typing import ClassVar, NamedTuple, Self, TypeAlias
 
 import numpy as np
@@ -26,8 +26,8 @@ from reactorwatch.spc.charts.residual_space import BLOCKS, adjustment, average_r
 from reactorwatch.spc.false_alarm_budget import degrees_of_freedom
 from reactorwatch.spc.prewhitening import Prewhitening, learn
 from reactorwatch.spc.run_length.design import ewma_limit
-from reactorwatch.spc.training_errors import TrainingErrors
-from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
+from reactorwatch.spc.training_errors import TrainingErrors, student_tail
+from reactorwatch.spc.value_chart import ValueBaseline, ValueChart, student_limit
 from reactorwatch.stored_state import pack_numbers, unpack_numbers
 
 OUTLIER = 6.0
@@ -59,6 +59,13 @@ class StatisticsState(ChartState, frozen=True):
     averages: bytes
     parts: bytes
     before: bytes
+
+
+def standardise(values: Array) -> tuple[Array, Array, Array]:
+    """Mean and standard deviation of each signal, 1 for a constant one, and the scaled deviations of the rows."""
+    centre, scale = values.mean(axis=0), values.std(axis=0, ddof=1)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    return centre, scale, (values - centre) / scale
 
 
 class Averages(NamedTuple):
@@ -99,6 +106,7 @@ class StatisticsChart(ValueChart):
         labels: names of the statistics.
         rows_before: number of rows before the newest one that the statistics need.
         pieces: number of separate pieces of a held-out block.
+        is_skewed: whether averages of the plant are skewed, see `skewed_sds`.
         weight_key: key of the setting of the weight.
         reason: what a large statistic means, for the text of an alarm.
     """
@@ -107,6 +115,7 @@ class StatisticsChart(ValueChart):
     labels: ClassVar[tuple[str, ...]]
     rows_before: ClassVar[int] = 0
     pieces: ClassVar[int] = 1
+    is_skewed: ClassVar[bool] = False
     weight_key: ClassVar[str]
     reason: ClassVar[str]
 
@@ -178,7 +187,16 @@ class StatisticsChart(ValueChart):
         variances = [(item.sd / item.shift_gain) ** 2 / item.rows for item in learned]
         sds = [sqrt(average_variance(item, weight) + v) for item, v in zip(learned, variances, strict=True)]
         freedom = min(degrees_of_freedom(item, weight) for item in learned)
-        return Averages.of(roots, weight, np.array(sds), freedom)
+        found = Averages.of(roots, weight, np.array(sds), freedom)
+        if not cls.is_skewed:
+            return found
+        skewed = skewed_sds(found, roots, weight, cls._known_limit(baseline))
+        return Averages.of(roots, weight, skewed, min(freedom, cls.most_freedom(baseline)))
+
+    @classmethod
+    def most_freedom(cls, baseline: ValueBaseline) -> float:
+        """Largest number of degrees of freedom of skewed averages."""
+        return inf
 
     @classmethod
     def held_out_roots(cls, baseline: ValueBaseline) -> Array:
@@ -201,12 +219,8 @@ class StatisticsChart(ValueChart):
 
     @classmethod
     def limit_of(cls, baseline: ValueBaseline, averages: Averages) -> float:
-        """Limit of the averages for the false alarms of the chart, in standard deviations.
-
-        Where less than one false alarm is promised in the training, it is not below the largest average there.
-        """
-        limit = -float(special.stdtrit(averages.freedom, float(special.ndtr(-cls._known_limit(baseline)))))
-        return max(limit, averages.largest) if baseline.values.size < baseline.arl0 else limit
+        """Limit of the averages for the false alarms of the chart, in standard deviations."""
+        return student_limit(baseline, cls._known_limit(baseline), averages.freedom, averages.largest)
 
     @classmethod
     def _known_limit(cls, baseline: ValueBaseline) -> float:
@@ -219,8 +233,7 @@ class StatisticsChart(ValueChart):
         """See `ValueChart`: an average whose variance is off crosses the limit more or less often."""
         averages, known = cls.averages(baseline), cls._known_limit(baseline)
         errors = TrainingErrors.draw(1).scale[:, 0]
-        chi2 = 2.0 * special.gammainccinv(0.5 * averages.freedom, special.ndtr(-errors))
-        beyond = special.ndtr(-cls.limit_of(baseline, averages) * np.sqrt(chi2 / averages.freedom))
+        beyond = student_tail(cls.limit_of(baseline, averages), averages.freedom, errors)
         return np.asarray(len(baseline.names) * beyond / special.ndtr(-known))
 
     @classmethod

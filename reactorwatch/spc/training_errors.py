@@ -69,8 +69,23 @@ class TrainingErrors(NamedTuple):
         known = scale_variance(learned, weight)
         own, passed = sqrt(learned.sd_variance), (1.0 - weight) * sqrt(learned.passed_variance)
         mixed = (own * self.scale[:, signal] + passed * self.passed[:, signal]) / sqrt(max(known, 1e-300))
-        chi2 = 2.0 * special.gammainccinv(0.5 * freedom, special.ndtr(-mixed))
-        return np.asarray(np.sqrt((1.0 + LARGEST_ORDER / learned.rows) * freedom / chi2))
+        return np.asarray(np.sqrt((1.0 + LARGEST_ORDER / learned.rows) * freedom / _chi2(freedom, mixed)))
+
+
+def _chi2(freedom: float, errors: Array) -> Array:
+    """Chi-squares with these degrees of freedom whose errors are standard normal numbers."""
+    return np.asarray(2.0 * special.gammainccinv(0.5 * freedom, special.ndtr(-errors)))
+
+
+def student_tail(limit: float, freedom: float, errors: Array) -> Array:
+    """Probability that an average is beyond a limit, by errors of its estimated variance, same shape as the errors.
+
+    Args:
+        limit: limit in estimated standard deviations.
+        freedom: degrees of freedom of the variance.
+        errors: errors of the variance, see `TrainingErrors.scale`.
+    """
+    return np.asarray(special.ndtr(-limit * np.sqrt(_chi2(freedom, errors) / freedom)))
 
 
 @cache

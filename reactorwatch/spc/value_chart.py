@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple, Self
 
-from numpy.typing import ArrayLike
+from scipy import special
 
-from reactorwatch.spc.charts.base import Array, Chart, Judgement
+from reactorwatch.spc.charts.base import Array, Chart
 
 FEWEST_SIGNALS = 8
 """Least number of signals: with fewer the others say too little of each one."""
@@ -63,10 +63,6 @@ class ValueChart(Chart):
         """Rate of false alarms by the errors of the training, in shares of one signal's alarm, shape (draws,)."""
 
     @abstractmethod
-    def update(self, x: ArrayLike) -> Judgement:
-        """See `Chart`; x has shape (signals,)."""
-
-    @abstractmethod
     def fill(self, x: Array) -> Array | None:
         """The sample with expected values in place of missing ones, NaN; None if too many are missing."""
 
@@ -96,3 +92,18 @@ class ValueChart(Chart):
                 f"{needed} are needed"
             )
         return ""
+
+
+def student_limit(baseline: ValueBaseline, known: float, freedom: float, largest: float) -> float:
+    """Limit of averages whose variances were estimated, in standard deviations.
+
+    Where less than one false alarm is promised in the rows of the training, it is not below their largest average.
+
+    Args:
+        baseline: training of the signals.
+        known: limit that holds when the variances are known.
+        freedom: degrees of freedom of the variances.
+        largest: largest average of the training.
+    """
+    limit = -float(special.stdtrit(freedom, float(special.ndtr(-known))))
+    return max(limit, largest) if baseline.values.size < baseline.arl0 else limit

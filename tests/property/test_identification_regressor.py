@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reactorwatch.identification.regressor import RegressorBuffer, rows_of
-from reactorwatch.identification.structure import RowChoice, Structure
+from reactorwatch.identification.structure import Structure
 
 PERIOD_NS = 100
 
@@ -13,31 +13,31 @@ PERIOD_NS = 100
 @settings(max_examples=300)
 @given(st.data())
 def test_stream_and_record_agree(data: st.DataObject) -> None:
-    """Random structures, row choices, missing values and gaps: the same rows, the same numbers."""
+    """Random structures, missing values and gaps: the same rows, the same numbers."""
     small = st.integers(1, 3)
     structure = Structure(
         data.draw(small),
         data.draw(small),
         data.draw(small),
         data.draw(st.integers(1, 2)),
-        data.draw(st.integers(1, 2)),
-        data.draw(st.booleans()),
+        offset=data.draw(st.booleans()),
     )
-    choice = RowChoice(data.draw(st.integers(0, 5)), data.draw(small))
     count = data.draw(st.integers(5, 40))
     rng = np.random.default_rng(data.draw(st.integers(0, 10_000)))
-    u, y = rng.standard_normal((count, structure.inputs)), rng.standard_normal((count, structure.outputs))
+    u, y = rng.standard_normal((count, structure.inputs)), rng.standard_normal((count, 1))
     for signals in (u, y):
         signals[rng.random(signals.shape) < data.draw(st.sampled_from([0.0, 0.1]))] = np.nan
     intervals = np.where(rng.random(count) < data.draw(st.sampled_from([0.0, 0.15])), 3 * PERIOD_NS, PERIOD_NS)
-    # The record takes the median interval for the period; the stream is told it.
+    # The record takes the median interval for the period; the stream restarts at a gap.
     intervals[: count // 2 + 1] = PERIOD_NS
     time_ns = np.cumsum(intervals)
 
-    record = rows_of(structure, u, y, time_ns, choice)
-    buffer = RegressorBuffer(structure, PERIOD_NS, choice)
+    record = rows_of(structure, u, y, time_ns)
+    buffer = RegressorBuffer(structure)
     stream = {}
     for k in range(count):
+        if intervals[k] > PERIOD_NS:
+            buffer.restart()
         regressor = buffer.update(int(time_ns[k]), u[k], y[k])
         if regressor is not None:
             stream[k] = regressor

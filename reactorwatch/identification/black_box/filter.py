@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.identification.black_box.model import BlackBoxModel
-from reactorwatch.identification.black_box.state_map import evaluate, predict_outputs
+from reactorwatch.identification.black_box.state_map import predict_outputs
 from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
 
 UNSEEN = 1.3
@@ -110,8 +110,7 @@ def filter_row(
     predicted, jacobian, moved = np.empty(p), np.empty((p, n_x)), np.zeros((p, size))
     signals[:n_x] = x
     signals[n_x:] = inputs[past - n_u :]
-    evaluate(signals, products, n_x, values, slopes)
-    predict_outputs(theta, values, slopes, predicted, jacobian)
+    predict_outputs(theta, signals, products, values, slopes, predicted, jacobian)
     for j in range(p):
         for i in range(n_x):
             for c in range(size):

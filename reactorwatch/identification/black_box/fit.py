@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.identification.black_box.model import BlackBoxModel
-from reactorwatch.identification.black_box.prediction_error import NEXT, START, log_likelihood, prediction_errors
+from reactorwatch.identification.black_box.prediction_error import (
+    NEXT,
+    START,
+    RowArrays,
+    log_likelihood,
+    prediction_errors,
+)
 from reactorwatch.identification.black_box.state_map import Shape, lagged_inputs
 
 MOST_PARAMETERS = 90
@@ -66,6 +72,11 @@ class Rows:
     u: Array
     kinds: NDArray[np.int64]
     smallest: Array
+
+    @property
+    def arrays(self) -> RowArrays:
+        """Outputs, inputs and kinds, for kernels."""
+        return self.y, self.u, self.kinds
 
 
 @dataclass
@@ -222,7 +233,7 @@ def _gauss_newton(shape: Shape, rows: Rows, theta: Array, gain: float, iteration
 
     def run(candidate: Array, weights: Array, equations: Array) -> bool:
         return prediction_errors(
-            candidate, products, shape.states, rows.y, rows.u, rows.kinds, gain, weights, errors, equations, slope
+            candidate, products, shape.states, rows.arrays, gain, weights, errors, equations, slope
         )
 
     def cost(candidate: Array, weights: Array) -> float:
@@ -277,7 +288,7 @@ def _fit_variances(shape: Shape, rows: Rows, fitted: _Fit) -> tuple[Array, Array
 
     def likelihood(logs: Array) -> float:
         r, q = np.exp(logs[:count]), np.exp(logs[count:])
-        return log_likelihood(fitted.theta, products, shape.states, rows.y, rows.u, rows.kinds, r, q)
+        return log_likelihood(fitted.theta, products, shape.states, rows.arrays, r, q)
 
     without = np.maximum(np.log(np.concatenate([fitted.variances, _LEAST_VARIANCE * fitted.variances])), bounds)
     share = max(fitted.gain, 0.03)

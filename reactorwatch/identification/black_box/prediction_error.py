@@ -5,18 +5,23 @@ With the gain 0 the state is a simulation: noise of the measurements does not en
 """
 
 from math import inf
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.identification.black_box.state_map import evaluate, predict_outputs
+from reactorwatch.identification.black_box.state_map import predict_outputs
 
 START, NEXT = 1, 2
 """Kinds of a row: the state is set from its measurements; it follows the row before. 0: it is left out."""
 
 DIVERGED = 50.0
 """Scaled output beyond which a simulation has diverged."""
+
+RowArrays: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]
+"""Scaled outputs, shape (rows, outputs), NaN where missing; scaled lagged inputs, shape (rows, inputs lags); kinds of
+the rows, shape (rows,)."""
 
 LARGEST_SQUARE = 25.0
 """Largest square of a normalised error in the likelihood: more are outliers."""
@@ -27,9 +32,7 @@ def prediction_errors(
     theta: NDArray[np.float64],
     products: NDArray[np.int64],
     states: int,
-    y: NDArray[np.float64],
-    u: NDArray[np.float64],
-    kinds: NDArray[np.int64],
+    rows: RowArrays,
     gain: float,
     weights: NDArray[np.float64],
     errors: NDArray[np.float64],
@@ -42,16 +45,15 @@ def prediction_errors(
         theta: parameters, shape (outputs, terms).
         products: see `state_map.Products`.
         states: number of states.
-        y: scaled outputs, shape (rows, outputs); NaN where missing.
-        u: scaled lagged inputs, shape (rows, inputs lags).
-        kinds: kinds of the rows, shape (rows,).
+        rows: rows of the training.
         gain: share of an error that corrects the state.
         weights: weight of each output's squares, shape (outputs,).
         errors: filled, shape (rows, outputs); NaN where there is none.
         gram: filled, shape (parameters, parameters); of size 0: no equations are made.
         slope: filled, shape (parameters,).
     """
-    rows, outputs = y.shape
+    y, u, kinds = rows
+    count, outputs = y.shape
     terms, parameters = theta.shape[1], theta.size
     inputs, is_wanted = u.shape[1], gram.size > 0
     lags = states // outputs
@@ -59,7 +61,7 @@ def prediction_errors(
     predicted, jacobian = np.zeros(outputs), np.zeros((outputs, states))
     sensitivity, new = np.zeros((states, parameters)), np.zeros((outputs, parameters))
     gram[:], slope[:], errors[:] = 0.0, 0.0, np.nan
-    for k in range(rows):
+    for k in range(count):
         if kinds[k] == START:
             sensitivity[:] = 0.0
             for lag in range(lags):
@@ -69,8 +71,7 @@ def prediction_errors(
             continue
         for i in range(inputs):
             signals[states + i] = u[k - 1, i]
-        evaluate(signals, products, states, values, slopes)
-        predict_outputs(theta, values, slopes, predicted, jacobian)
+        predict_outputs(theta, signals, products, values, slopes, predicted, jacobian)
         for j in range(outputs):
             if not abs(predicted[j]) < DIVERGED:
                 return False
@@ -113,9 +114,7 @@ def log_likelihood(
     theta: NDArray[np.float64],
     products: NDArray[np.int64],
     states: int,
-    y: NDArray[np.float64],
-    u: NDArray[np.float64],
-    kinds: NDArray[np.int64],
+    rows: RowArrays,
     r: NDArray[np.float64],
     q: NDArray[np.float64],
 ) -> float:
@@ -125,19 +124,18 @@ def log_likelihood(
         theta: see `prediction_errors`.
         products: see `prediction_errors`.
         states: see `prediction_errors`.
-        y: see `prediction_errors`.
-        u: see `prediction_errors`.
-        kinds: see `prediction_errors`.
+        rows: see `prediction_errors`.
         r: variances of the measurements, shape (outputs,).
         q: variances of the process from row to row, shape (outputs,).
     """
-    rows, outputs = y.shape
+    y, u, kinds = rows
+    count, outputs = y.shape
     terms, inputs = theta.shape[1], u.shape[1]
     lags, total = states // outputs, 0.0
     signals, values, slopes = np.zeros(states + inputs), np.zeros(terms), np.zeros((terms, states))
     predicted, jacobian = np.zeros(outputs), np.zeros((outputs, states))
     P, moved, K = np.zeros((states, states)), np.zeros((outputs, states)), np.zeros(states)
-    for k in range(rows):
+    for k in range(count):
         if kinds[k] == START:
             P[:] = 0.0
             for lag in range(lags):
@@ -148,8 +146,7 @@ def log_likelihood(
             continue
         for i in range(inputs):
             signals[states + i] = u[k - 1, i]
-        evaluate(signals, products, states, values, slopes)
-        predict_outputs(theta, values, slopes, predicted, jacobian)
+        predict_outputs(theta, signals, products, values, slopes, predicted, jacobian)
         for j in range(outputs):
             if not abs(predicted[j]) < DIVERGED:
                 return -inf

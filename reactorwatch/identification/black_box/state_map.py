@@ -85,23 +85,28 @@ def lagged_inputs(shape: Shape, inputs: Array) -> Array:
 
 
 @jit
-def evaluate(
+def predict_outputs(
+    theta: NDArray[np.float64],
     signals: NDArray[np.float64],
     products: NDArray[np.int64],
-    states: int,
     values: NDArray[np.float64],
     slopes: NDArray[np.float64],
+    outputs: NDArray[np.float64],
+    jacobian: NDArray[np.float64],
 ) -> None:
-    """Evaluate the products and their derivatives.
+    """Outputs of the next row and their derivatives by the states.
 
     Args:
+        theta: parameters, shape (outputs, terms).
         signals: scaled signals, the states first.
         products: see `Products`.
-        states: number of states.
         values: filled with the products, shape (terms,).
         slopes: filled with their derivatives by the states, shape (terms, states).
+        outputs: filled, shape (outputs,).
+        jacobian: filled, shape (outputs, states).
     """
     terms, degree = products.shape
+    states = slopes.shape[1]
     for term in range(terms):
         value = 1.0
         for i in range(degree):
@@ -118,32 +123,13 @@ def evaluate(
                     if k != i and products[term, k] >= 0:
                         others *= signals[products[term, k]]
                 slopes[term, factor] += others
-
-
-@jit
-def predict_outputs(
-    theta: NDArray[np.float64],
-    values: NDArray[np.float64],
-    slopes: NDArray[np.float64],
-    outputs: NDArray[np.float64],
-    jacobian: NDArray[np.float64],
-) -> None:
-    """Outputs of the next row and their derivatives by the states.
-
-    Args:
-        theta: parameters, shape (outputs, terms).
-        values: see `evaluate`.
-        slopes: see `evaluate`.
-        outputs: filled, shape (outputs,).
-        jacobian: filled, shape (outputs, states).
-    """
     for j in range(theta.shape[0]):
         total = 0.0
-        for term in range(values.size):
+        for term in range(terms):
             total += theta[j, term] * values[term]
         outputs[j] = total
-        for i in range(slopes.shape[1]):
+        for i in range(states):
             total = 0.0
-            for term in range(values.size):
+            for term in range(terms):
                 total += theta[j, term] * slopes[term, i]
             jacobian[j, i] = total

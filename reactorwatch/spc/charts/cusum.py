@@ -22,17 +22,7 @@ from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.base import Array, Judgement, Setting, Shown, finite, positive
-from reactorwatch.spc.compiled_chart import (
-    CENTRE,
-    LOWER,
-    OUT,
-    PRESENT,
-    SETTINGS,
-    STATISTIC,
-    UPPER,
-    CompiledChart,
-    X,
-)
+from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, CompiledChart, X, write_point
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.run_length.cusum import check_parameters
 from reactorwatch.spc.run_length.design import cusum_limit
@@ -56,11 +46,8 @@ def _judge(columns: Array) -> None:
         low = min(max(0.0, columns[_LOW, p] - off - allowance), CEILING * limit)
         columns[_HIGH, p] = high if present else columns[_HIGH, p]
         columns[_LOW, p] = low if present else columns[_LOW, p]
-        columns[STATISTIC, p] = high if high >= low else -low
-        columns[CENTRE, p] = 0.0
-        columns[LOWER, p] = -limit
-        columns[UPPER, p] = limit
-        columns[OUT, p] = 1.0 if max(high, low) > limit else 0.0
+        statistic = high if high >= low else -low
+        write_point(columns, p, statistic, 0.0, -limit, limit, 1.0 if max(high, low) > limit else 0.0)
 
 
 class Cusum(CompiledChart):

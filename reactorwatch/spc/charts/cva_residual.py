@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from reactorwatch.spc.charts.base import Array, Setting
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart
+from reactorwatch.spc.statistics_chart import Model, StatisticsChart, standardise
 from reactorwatch.spc.value_chart import ValueBaseline
 
 ROWS = 3
@@ -47,9 +47,7 @@ class CvaResidual(StatisticsChart):
     @classmethod
     def fit(cls, values: Array, baseline: ValueBaseline) -> Model:
         """See `StatisticsChart`."""
-        centre, scale = values.mean(axis=0), values.std(axis=0, ddof=1)
-        scale = np.where(scale > 0.0, scale, 1.0)
-        x = (values - centre) / scale
+        centre, scale, x = standardise(values)
         rows = len(x) - 2 * ROWS + 1
         past, future = (
             np.concatenate([x[first + i : first + i + rows] for i in range(ROWS)], axis=1) for first in (0, ROWS)

@@ -19,17 +19,7 @@ from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.base import Array, Judgement, Setting, Shown, finite, positive
-from reactorwatch.spc.compiled_chart import (
-    CENTRE,
-    LOWER,
-    OUT,
-    PRESENT,
-    SETTINGS,
-    STATISTIC,
-    UPPER,
-    CompiledChart,
-    X,
-)
+from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, CompiledChart, X, write_point
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.run_length.design import ewma_limit
 from reactorwatch.spc.run_length.ewma import check_parameters
@@ -52,11 +42,8 @@ def _judge(columns: Array) -> None:
         limit = columns[_LIMIT, p] * np.sqrt(1.0 - missing)
         columns[_AVERAGE, p] = average if present else columns[_AVERAGE, p]
         columns[_MISSING, p] = missing if present else columns[_MISSING, p]
-        columns[STATISTIC, p] = average
-        columns[CENTRE, p] = mean
-        columns[LOWER, p] = mean - limit
-        columns[UPPER, p] = mean + limit
-        columns[OUT, p] = 1.0 if abs(average - mean) > limit else 0.0
+        out = 1.0 if abs(average - mean) > limit else 0.0
+        write_point(columns, p, average, mean, mean - limit, mean + limit, out)
 
 
 class Ewma(CompiledChart):

@@ -141,11 +141,9 @@ class Mewma(JointChart):
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (p,)."""
         values = np.ascontiguousarray(x, dtype=np.float64)
-        if values.shape != self._average.shape:
-            raise ValueError(f"a sample must have shape {self._average.shape}, got {values.shape}")
-        statistic = _MOVE.call(self.numbers, values, self.weight)
+        statistic = _MOVE.call(self.numbers, values, self.weight) if values.shape == self._average.shape else -1.0
         if statistic < 0.0:
-            vector(x, self._average.size)  # says which value it is
+            vector(x, self._average.size)  # says what is wrong
         return Judgement(statistic, float(self._average.size), 0.0, self.limit, statistic > self.limit)
 
     def contributions(self, x: ArrayLike | None = None) -> Array:

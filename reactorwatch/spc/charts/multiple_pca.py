@@ -20,7 +20,7 @@ from scipy import special
 
 from reactorwatch.spc.charts.base import Array, Setting
 from reactorwatch.spc.principal_components import Components, components_of, parts_of
-from reactorwatch.spc.statistics_chart import Averages, Model, StatisticsChart, skewed_sds
+from reactorwatch.spc.statistics_chart import Model, StatisticsChart, standardise
 from reactorwatch.spc.value_chart import ValueBaseline
 
 DIMENSION = 3
@@ -132,20 +132,12 @@ class MultiplePca(StatisticsChart):
     reason = "in its regime is unlike the training"
     fewest_signals = 3
     pieces = 4
-
-    @classmethod
-    def spread(cls, roots: Array, baseline: ValueBaseline) -> Averages:
-        """See `StatisticsChart`; a plant stays away from the middle of its regimes for long after a move."""
-        found, weight = super().spread(roots, baseline), baseline.settings[cls.weight_key]
-        sds = skewed_sds(found, roots, weight, cls._known_limit(baseline))
-        return Averages.of(roots, weight, sds, found.freedom)
+    is_skewed = True  # a plant stays away from the middle of its regimes for long after a move
 
     @classmethod
     def fit(cls, values: Array, baseline: ValueBaseline) -> Model:
         """See `StatisticsChart`."""
-        centre, scale = values.mean(axis=0), values.std(axis=0, ddof=1)
-        scale = np.where(scale > 0.0, scale, 1.0)
-        z = (values - centre) / scale
+        centre, scale, z = standardise(values)
         plane = np.linalg.svd(z, full_matrices=False)[2][: min(DIMENSION, z.shape[1] - 1)].T
         regimes = int(baseline.settings["multiple_pca_regimes"])
         mixture = fit_mixture(z @ plane, regimes, ROWS_A_SIGNAL * z.shape[1])

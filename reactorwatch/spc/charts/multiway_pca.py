@@ -16,7 +16,7 @@ import numpy as np
 from reactorwatch.spc.charts.base import Array, Setting, SignalSetting
 from reactorwatch.spc.charts.residual_space import BLOCKS
 from reactorwatch.spc.principal_components import components_of, parts_of
-from reactorwatch.spc.statistics_chart import Averages, Model, StatisticsChart, skewed_sds
+from reactorwatch.spc.statistics_chart import Model, StatisticsChart
 from reactorwatch.spc.value_chart import ValueBaseline
 
 STAGES = 20
@@ -40,6 +40,7 @@ class MultiwayPca(StatisticsChart):
     weight_key = "multiway_pca_weight"
     reason = "at this stage of a batch is unlike that of earlier batches"
     fewest_signals = 3
+    is_skewed = True
 
     @classmethod
     def obstacle(cls, values: Array, names: Sequence[str], signals: Mapping[str, tuple[str, ...]]) -> str:
@@ -53,17 +54,14 @@ class MultiwayPca(StatisticsChart):
     @classmethod
     def edges(cls, baseline: ValueBaseline) -> list[int]:
         """See `StatisticsChart`; batches stay whole."""
-        starts = batch_starts(baseline.values[:, baseline.names.index(baseline.signals["multiway_pca_progress"][0])])
+        starts = batch_starts(progress_of(baseline))
         chosen = np.linspace(0, len(starts), BLOCKS + 1).astype(int)[1:-1]
         return [0, *(starts[index] for index in chosen.tolist()), len(baseline.values)]
 
     @classmethod
-    def spread(cls, roots: Array, baseline: ValueBaseline) -> Averages:
+    def most_freedom(cls, baseline: ValueBaseline) -> float:
         """See `StatisticsChart`; a batch is unlike others as a whole, so the batches are what is independent."""
-        found, weight = super().spread(roots, baseline), baseline.settings[cls.weight_key]
-        progress = baseline.values[:, baseline.names.index(baseline.signals["multiway_pca_progress"][0])]
-        sds = skewed_sds(found, roots, weight, cls._known_limit(baseline))
-        return Averages.of(roots, weight, sds, min(found.freedom, len(batch_starts(progress)) - 1.0))
+        return len(batch_starts(progress_of(baseline))) - 1.0
 
     @classmethod
     def fit(cls, values: Array, baseline: ValueBaseline) -> Model:
@@ -103,6 +101,11 @@ class MultiwayPca(StatisticsChart):
     def fill(self, x: Array) -> Array | None:
         """See `ValueChart`; a row without the progress is skipped."""
         return super().fill(x) if np.isfinite(x[self.model["is_progress"] > 0.0]).all() else None
+
+
+def progress_of(baseline: ValueBaseline) -> Array:
+    """Values of the signal that measures the progress of a batch."""
+    return baseline.values[:, baseline.names.index(baseline.signals["multiway_pca_progress"][0])]
 
 
 def batch_starts(progress: Array) -> list[int]:

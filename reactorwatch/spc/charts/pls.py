@@ -20,7 +20,7 @@ import numpy as np
 
 from reactorwatch.spc.charts.base import Array, Setting, SignalSetting
 from reactorwatch.spc.charts.residual_space import BLOCKS
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart
+from reactorwatch.spc.statistics_chart import Model, StatisticsChart, standardise
 from reactorwatch.spc.value_chart import ValueBaseline
 
 MOST_COMPONENTS = 8
@@ -91,9 +91,7 @@ class Pls(StatisticsChart):
     def fit(cls, values: Array, baseline: ValueBaseline) -> Model:
         """See `StatisticsChart`."""
         is_quality = np.isin(baseline.names, baseline.signals["pls_quality"])
-        centre, scale = values.mean(axis=0), values.std(axis=0, ddof=1)
-        scale = np.where(scale > 0.0, scale, 1.0)
-        z = (values - centre) / scale
+        centre, scale, z = standardise(values)
         x, y = z[:, ~is_quality], z[:, is_quality]
         fitted = Projection.fit(x, y, choose_components(x, y))
         scores = x @ fitted.rotations

@@ -39,8 +39,8 @@ from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Setting, positive, vector
 from reactorwatch.spc.run_length.design import ewma_limit
-from reactorwatch.spc.training_errors import TrainingErrors
-from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
+from reactorwatch.spc.training_errors import TrainingErrors, student_tail
+from reactorwatch.spc.value_chart import ValueBaseline, ValueChart, student_limit
 from reactorwatch.stored_state import pack_numbers, unpack_numbers
 
 BLOCKS = 5
@@ -139,7 +139,7 @@ class ResidualSpace(ValueChart):
         scaled, weight = baseline.values / scale, baseline.settings["residual_space_weight"]
         sds, freedom, largest = held_out_deviations(scaled, weight)
         centre, matrix = adjustment(scaled)
-        limit = limit_of(baseline, freedom, largest)
+        limit = student_limit(baseline, ewma_limit(baseline.arl0, weight), freedom, largest)
         return cls(baseline.names, centre * scale, matrix / sds[:, None] / scale, weight, limit)
 
     @classmethod
@@ -147,10 +147,10 @@ class ResidualSpace(ValueChart):
         """See `ValueChart`: an average whose variance is off crosses the limit more or less often."""
         scale, weight = baseline.values.std(axis=0, ddof=1), baseline.settings["residual_space_weight"]
         _, freedom, largest = held_out_deviations(baseline.values / scale, weight)
-        known, limit = ewma_limit(baseline.arl0, weight), limit_of(baseline, freedom, largest)
+        known = ewma_limit(baseline.arl0, weight)
+        limit = student_limit(baseline, known, freedom, largest)
         errors = TrainingErrors.draw(len(baseline.names)).scale
-        chi2 = 2.0 * special.gammainccinv(0.5 * freedom, special.ndtr(-errors))
-        return np.asarray(np.sum(special.ndtr(-limit * np.sqrt(chi2 / freedom)), axis=1) / special.ndtr(-known))
+        return np.asarray(np.sum(student_tail(limit, freedom, errors), axis=1) / special.ndtr(-known))
 
     @classmethod
     def from_state(cls, state: ResidualSpaceState) -> Self:
@@ -176,11 +176,9 @@ class ResidualSpace(ValueChart):
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (p,)."""
         values = np.ascontiguousarray(x, dtype=np.float64)
-        if values.shape != self._averages.shape:
-            raise ValueError(f"a sample must have shape {self._averages.shape}, got {values.shape}")
-        statistic = _MOVE.call(self.numbers, values, self.weight)
+        statistic = _MOVE.call(self.numbers, values, self.weight) if values.shape == self._averages.shape else -1.0
         if statistic < 0.0:
-            vector(x, self._averages.size)  # says which value it is
+            vector(x, self._averages.size)  # says what is wrong
         return Judgement(statistic, 0.0, 0.0, self.limit, statistic > self.limit)
 
     def fill(self, x: Array) -> Array | None:
@@ -222,19 +220,6 @@ def fill_missing(x: Array, centre: Array, matrix: Array) -> Array | None:
     off = np.where(missing, 0.0, x - centre)
     off[missing] = -np.linalg.solve(matrix[np.ix_(missing, missing)], matrix[missing] @ off)
     return np.asarray(np.where(missing, centre + off, x))
-
-
-def limit_of(baseline: ValueBaseline, freedom: float, largest: float) -> float:
-    """Limit of the averages.
-
-    Args:
-        baseline: training of the signals.
-        freedom: degrees of freedom of the averages' variances.
-        largest: largest average of the training.
-    """
-    tail = float(special.ndtr(-ewma_limit(baseline.arl0, baseline.settings["residual_space_weight"])))
-    limit = -float(special.stdtrit(freedom, tail))
-    return max(limit, largest) if baseline.values.size < baseline.arl0 else limit
 
 
 def adjustment(rows: Array) -> tuple[Array, Array]:

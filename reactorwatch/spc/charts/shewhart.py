@@ -30,17 +30,7 @@ from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.base import Array, Judgement, Shown, finite, positive
-from reactorwatch.spc.compiled_chart import (
-    CENTRE,
-    LOWER,
-    OUT,
-    PRESENT,
-    SETTINGS,
-    STATISTIC,
-    UPPER,
-    CompiledChart,
-    X,
-)
+from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, CompiledChart, X, write_point
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.run_length.shewhart import RULES, checked_rules
 
@@ -80,11 +70,7 @@ def _judge(columns: Array) -> None:
         columns[_ZONE2, p] = zone1 if present else zone2
         columns[_ZONE3, p] = zone2 if present else zone3
         columns[_ZONE4, p] = zone3 if present else zone4
-        columns[STATISTIC, p] = x
-        columns[CENTRE, p] = mean
-        columns[LOWER, p] = lower
-        columns[UPPER, p] = upper
-        columns[OUT, p] = out
+        write_point(columns, p, x, mean, lower, upper, out)
 
 
 class Shewhart(CompiledChart):

@@ -73,10 +73,12 @@ def test_sensitivities_of_simulation_errors_are_those_of_finite_differences() ->
 
     def cost(parameters: Array) -> float:
         nothing = np.empty((0, 0))
-        prediction_errors(parameters, shape.products(), shape.states, y, u, kinds, 0.3, weights, errors, nothing, slope)
+        prediction_errors(
+            parameters, shape.products(), shape.states, (y, u, kinds), 0.3, weights, errors, nothing, slope
+        )
         return float(np.nansum(errors**2 * weights))
 
-    prediction_errors(theta, shape.products(), shape.states, y, u, kinds, 0.3, weights, errors, gram, slope)
+    prediction_errors(theta, shape.products(), shape.states, (y, u, kinds), 0.3, weights, errors, gram, slope)
     gradient = slope.copy()
     for i in range(0, theta.size, 5):
         step = np.zeros(theta.size)

@@ -14,6 +14,7 @@ from reactorwatch.identification.excitation import (
     sampling,
     variation,
 )
+from reactorwatch.identification.scaled_record import ScaledRecord
 from reactorwatch.identification.structure import Structure
 from tests.unit.identification.truth import Array, Daisy, NoisyPlant
 
@@ -88,17 +89,17 @@ def sampled_plant(period_min: float, noise_sd: float) -> tuple[Array, Array]:
 def test_a_sampling_rate_that_is_too_fast_gets_a_decimation_that_is_good(noise_sd: float) -> None:
     """Noise must not hide it: least squares would take it for fast dynamics."""
     u, y = sampled_plant(0.01, noise_sd)
-    check = sampling(Structure.of_order(2), u, y)
+    check = sampling(ScaledRecord.of(Structure.of_order(2), u, y))
     assert not check.passed
     assert "too fast" in check.result
     assert check.decimation > 1
     u, y = sampled_plant(0.01 * check.decimation, noise_sd)
-    assert sampling(Structure.of_order(2), u, y).passed
+    assert sampling(ScaledRecord.of(Structure.of_order(2), u, y)).passed
 
 
 def test_a_good_sampling_rate_passes_and_a_slow_one_is_told() -> None:
-    assert sampling(Structure.of_order(2), *sampled_plant(0.1, 0.05)).passed
-    check = sampling(Structure.of_order(2), *sampled_plant(1.0, 0.05))
+    assert sampling(ScaledRecord.of(Structure.of_order(2), *sampled_plant(0.1, 0.05))).passed
+    check = sampling(ScaledRecord.of(Structure.of_order(2), *sampled_plant(1.0, 0.05)))
     assert "too slow" in check.result
     assert check.decimation == 1
 
@@ -128,21 +129,21 @@ def test_the_daisy_record_passes_for_orders_one_to_three(daisy: Daisy) -> None:
 def test_the_amplitude_is_held_against_the_noise(noisy_plant: NoisyPlant) -> None:
     loud = noisy_plant.clean + 3.0 * np.std(noisy_plant.clean) * np.random.default_rng(6).standard_normal(4000)
     structure = Structure.of_order(2)
-    check = amplitude(structure, noisy_plant.inputs, loud)
+    check = amplitude(ScaledRecord.of(structure, noisy_plant.inputs, loud))
     assert not check.passed
     assert check.value == pytest.approx(1.0, abs=0.1)
-    assert amplitude(structure, noisy_plant.inputs, noisy_plant.clean).passed
+    assert amplitude(ScaledRecord.of(structure, noisy_plant.inputs, noisy_plant.clean)).passed
 
 
 def test_dependent_regressors_are_told_by_their_condition_number() -> None:
     rng = np.random.default_rng(7)
-    check = conditioning(Structure.of_order(1), np.ones(100), rng.standard_normal(100))
+    check = conditioning(ScaledRecord.of(Structure.of_order(1), np.ones(100), rng.standard_normal(100)))
     assert check.value == np.inf
     assert "nearly dependent" in check.result
     assert condition_check(50.0).passed
     assert not condition_check(1e5).passed
     with pytest.raises(InputError, match="3 parameters need as many complete rows, got 1"):
-        conditioning(Structure.of_order(1), np.ones(2), np.ones(2))
+        conditioning(ScaledRecord.of(Structure.of_order(1), np.ones(2), np.arange(2.0)))
 
 
 def test_an_output_that_never_moves_ends_the_checks() -> None:

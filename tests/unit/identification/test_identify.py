@@ -84,7 +84,7 @@ def test_gaps_and_missing_rows_are_left_out_where_that_is_asked_for(noisy_plant:
 def test_the_report_s_scheme_is_chosen_by_name(daisy: Daisy) -> None:
     told = identify(daisy.time, daisy.qc, daisy.T, order=2, scheme="report")
     model = fit_least_squares(Structure.of_order(2), daisy.qc[:3750], daisy.T[:3750])
-    np.testing.assert_allclose(told_parameters(told), model.parameters[0], rtol=1e-12)
+    np.testing.assert_allclose(told_parameters(told), model.parameters, rtol=1e-12)
     for form in ({"model": "armax"}, {"recursive": True}):
         with pytest.raises(InputError, match="scheme report fits arx and oe, and no recursive model, got"):
             identify(daisy.time, daisy.qc, daisy.T, scheme="report", **form)

@@ -60,10 +60,3 @@ def test_without_scikit_learn_the_cure_is_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(sys.modules, "sklearn.exceptions", None)
     with pytest.raises(InputError, match=r"the neural model needs scikit-learn: pip install reactorwatch\[neural\]"):
         SMALL.fit(Structure.of_order(1), *bent_plant(300))
-
-
-def test_several_outputs_are_refused() -> None:
-    pytest.importorskip("sklearn", reason="the extra 'neural' is not installed")
-    u, y = bent_plant(300)
-    with pytest.raises(InputError, match="a neural model has one output, got 2"):
-        SMALL.fit(Structure.of_order(1, outputs=2), u, np.column_stack([y, y]))

@@ -6,9 +6,11 @@ from scipy.optimize import least_squares as scipy_least_squares
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.descent import _triangle
 from reactorwatch.identification.instrumental_variable import stabilize
-from reactorwatch.identification.linear_model import plan_run, simulate
-from reactorwatch.identification.output_error import _triangle, fit_oe, is_stable, run_with_gradient
+from reactorwatch.identification.linear_predictor import is_stable, predict_with_gradient
+from reactorwatch.identification.output_error import fit_oe
+from reactorwatch.identification.simulation import plan_run, simulate
 from reactorwatch.identification.structure import RowChoice, Structure
 from tests.unit.identification.truth import Array, Daisy, NoisyPlant, oscillating_plant
 
@@ -18,11 +20,11 @@ def test_a_plant_with_measurement_noise_is_found_where_arx_is_biased(noisy_plant
     structure = Structure.of_order(2)
     oe = fit_oe(structure, noisy_plant.inputs, noisy_plant.measured)
     arx = fit_arx(structure, noisy_plant.inputs, noisy_plant.measured)
-    error = np.abs(oe.parameters[0] - noisy_plant.parameters) / oe.standard_deviations[0]
+    error = np.abs(oe.parameters - noisy_plant.parameters) / oe.standard_deviations
     assert error.max() < 4.0
-    assert np.max(np.abs(arx.parameters[0] - noisy_plant.parameters) / arx.standard_deviations[0]) > 20.0
-    assert oe.noise_sd[0] == pytest.approx(noisy_plant.noise_sd, rel=0.05)
-    assert oe.simulates
+    assert np.max(np.abs(arx.parameters - noisy_plant.parameters) / arx.standard_deviations) > 20.0
+    assert oe.noise_sd == pytest.approx(noisy_plant.noise_sd, rel=0.05)
+    assert oe.kind == "oe"
 
 
 def test_standard_deviations_are_the_scatter_over_many_records() -> None:
@@ -31,8 +33,8 @@ def test_standard_deviations_are_the_scatter_over_many_records() -> None:
     for seed in range(100):
         plant = oscillating_plant(600, noise_sd=0.5, seed=seed)
         model = fit_oe(Structure.of_order(2), plant.inputs, plant.measured)
-        found.append(model.parameters[0])
-        told.append(model.standard_deviations[0])
+        found.append(model.parameters)
+        told.append(model.standard_deviations)
     np.testing.assert_allclose(np.mean(told, axis=0), np.std(found, axis=0), rtol=0.25)
     np.testing.assert_allclose(np.mean(found, axis=0), plant.parameters, atol=4.0 * np.std(found, axis=0).max() / 10.0)
 
@@ -49,11 +51,10 @@ def test_the_gradient_is_the_derivative_of_the_run() -> None:
     assert plan.starts.sum() == 3
 
     def run(parameters: Array) -> tuple[Array, Array]:
-        values, gradient = run_with_gradient(parameters, 2, 2, 2, True, u, y[:, 0], plan.starts, plan.running)
-        return values, gradient
+        return predict_with_gradient(parameters, (2, 2, 2, 0), u, y[:, 0], plan.arrays)
 
     values, gradient = run(theta)
-    np.testing.assert_allclose(values, simulate(structure, theta[None, :], u, y, plan)[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(values, simulate(structure, theta, u, y, plan)[:, 0], rtol=1e-12)
     for i in range(theta.size):
         step = np.zeros(theta.size)
         step[i] = 1e-6
@@ -68,13 +69,13 @@ def test_the_minimum_is_that_of_an_independent_solver(noisy_plant: NoisyPlant) -
     plan = plan_run(structure, u[:, None], y[:, None])
 
     def errors(parameters: Array) -> Array:
-        run = simulate(structure, parameters[None, :], u[:, None], y[:, None], plan)
+        run = simulate(structure, parameters, u[:, None], y[:, None], plan)
         return (y[:, None] - run)[2:, 0]
 
     independent = scipy_least_squares(errors, noisy_plant.parameters, xtol=1e-12, ftol=1e-14, gtol=1e-14)
     model = fit_oe(structure, u, y)
-    assert np.sum(errors(model.parameters[0]) ** 2) <= 2.0 * independent.cost * (1.0 + 1e-9)
-    np.testing.assert_allclose(model.parameters[0], independent.x, rtol=1e-4)
+    assert np.sum(errors(model.parameters) ** 2) <= 2.0 * independent.cost * (1.0 + 1e-9)
+    np.testing.assert_allclose(model.parameters, independent.x, rtol=1e-4)
 
 
 @pytest.mark.parametrize("output", ["C", "T"])
@@ -88,7 +89,7 @@ def test_a_higher_order_never_runs_worse_over_the_fitted_rows(daisy: Daisy, outp
     assert squares[1] > squares[2] * (1.0 - 1e-3)
     arx = [fit_arx(Structure.of_order(order), u, y) for order in (1, 2, 3)]
     assert all(s < np.sum((y[:, None] - m.simulate(u, y))[3:] ** 2) for s, m in zip(squares, arx, strict=True))
-    poles = [np.roots([1.0, *-model.parameters[0, : model.structure.output_lags]]) for model in models]
+    poles = [np.roots([1.0, *-model.parameters[: model.structure.output_lags]]) for model in models]
     assert all(np.abs(roots).max() < 1.0 for roots in poles)
 
 
@@ -100,7 +101,7 @@ def test_delay_several_inputs_and_no_offset() -> None:
     for k in range(4, 2000):
         y[k] = truth @ np.concatenate([[y[k - 1]], u[k - 3], u[k - 4]])
     model = fit_oe(structure, u, y + 0.3 * rng.standard_normal(2000))
-    assert np.max(np.abs(model.parameters[0] - truth) / model.standard_deviations[0]) < 4.0
+    assert np.max(np.abs(model.parameters - truth) / model.standard_deviations) < 4.0
 
 
 def test_missing_rows_and_chosen_rows_still_lead_to_the_plant(noisy_plant: NoisyPlant) -> None:
@@ -109,10 +110,10 @@ def test_missing_rows_and_chosen_rows_still_lead_to_the_plant(noisy_plant: Noisy
     y[rng.random(y.size) < 0.05] = np.nan
     u[1500:1510] = np.nan
     model = fit_oe(Structure.of_order(2), u, y)
-    assert np.max(np.abs(model.parameters[0] - noisy_plant.parameters) / model.standard_deviations[0]) < 4.0
+    assert np.max(np.abs(model.parameters - noisy_plant.parameters) / model.standard_deviations) < 4.0
     chosen = fit_oe(Structure.of_order(2), u, noisy_plant.measured, choice=RowChoice(99, 6))
     assert chosen.rows < 700
-    assert np.max(np.abs(chosen.parameters[0] - noisy_plant.parameters) / chosen.standard_deviations[0]) < 4.0
+    assert np.max(np.abs(chosen.parameters - noisy_plant.parameters) / chosen.standard_deviations) < 4.0
 
 
 def test_stable_agrees_with_the_roots() -> None:
@@ -149,8 +150,8 @@ def test_the_triangle_is_that_of_lapack() -> None:
 def test_records_that_determine_nothing_are_refused_with_the_cause() -> None:
     rng = np.random.default_rng(6)
     u, y = rng.standard_normal(50), rng.standard_normal(50)
-    with pytest.raises(InputError, match="an output-error model has one output, got 2"):
-        fit_oe(Structure.of_order(1, outputs=2), u, np.column_stack([y, y]))
+    with pytest.raises(InputError, match="outputs must have the shape"):
+        fit_oe(Structure.of_order(1), u, np.column_stack([y, y]))
     with pytest.raises(InputError, match="output 1 is constant"):
         fit_oe(Structure.of_order(1), u, np.zeros(50))
     with pytest.raises(InputError, match="7 parameters need at least 7 rows"):

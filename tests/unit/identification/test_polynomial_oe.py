@@ -7,9 +7,9 @@ import pytest
 from reactorwatch.errors import InputError
 from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.identify import ModelForm, identify
-from reactorwatch.identification.linear_model import plan_run
 from reactorwatch.identification.polynomial_narx import candidate_products, factors_of
 from reactorwatch.identification.polynomial_oe import run_with_gradient
+from reactorwatch.identification.simulation import plan_run
 from reactorwatch.identification.structure import Structure
 
 NOISE_SD = 0.05
@@ -50,7 +50,7 @@ def test_the_gradient_is_the_derivative_of_the_simulation() -> None:
     theta = np.random.default_rng(2).uniform(-0.1, 0.1, len(products))
 
     def run(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return run_with_gradient(values, factors_of(products), 2, 2, 1, u, y[:, 0], plan.starts, plan.running)
+        return run_with_gradient(values, factors_of(products), (2, 2, 1), u, y[:, 0], plan.arrays)
 
     _, gradient = run(theta)
     for i in range(theta.size):

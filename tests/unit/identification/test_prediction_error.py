@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.linear_model import plan_run
+from reactorwatch.identification.linear_model import LinearModel
+from reactorwatch.identification.linear_predictor import predict_with_gradient
 from reactorwatch.identification.prediction_error import (
-    PredictionErrorModel,
     fit_armax,
     fit_box_jenkins,
-    predict_with_gradient,
 )
+from reactorwatch.identification.simulation import plan_run
 from reactorwatch.identification.structure import Structure
 from tests.unit.identification.systems import ARMA, ARMAX, BOX_JENKINS, OUTPUT_ERROR, System
 
@@ -18,7 +18,7 @@ SEEDS = 6
 ROWS = 600
 
 
-def fit(system: System, seed: int, order: int = 2, kind: str = "armax") -> tuple[PredictionErrorModel, np.ndarray]:
+def fit(system: System, seed: int, order: int = 2, kind: str = "armax") -> tuple[LinearModel, np.ndarray]:
     fitting = fit_armax if kind == "armax" else fit_box_jenkins
     u, y = system.simulate(ROWS, seed)
     b = np.ravel(system.b)
@@ -49,7 +49,7 @@ def test_the_gradient_is_the_derivative_of_the_prediction() -> None:
     theta = np.array([1.4, -0.6, 0.9, -0.5, 0.4, 0.2, 0.1, -0.3, -0.2, 0.5, 0.1])
 
     def predict(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return predict_with_gradient(parameters, 2, 2, 1, u, y, plan.starts, plan.running)
+        return predict_with_gradient(parameters, (2, 2, 1, 2), u, y, plan.arrays)
 
     predicted, gradient = predict(theta)
     assert np.isfinite(predicted[20])

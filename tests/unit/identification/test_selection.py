@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from benchmarks.study_figures.flow_chart import follow
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import fit_arx
-from reactorwatch.identification.families import LINEAR_FAMILIES, Arx, Model, OutputError
+from reactorwatch.identification.families import LINEAR_FAMILIES, Model
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.selection import bic, select
 from reactorwatch.identification.structure import Structure
@@ -85,7 +85,7 @@ def test_a_model_that_cannot_be_fitted_stays_in_the_table_with_its_reason(noisy_
     u, y = noisy_plant.inputs, np.zeros(4000)
     for k in range(1, 4000):
         y[k] = 0.5 * y[k - 1] + u[k - 1]
-    selection = select(u, y, families=(Arx(),), orders=(1, 3))
+    selection = select(u, y, families=LINEAR_FAMILIES[:1], orders=(1, 3))
     assert "don't determine 7 parameters" in selection.candidates[1].refusal
     assert "don't determine 7 parameters" in selection.table()
     assert selection.chosen.order == 1
@@ -93,7 +93,7 @@ def test_a_model_that_cannot_be_fitted_stays_in_the_table_with_its_reason(noisy_
 
 def test_where_nothing_can_be_chosen_every_reason_is_given() -> None:
     with pytest.raises(InputError, match="no model can be chosen: arx 1: output 1 is constant"):
-        select(np.arange(50.0), np.ones(50), families=(Arx(),), orders=(1,))
+        select(np.arange(50.0), np.ones(50), families=LINEAR_FAMILIES[:1], orders=(1,))
     with pytest.raises(InputError, match="no family or order was given"):
         select(np.arange(50.0), np.ones(50), families=())
     with pytest.raises(InputError, match="order must be at least 1, got 0"):
@@ -126,7 +126,7 @@ def test_where_no_model_fits_it_recommends_none_and_says_why(case: str) -> None:
     moved, seen, why = DIFFERENT_HALVES[case]
     u = moved(np.repeat(np.random.default_rng(1).standard_normal(400), 10))
     y = seen(second_order(u, np.ones(4000))) + 0.01 * np.random.default_rng(3).standard_normal(4000)
-    selection = select(u, y, families=(Arx(),))
+    selection = select(u, y, families=LINEAR_FAMILIES[:1])
     assert not selection.fits
     assert max(candidate.free_run_percent for candidate in selection.candidates) < 20.0
     assert re.match(
@@ -151,7 +151,7 @@ def test_bic_is_schwarzs() -> None:
 def test_models_know_what_they_are() -> None:
     assert [family.name for family in LINEAR_FAMILIES] == ["arx", "oe"]
     plant_rows = np.random.default_rng(1).standard_normal((200, 2))
-    for family in (Arx(), OutputError()):
+    for family in LINEAR_FAMILIES:
         model = family.fit(Structure.of_order(1), plant_rows[:, 0], plant_rows[:, 1])
         assert isinstance(model, LinearModel)
         assert model.parameter_count == 3

@@ -18,7 +18,7 @@ LONG_COMPILED: tuple[tuple[ModuleType, str], ...] = (
     (plants, "step_rows"),
     (plants, "take_samples"),
     (plants, "find_deadlines"),
-    (information, "learn_one"),
+    (information, "learn"),
     (sample_bytes, "_read"),
 )
 
