@@ -39,8 +39,9 @@ from monitor_node.ingest.sampling import regular_intervals
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import ModelSnapshot
 from reactorwatch.errors import InputError
+from reactorwatch.identification.recursion import RlsState
 from reactorwatch.identification.regressor import BufferState, RegressorBuffer, Rows
-from reactorwatch.identification.rls import RecursiveLeastSquares, RlsState
+from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.charts.base import Judgement

@@ -40,30 +40,8 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reactorwatch.errors import InputError
 from reactorwatch.identification import information
-from reactorwatch.identification.information import LARGEST_VALUE
-from reactorwatch.stored_state import StoredState
-
-DEFAULT_COVARIANCE_LIMIT = 1e6
-
-
-class RlsState(StoredState, frozen=True):
-    """State of a recursive estimator.
-
-    Attributes:
-        plants: 1.
-        parameters: number of parameters.
-        forgetting: weight of a row relative to its successor.
-        covariance_limit: bound on the eigenvalues of P.
-        memory: little-endian doubles, shape (state_size(parameters),), laid out as in `information.py`.
-    """
-
-    plants: int
-    parameters: int
-    forgetting: float
-    covariance_limit: float
-    memory: bytes
+from reactorwatch.identification.recursion import Recursion, RlsState, describe_invalid
 
 
 class RlsUpdate(msgspec.Struct, frozen=True, gc=False):
@@ -83,7 +61,7 @@ class RlsUpdate(msgspec.Struct, frozen=True, gc=False):
     leverage: float
 
 
-class RecursiveLeastSquares:
+class RecursiveLeastSquares(Recursion):
     """y = regressor . parameters + noise, learned row by row.
 
     Regressors should be of the order of 1 (`regressor.Scaling`): `covariance_limit` counts in their units.
@@ -105,31 +83,8 @@ class RecursiveLeastSquares:
     """
 
     def __init__(self, parameters: int, forgetting: float = 1.0, covariance_limit: float | None = None) -> None:
-        if parameters < 1:
-            raise InputError(f"parameters must be at least 1, got {parameters}")
-        if covariance_limit is None:
-            covariance_limit = math.inf if forgetting == 1.0 else DEFAULT_COVARIANCE_LIMIT
-        if not covariance_limit > 1.0 / LARGEST_VALUE:
-            raise InputError(f"covariance_limit must be above {1.0 / LARGEST_VALUE}, got {covariance_limit}")
-        self._parameters, self._covariance_limit = parameters, float(covariance_limit)
-        self._rank_share = information.RANK_SHARE if math.isinf(self._covariance_limit) else 0.0
-        self._set_forgetting(forgetting)
-        self._size = information.state_size(parameters)
-        self._numbers = np.zeros(self._size + parameters)
-        self._numbers[2 * parameters : 3 * parameters] = 1.0 / (
-            self._covariance_limit * self._forgetting ** (parameters - 1)
-        )
-
-    def _set_forgetting(self, forgetting: float) -> None:
-        if not 0.0 < forgetting <= 1.0:
-            raise InputError(f"forgetting must be in (0, 1], got {forgetting}")
-        if forgetting < 1.0 and not self._covariance_limit < LARGEST_VALUE:
-            raise InputError(
-                f"covariance_limit must be below {LARGEST_VALUE} when forgetting < 1, got {self._covariance_limit}"
-            )
-        n, f = self._parameters, float(forgetting)
-        self._forgetting = f
-        self._renewal = (1.0 - f**n) / (self._covariance_limit * f ** (n - 1))
+        super().__init__(1, parameters, forgetting, covariance_limit, plants_in_tile=1)
+        self._tile: NDArray[np.float64] = self._tiles[0]
 
     @classmethod
     def from_state(cls, state: RlsState) -> Self:
@@ -138,25 +93,11 @@ class RecursiveLeastSquares:
         Raises:
             ValueError: the state is of several plants, or damaged.
         """
+        if state.plants != 1:
+            raise ValueError(f"state must be of one plant, got {state.plants}: use RecursiveLeastSquaresBank")
         estimator = cls(state.parameters, state.forgetting, state.covariance_limit)
-        if state.plants != 1 or len(state.memory) != 8 * estimator._size:
-            raise ValueError(
-                f"state of one plant with {state.parameters} parameters must have {8 * estimator._size} bytes, "
-                f"got {len(state.memory)} of {state.plants} plants"
-            )
-        estimator._numbers[: estimator._size] = np.frombuffer(state.memory, dtype="<f8")
+        estimator._load(state.memory)
         return estimator
-
-    @property
-    def state(self) -> RlsState:
-        """A copy of the full state."""
-        memory = self._numbers[: self._size].astype("<f8").tobytes()
-        return RlsState(1, self._parameters, self._forgetting, self._covariance_limit, memory)
-
-    @property
-    def forgetting(self) -> float:
-        """Weight of a row relative to its successor."""
-        return self._forgetting
 
     def update(self, regressor: ArrayLike, output: float) -> RlsUpdate:
         """Predict the output, then learn from it.
@@ -171,16 +112,16 @@ class RecursiveLeastSquares:
         row = np.ascontiguousarray(regressor, dtype=np.float64)
         if row.ndim != 1 or row.size != self._parameters:
             raise ValueError(f"regressor must have shape ({self._parameters},), got {row.shape}")
-        result = information.learn(self._numbers, row, float(output), self._forgetting, self._renewal, self._rank_share)
+        result = information.learn_one(
+            self._tile, row, float(output), self._forgetting, self._renewal, self._rank_share
+        )
         if result[0] != result[0]:
-            values = {f"regressor[{i}]": value for i, value in enumerate(row)} | {"output": output}
-            name, value = next(item for item in values.items() if not abs(item[1]) < LARGEST_VALUE)
-            raise ValueError(f"{name} must be a finite number below {LARGEST_VALUE:g} in size, got {value}")
+            raise ValueError(describe_invalid(row, output))
         return RlsUpdate(*result)
 
     def predict(self, regressor: ArrayLike) -> float:
         """Predict an output with the present parameters."""
-        return float(np.dot(np.asarray(regressor, dtype=np.float64), self._numbers[: self._parameters]))
+        return float(np.dot(np.asarray(regressor, dtype=np.float64), self._tile[: self._parameters, 0]))
 
     def set_parameters(self, parameters: ArrayLike) -> None:
         """Set the parameters and keep their uncertainty.
@@ -195,9 +136,9 @@ class RecursiveLeastSquares:
         if theta.shape != (self._parameters,) or not np.all(np.isfinite(theta)):
             raise ValueError(f"parameters must be {self._parameters} finite numbers, got {theta}")
         n = self._parameters
-        self._numbers[:n] = theta
-        self._numbers[n : 2 * n] = self._factor() @ theta
-        self._numbers[4 * n : 5 * n] = 0.0
+        self._tile[:n, 0] = theta
+        self._tile[n : 2 * n, 0] = self._factor() @ theta
+        self._tile[4 * n : 5 * n, 0] = 0.0
 
     def raise_information(self, factor: float) -> None:
         """Count the rows so far as more, so that rows to come change the parameters less.
@@ -211,7 +152,7 @@ class RecursiveLeastSquares:
         if not 1.0 <= factor < math.inf:
             raise ValueError(f"factor must be a number from 1 on, got {factor}")
         n = self._parameters
-        self._numbers[2 * n : 3 * n] *= factor
+        self._tile[2 * n : 3 * n, 0] *= factor
 
     def raise_forgetting(self, forgetting: float) -> None:
         """Raise the forgetting factor from here on, for a recursion that starts with poor parameters.
@@ -226,7 +167,7 @@ class RecursiveLeastSquares:
     @property
     def parameters(self) -> NDArray[np.float64]:
         """Parameters, shape (n,); 0 for one that no row has resolved yet."""
-        return self._numbers[: self._parameters].copy()
+        return self._tile[: self._parameters, 0].copy()
 
     @property
     def rows(self) -> int:
@@ -283,14 +224,14 @@ class RecursiveLeastSquares:
     def _factor(self) -> NDArray[np.float64]:
         n = self._parameters
         factor = np.eye(n)
-        factor[np.triu_indices(n, 1)] = self._numbers[5 * n + 5 : 5 * n + 5 + n * (n - 1) // 2]
+        factor[np.triu_indices(n, 1)] = self._tile[5 * n + 5 : 5 * n + 5 + n * (n - 1) // 2, 0]
         return factor
 
     def _diagonal(self) -> NDArray[np.float64]:
-        return np.asarray(self._numbers[2 * self._parameters : 3 * self._parameters])
+        return np.asarray(self._tile[2 * self._parameters : 3 * self._parameters, 0])
 
     def _sums(self) -> NDArray[np.float64]:
-        return np.asarray(self._numbers[5 * self._parameters : 5 * self._parameters + 5])
+        return np.asarray(self._tile[5 * self._parameters : 5 * self._parameters + 5, 0])
 
     def _weight_share(self) -> float:
         sums = self._sums()

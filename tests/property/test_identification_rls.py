@@ -6,7 +6,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from reactorwatch.identification.rls import RecursiveLeastSquares, RlsState
+from reactorwatch.identification.recursion import RlsState
+from reactorwatch.identification.rls import RecursiveLeastSquares
+from reactorwatch.identification.rls_bank import RecursiveLeastSquaresBank
 
 N = 4
 FORGETTING = st.sampled_from([0.5, 0.9, 0.99, 0.9999, 1.0])
@@ -63,3 +65,20 @@ def test_stored_at_any_row_it_goes_on_with_the_same_bits(
     for row in rows:
         straight.update(row[:N], row[N])
     assert resumed.state == straight.state
+
+
+@settings(max_examples=200)
+@given(rows_of(ANY), FORGETTING, st.integers(1, 70), st.data())
+def test_in_a_bank_a_plant_has_the_bits_of_its_own(
+    rows: NDArray[np.float64], forgetting: float, plants: int, data: st.DataObject
+) -> None:
+    """Wherever in the bank the plant is, and whatever its neighbours get."""
+    place = data.draw(st.integers(0, plants - 1))
+    rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
+    alone, bank = RecursiveLeastSquares(N, forgetting), RecursiveLeastSquaresBank(plants, N, forgetting)
+    for row in rows:
+        everybody = rng.standard_normal((plants, N + 1))
+        everybody[place] = row
+        bank.update(everybody[:, :N], everybody[:, N])
+        alone.update(row[:N], row[N])
+    assert bank.plant(place).state == alone.state

@@ -18,7 +18,7 @@ LONG_COMPILED: tuple[tuple[ModuleType, str], ...] = (
     (plants, "step_rows"),
     (plants, "take_samples"),
     (plants, "find_deadlines"),
-    (information, "learn"),
+    (information, "learn_one"),
     (sample_bytes, "_read"),
 )
 
