@@ -35,6 +35,8 @@ from recorder.storage.chunk_data import chunk_data
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of the summary offsets, CRC
 RECORD = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the payload
+_MESSAGE_RECORD = struct.Struct("<BQHIQQ")  # both
+_MESSAGE_OPCODE = int(Opcode.MESSAGE)
 
 TABLE_CURE = "the name of a table must end in .csv, .xlsx, .parquet or another ending of a table"
 """Cure for a table that is taken for a recording by its name."""
@@ -128,8 +130,7 @@ def ordered_messages(path: Path, summary: Summary, wanted: set[int]) -> Iterator
             if wanted.isdisjoint(index.message_index_offsets):
                 continue
             try:
-                data = _decompress_chunk(stream, index, size)
-                parsed = list(_messages_of(data, channels))
+                parsed = _messages_of(_decompress_chunk(stream, index, size), channels)
             except DAMAGE as error:
                 where = f"the chunk at byte {index.chunk_start_offset} cannot be read"
                 raise damage_error(path, where, error) from error
@@ -243,7 +244,7 @@ def _decompress_chunk(stream: IO[bytes], index: ChunkIndex, size: int) -> bytes:
 
 def _messages_of(
     data: bytes, channels: dict[int, KeyedChannel], schemas: dict[int, Schema] | None = None
-) -> Iterator[RecordedMessage]:
+) -> list[RecordedMessage]:
     """Messages of an uncompressed chunk, a sequence of records of opcode, length and content.
 
     Args:
@@ -255,28 +256,34 @@ def _messages_of(
     Raises:
         ValueError: a record is of an unknown kind, or, with `schemas`, its channel is not described.
     """
-    record, message = RECORD.unpack_from, MESSAGE.unpack_from
+    found: list[RecordedMessage] = []
+    append, new, unpack = found.append, tuple.__new__, _MESSAGE_RECORD.unpack_from  # this runs for each message
     at, end = 0, len(data)
     while at < end:
-        opcode, length = record(data, at)
-        at += RECORD.size
-        if opcode == Opcode.MESSAGE:
-            number, _, log_time, publish_time = message(data, at)
+        if data[at] == _MESSAGE_OPCODE:
+            _, length, number, _, log_time, publish_time = unpack(data, at)
+            at += RECORD.size
             channel = channels.get(number)
             if channel is not None:
+                key, encoding, latched = channel
                 payload = data[at + MESSAGE.size : at + length]
-                yield RecordedMessage(channel.key, payload, channel.encoding, log_time, publish_time, channel.latched)
+                append(new(RecordedMessage, (key, payload, encoding, log_time, publish_time, latched)))
             elif schemas is not None:
                 raise ValueError(f"channel {number} is described nowhere")
-        elif not opcode:
+            at += length
+            continue
+        opcode, length = RECORD.unpack_from(data, at)
+        at += RECORD.size
+        if not opcode:
             raise ValueError("the chunk holds a record of kind 0, which the format does not know")
-        elif schemas is not None and opcode == Opcode.SCHEMA:
+        if schemas is not None and opcode == Opcode.SCHEMA:
             schema = Schema.read(ReadDataStream(io.BytesIO(data[at : at + length])))
             schemas[schema.id] = schema
         elif schemas is not None and opcode == Opcode.CHANNEL:
             described = Channel.read(ReadDataStream(io.BytesIO(data[at : at + length])))
             channels[described.id] = keyed_channel(described, schemas)
         at += length
+    return found
 
 
 def foreign_file_error(path: Path) -> InputError:

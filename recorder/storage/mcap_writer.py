@@ -94,23 +94,26 @@ class RecordingWriter:
         """Bytes written, without the current chunk."""
         return self._stream.tell()
 
-    def write(self, message: RecordedMessage, *, readable: bool = True) -> None:
+    def write(self, message: RecordedMessage, *, readable: bool = True, sequence: int | None = None) -> None:
         """Append a message; the sequence number of a sample becomes that of the MCAP message.
 
         Args:
             message: the message.
             readable: False writes the payload without the schema that its encoding names.
+            sequence: sequence number of a sample, else 0, where it is known; None: it is read from the payload.
 
         Raises:
             WriteError: the file cannot be written, for example because the disk is full.
         """
+        key, payload, encoding, log_time_ns, publish_time_ns, latched = message
         try:
-            name = (message.key, message.encoding, readable, message.latched)
+            name = (key, encoding, readable, latched)
             channel = self._channels.get(name)
             if channel is None:
                 channel = self._channels[name] = self._register(message, readable=readable)
-            number = read_sequence(message.payload) & MAX_SEQUENCE if readable and message.encoding == _SAMPLE else 0
-            self._writer.add_message(channel, message.log_time_ns, message.payload, message.publish_time_ns, number)
+            if sequence is None:
+                sequence = read_sequence(payload) if readable and encoding == _SAMPLE else 0
+            self._writer.add_message(channel, log_time_ns, payload, publish_time_ns, sequence & MAX_SEQUENCE)
         except OSError as error:
             raise self._write_error(error) from error
 
