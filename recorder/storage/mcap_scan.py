@@ -12,6 +12,7 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -30,6 +31,7 @@ from recorder.storage.mcap_chunks import (
     LATCHED,
     MESSAGE,
     RECORD,
+    damage_error,
     foreign_file_error,
     keyed_channel,
     read_summary,
@@ -134,6 +136,16 @@ class Scan:
     def is_intact(self) -> bool:
         """True after the pass if the file has its end and no damage was found."""
         return self._ended and not self.damages and not self.orphans
+
+    def check_intact(self) -> None:
+        """Check after the pass that everything was read.
+
+        Raises:
+            InputError: the file is damaged, or has no end.
+        """
+        if not self.is_intact:
+            damages = "; ".join(map(str, self.damages))
+            raise damage_error(self._path, damages or "some channels are described nowhere")
 
     def __iter__(self) -> Iterator[RawMessage]:
         """Messages in the order of the file."""
@@ -309,6 +321,18 @@ class Scan:
             return False
         (data_length,) = _DATA_LENGTH.unpack_from(self._bytes, at + _BEFORE_COMPRESSION + name_length)
         return bool(head + name_length + _DATA_LENGTH.size + data_length == length)
+
+
+def unindexed_messages(path: Path) -> Iterator[RecordedMessage]:
+    """All messages in the order of receipt; they are in memory at once.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    scan = Scan(path)
+    messages = sorted((stored.recorded_message for stored in scan), key=attrgetter("log_time_ns"))
+    scan.check_intact()
+    yield from messages
 
 
 def profile_of(path: Path) -> str:

@@ -34,12 +34,14 @@ from recorder.columns.sample_series import BATCH, SAMPLE, SampleSeries
 from recorder.message import RecordedMessage
 from recorder.storage.mcap_chunks import (
     is_in_order,
+    is_indexed,
     metadata_records,
     ordered_messages,
     read_summary,
     sorted_messages,
     span_ns,
 )
+from recorder.storage.mcap_scan import unindexed_messages
 from recorder.storage.mcap_types import Summary
 from recorder.storage.mcap_writer import RecordingWriter, own_metadata
 from recorder.storage.process_metadata import processes_in
@@ -76,11 +78,11 @@ def read_messages(
         return (kinds is None or topic.kind in kinds) and (plant is None or topic.plant == plant)
 
     def read(file: _File) -> Iterator[RecordedMessage]:
-        if is_in_order(file.summary):
+        if is_indexed(file.summary) and is_in_order(file.summary):
             numbers = {number for number, channel in file.summary.channels.items() if is_selected(channel.topic)}
             found = ordered_messages(file.path, file.summary, numbers)
         else:
-            found = (entry for entry in sorted_messages(file.path, file.summary) if is_selected(entry.key))
+            found = (entry for entry in _all_messages(file) if is_selected(entry.key))
         return found if file.first else (entry for entry in found if not entry.latched)
 
     if len(groups) == len(groups[0]) == 1:
@@ -116,7 +118,7 @@ def sample_topics_in(path: Path) -> set[keys.Topic]:
     for file in _files(path):
         topics = {channel.topic for channel in file.summary.channels.values()}
         if not topics:  # nothing was recorded, or the file's index does not say what
-            topics = {entry.key for entry in sorted_messages(file.path, file.summary)}
+            topics = {entry.key for entry in _all_messages(file)}
         parsed = map(keys.parse, topics)
         found.update(topic for topic in parsed if topic is not None and topic.kind == keys.SAMPLE)
     return found
@@ -244,6 +246,11 @@ class _File(NamedTuple):
     summary: Summary
     span: tuple[int, int]
     first: bool
+
+
+def _all_messages(file: _File) -> Iterator[RecordedMessage]:
+    """Messages of a file in the order of receipt, whatever the file's order is."""
+    return sorted_messages(file.path, file.summary) if is_indexed(file.summary) else unindexed_messages(file.path)
 
 
 def _files(path: Path) -> list[_File]:
