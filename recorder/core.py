@@ -16,7 +16,6 @@ from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.columns.sequence_counter import SequenceCounter
 from recorder.message import RecordedMessage
@@ -79,6 +78,9 @@ class Recorder:
         start_ns: clock reading at the start.
         fingerprints: hashes of messages in earlier files, which the bus may deliver once more.
         fingerprints_until_ns: time after which `fingerprints` are dropped.
+
+    Attributes:
+        alarms: alarms of the recorder itself.
     """
 
     def __init__(
@@ -95,7 +97,7 @@ class Recorder:
         self._longest_lag_ns = 0
         self._refused: Counter[str] = Counter()
         self._stopped = False
-        self._alarms = OwnAlarms(plant)
+        self.alarms = OwnAlarms(plant)
         self._counters: dict[str, SequenceCounter] = {}  # by key, in the order of their last samples
         self._evicted = SequenceCounter()  # counts of evicted keys
         self._no_room_ns = 0  # time of the last rejected message
@@ -187,43 +189,34 @@ class Recorder:
         if self._logged_ns is None or now_ns - self._logged_ns >= LOG_INTERVAL_NS:
             self._logged_ns = now_ns
             log.warning("not recorded: too many keys", example=key, keys=kind, messages=self._refused["too many keys"])
-        if self._alarms.is_active(KEYS_ALARM):
+        if self.alarms.is_active(KEYS_ALARM):
             return []
         text = f"not everything is recorded: a file has no room for more keys {kind}, {key!r} for instance"
-        return [self._alarms.raise_alarm(KEYS_ALARM, text, now_ns), self.health(now_ns)]
+        return [self.alarms.raise_alarm(KEYS_ALARM, text, now_ns), self.health(now_ns)]
 
     def clear_keys_alarm(self, now_ns: int) -> list[Publication]:
         """Clear the alarm about keys once no message was rejected for `NO_ROOM_NS`."""
-        if not self._alarms.is_active(KEYS_ALARM) or now_ns - self._no_room_ns < NO_ROOM_NS:
+        if not self.alarms.is_active(KEYS_ALARM) or now_ns - self._no_room_ns < NO_ROOM_NS:
             return []
         text = f"everything is recorded again; {self._refused['too many keys']} messages are missing so far"
-        return [self._alarms.clear(KEYS_ALARM, text, now_ns)]
+        return [self.alarms.clear(KEYS_ALARM, text, now_ns)]
 
     def stop_recording(self, why: str, now_ns: int) -> list[Publication]:
         """Raise the alarm that no file can be written."""
         self._stopped = True
         text = f"recording stopped: {why}; it resumes when a file can be written"
-        return [self._alarms.raise_alarm(DISK_ALARM, text, now_ns), self.health(now_ns)]
+        return [self.alarms.raise_alarm(DISK_ALARM, text, now_ns), self.health(now_ns)]
 
     def resume_recording(self, now_ns: int) -> list[Publication]:
         """Clear the alarm that no file can be written."""
         self._stopped = False
         text = f"recording resumed; {self._refused['disk']} messages are missing so far"
-        return [self._alarms.clear(DISK_ALARM, text, now_ns), self.health(now_ns)]
+        return [self.alarms.clear(DISK_ALARM, text, now_ns), self.health(now_ns)]
 
     @property
     def is_stopped(self) -> bool:
         """True while no file can be written."""
         return self._stopped
-
-    @property
-    def alarms(self) -> list[messages.Alarm]:
-        """The recorder's alarms in their present state."""
-        return self._alarms.now
-
-    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """Execute a command about the recorder's alarms."""
-        return self._alarms.execute(question, now_ns)
 
     def health(self, now_ns: int, phase: str = "") -> Publication:
         """Health report; the lag is the longest from receipt to processing since the last call.

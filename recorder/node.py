@@ -87,7 +87,7 @@ class RecorderNode:
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """Execute a command about the recorder's alarms."""
-        return self._core.on_command(question, now_ns)
+        return self._core.alarms.execute(question, now_ns)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Flush, retry on a full disk, save a black box and report health, each when due."""
@@ -101,7 +101,7 @@ class RecorderNode:
 
     def alarms(self) -> list[Alarm]:
         """The recorder's alarms in their present state."""
-        return self._core.alarms
+        return self._core.alarms.now
 
     def next_tick_ns(self) -> int:
         """Time of the next due action."""
