@@ -63,10 +63,10 @@ class _PublisherRun(GapTracker):
             self._thin_out()
         return True
 
-    def accept_all(self, numbers: NDArray[np.int64], times_ns: NDArray[np.int64]) -> None:
-        """Call `accept_next` for samples that it accepts, at once."""
-        points, at = list(zip(numbers.tolist(), times_ns.tolist(), strict=True)), 0
+    def extend(self, points: list[tuple[int, int]]) -> None:
+        """Call `accept_next` for (number, time) that it accepts, at once."""
         self.expected, self.newest_ns = points[-1][0] + 1, points[-1][1]
+        at = 0
         while at < len(points):
             end = at + MAX_POINTS + 1 - len(self.points)
             self.points += points[at:end]
@@ -80,11 +80,6 @@ class _PublisherRun(GapTracker):
         if len(self.points) > MAX_POINTS:
             self._thin_out()
         return GapTracker.advance(self, number, time_ns)
-
-    def continues(self, numbers: NDArray[np.int64], times_ns: NDArray[np.int64]) -> bool:
-        """True if `accept_next` would accept each of these samples; at least one."""
-        is_next = len(self.points) > 1 and numbers[0] == self.expected and times_ns[0] > self.newest_ns
-        return bool(is_next and (np.diff(numbers) == 1).all() and (np.diff(times_ns) > 0).all())
 
     def _thin_out(self) -> None:
         del self.points[1 : MAX_POINTS // 2 : 2]
@@ -164,12 +159,15 @@ class SequenceCounter:
 
     def continues(self, numbers: NDArray[np.int64], times_ns: NDArray[np.int64]) -> bool:
         """True if each of these samples is the next one of the run, as nearly always; at least one."""
-        return self._run is not None and self._run.continues(numbers, times_ns)
+        run = self._run
+        if run is None or len(run.points) < 2 or numbers[0] != run.expected or times_ns[0] <= run.newest_ns:
+            return False
+        return bool((np.diff(numbers) == 1).all() and (np.diff(times_ns) > 0).all())
 
     def update_all(self, numbers: NDArray[np.int64], times_ns: NDArray[np.int64]) -> None:
-        """Count samples that all are the next one of the run, see `continues`."""
+        """Count samples of which `continues` is True, as `update` would count each."""
         assert self._run is not None, "it continues"
-        self._run.accept_all(numbers, times_ns)
+        self._run.extend(list(zip(numbers.tolist(), times_ns.tolist(), strict=True)))
         self._checkpoint = None
 
     def _continues(self, run: _PublisherRun, sequence: int, time_ns: int) -> bool:
