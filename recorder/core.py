@@ -81,6 +81,7 @@ class Recorder:
 
     Attributes:
         alarms: alarms of the recorder itself.
+        is_stopped: True while no file can be written.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class Recorder:
         self._reports = 0
         self._longest_lag_ns = 0
         self._refused: Counter[str] = Counter()
-        self._stopped = False
+        self.is_stopped = False
         self.alarms = OwnAlarms(plant)
         self._counters: dict[str, SequenceCounter] = {}  # by key, in the order of their last samples
         self._evicted = SequenceCounter()  # counts of evicted keys
@@ -203,20 +204,15 @@ class Recorder:
 
     def stop_recording(self, why: str, now_ns: int) -> list[Publication]:
         """Raise the alarm that no file can be written."""
-        self._stopped = True
+        self.is_stopped = True
         text = f"recording stopped: {why}; it resumes when a file can be written"
         return [self.alarms.raise_alarm(DISK_ALARM, text, now_ns), self.health(now_ns)]
 
     def resume_recording(self, now_ns: int) -> list[Publication]:
         """Clear the alarm that no file can be written."""
-        self._stopped = False
+        self.is_stopped = False
         text = f"recording resumed; {self._refused['disk']} messages are missing so far"
         return [self.alarms.clear(DISK_ALARM, text, now_ns), self.health(now_ns)]
-
-    @property
-    def is_stopped(self) -> bool:
-        """True while no file can be written."""
-        return self._stopped
 
     def health(self, now_ns: int, phase: str = "") -> Publication:
         """Health report; the lag is the longest from receipt to processing since the last call.
@@ -225,7 +221,7 @@ class Recorder:
             now_ns: clock reading.
             phase: phase to report; empty derives it from the state.
         """
-        phase = phase or ("not recording" if self._stopped else "recording")
+        phase = phase or ("not recording" if self.is_stopped else "recording")
         checks = [self._evicted, *self._counters.values()]
         self._reports += 1
         health = messages.Health(

@@ -68,9 +68,10 @@ class RecorderNode:
         if received is None:
             return []
         published = self._write(received, now_ns)
-        if isinstance(received.message, STATES) and self._channels.has(received.channel):
-            self._latched.update(received.recorded, received.message)
-            ended = self._black_box.on_message(received.message, received.recorded.log_time_ns)
+        content = received.message
+        if content is not None and type(content) in STATES and self._channels.has(received.channel):
+            self._latched.update(received.recorded, content)
+            ended = self._black_box.on_message(content, received.recorded.log_time_ns)
             published += self._save_black_box(ended, now_ns)
         return published
 

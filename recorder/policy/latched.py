@@ -11,8 +11,8 @@ from reactorwatch.contract import messages_pb2 as messages
 from recorder.message import RecordedMessage
 from recorder.policy.channel_budget import MAX_KEYS
 
-STATES = (messages.ModelSnapshot, messages.Alarm, messages.Baseline, messages.Promise, messages.Fault)
-"""Messages that are latched."""
+STATES = frozenset({messages.ModelSnapshot, messages.Alarm, messages.Baseline, messages.Promise, messages.Fault})
+"""Types of messages that are latched."""
 
 
 class LatchedMessages:
@@ -31,7 +31,7 @@ class LatchedMessages:
         if isinstance(message, messages.ModelSnapshot):
             # models that share a key: the adaptive one, the one held since the training, the reference
             name = (recorded.key, (message.structure, message.reference, message.held))
-        elif isinstance(message, STATES):
+        elif type(message) in STATES:
             name = (recorded.key, ("", False, False))
         else:
             return

@@ -30,7 +30,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import list_files
 from reactorwatch.records.record import MINUTE_NS, Record, join_runs
 from recorder.columns.process_annotations import signal_roles
-from recorder.columns.sample_series import BATCH, SAMPLE, SampleSeries
+from recorder.columns.sample_series import BATCH, FIRST_BATCH, SAMPLE, SampleSeries
 from recorder.message import RecordedMessage
 from recorder.storage.mcap_chunks import (
     is_in_order,
@@ -184,18 +184,20 @@ def read_record(path: Path, plant: str | None = None, process: Process | None = 
     series = SampleSeries()
     signals: list[str] = []
     payloads: list[bytes] = []
+    batch = FIRST_BATCH
     for entry in read_messages(path, {keys.SAMPLE}, plant):
-        if entry.key not in names:
-            name = entry.key.split("/", 3)[3]
-            names[entry.key] = name if wanted is None or name in wanted else None
-        signal = names[entry.key]
+        key = entry.key
+        if key not in names:
+            name = key.split("/", 3)[3]
+            names[key] = name if wanted is None or name in wanted else None
+        signal = names[key]
         if signal is None or entry.encoding != SAMPLE:
             continue
         signals.append(signal)
         payloads.append(entry.payload)
-        if len(signals) == BATCH:
+        if len(signals) == batch:
             series.add(signals, payloads)
-            signals, payloads = [], []
+            signals, payloads, batch = [], [], BATCH
     series.add(signals, payloads)
     runs, splitter, units = series.runs, series.splitter, series.units
     if not runs:
