@@ -18,7 +18,7 @@ DEFAULT_LARGEST_MB = 32.0
 
 _MB = 1_000_000
 _RECORDS = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE})
-_FIRST_PRIVATE = 0x80
+FIRST_PRIVATE = 0x80
 """Opcodes from here on are private to other programs; their records are skipped."""
 
 
@@ -62,7 +62,7 @@ def chunk_data(chunk: Chunk, indexed_bytes: int | None = None) -> bytes:
         raise ValueError(f"the chunk holds more than the {claimed} bytes that it claims")
     if len(data) < claimed:
         raise ValueError(f"the chunk holds {len(data)} bytes, and claims {claimed}")
-    if data and data[0] not in _RECORDS and data[0] < _FIRST_PRIVATE:
+    if data and data[0] not in _RECORDS and data[0] < FIRST_PRIVATE:
         raise ValueError(f"the chunk begins with a record of kind {data[0]}, which no chunk may hold")
     crc = chunk.uncompressed_crc
     if crc and zlib.crc32(data) != crc:

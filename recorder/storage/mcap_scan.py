@@ -24,7 +24,7 @@ from mcap.writer import MCAP0_MAGIC
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import wrap_read_errors
 from recorder.message import RecordedMessage
-from recorder.storage.chunk_data import chunk_data
+from recorder.storage.chunk_data import FIRST_PRIVATE, chunk_data
 from recorder.storage.mcap_chunks import (
     DAMAGE,
     FOOTER,
@@ -95,6 +95,8 @@ class Scan:
         from_ns: chunks that were received entirely before this time are skipped.
         to_ns: chunks that were received entirely after this time are skipped.
         wanted: selects the topics to read; None reads all.
+        skip_private: True to skip records that are private to other programs; False takes them for damage, as the
+            opcode of any record may be damaged.
 
     Attributes:
         damages: unreadable parts; complete after the pass.
@@ -106,13 +108,21 @@ class Scan:
         InputError: the file does not exist, is empty, or contains nothing of a recording.
     """
 
-    def __init__(self, path: Path, from_ns: int = 0, to_ns: int = LATEST_NS, wanted: Wanted | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        from_ns: int = 0,
+        to_ns: int = LATEST_NS,
+        wanted: Wanted | None = None,
+        *,
+        skip_private: bool = False,
+    ) -> None:
         self.damages: list[Damage] = []
         self.metadata: list[Metadata] = []
         self.profile = ""
         self._attached: list[tuple[int, int]] = []
         self.orphans = 0
-        self._wanted = wanted
+        self._wanted, self._skip_private = wanted, skip_private
         self._path, self._from_ns, self._to_ns = path, from_ns, to_ns
         self._ended = False
         self._channels: dict[int, Channel] = {}
@@ -236,7 +246,7 @@ class Scan:
                 if self._bytes[end:] != MCAP0_MAGIC:
                     raise ValueError("the last bytes are not those of a recording")
                 self._ended = True
-            case _ if opcode not in _OPCODES:
+            case _ if opcode not in _OPCODES and not (self._skip_private and opcode >= FIRST_PRIVATE):
                 raise ValueError("of no known kind")
 
     def _may_be_wanted(self, at: int) -> bool:
@@ -329,7 +339,7 @@ def unindexed_messages(path: Path) -> Iterator[RecordedMessage]:
     Raises:
         InputError: the file is damaged.
     """
-    scan = Scan(path)
+    scan = Scan(path, skip_private=True)
     messages = sorted((stored.recorded_message for stored in scan), key=attrgetter("log_time_ns"))
     scan.check_intact()
     yield from messages
