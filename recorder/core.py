@@ -135,7 +135,9 @@ class Recorder:
             if time_ns >= 0 and decoded.quality == _NO_SAMPLE:
                 self._refused["payload"] += 1
             elif time_ns >= 0 and channel.is_product:
-                self._count_sample(key, sequence, time_ns)
+                counter = self._counters.pop(key, None) or self._new_counter()
+                self._counters[key] = counter  # the most recently used one is last
+                counter.update(sequence, time_ns)
         else:
             time_ns = getattr(decoded, "time_ns", received_ns)
         if time_ns < 0:  # before 1970, which MCAP cannot represent
@@ -144,18 +146,14 @@ class Recorder:
         recorded = _new(RecordedMessage, (key, payload, encoding, received_ns, time_ns, False))
         return _new(ReceivedMessage, (recorded, decoded, channel, sequence))
 
-    def _count_sample(self, key: str, sequence: int, time_ns: int) -> None:
-        """Count a sample of a key, which becomes the most recently used one."""
-        counter = self._counters.pop(key, None)
-        if counter is None:
-            counter = SequenceCounter()
-            if len(self._counters) >= MAX_COUNTERS:
-                evicted = self._counters.pop(next(iter(self._counters)))
-                self._evicted.lost += evicted.lost
-                self._evicted.duplicated += evicted.duplicated
-                self._evicted.out_of_order += evicted.out_of_order
-        self._counters[key] = counter
-        counter.update(sequence, time_ns)
+    def _new_counter(self) -> SequenceCounter:
+        """Counter of a new key, for which the least recently used one is evicted if there are too many."""
+        if len(self._counters) >= MAX_COUNTERS:
+            evicted = self._counters.pop(next(iter(self._counters)))
+            self._evicted.lost += evicted.lost
+            self._evicted.duplicated += evicted.duplicated
+            self._evicted.out_of_order += evicted.out_of_order
+        return SequenceCounter()
 
     def _is_recorded(self, key: str, payload: bytes, now_ns: int) -> bool:
         """True if an earlier file holds the message; each fingerprint matches once."""
