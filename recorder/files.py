@@ -149,10 +149,11 @@ class RecordingFiles:
             WriteError: the file cannot be written; see `abandon`.
         """
         assert self._writer is not None, "a file was started"
-        if received.recorded.key not in self._keys:
-            self._describe_plant(received.recorded.key)
-        self._writer.write(received.recorded, readable=received.is_readable)
-        self._last_ns = received.recorded.log_time_ns
+        recorded = received.recorded
+        if recorded.key not in self._keys:
+            self._describe_plant(recorded.key)
+        self._writer.write(recorded, readable=received.message is not None, sequence=received.sequence)
+        self._last_ns = recorded.log_time_ns
 
     def _describe_plant(self, key: str) -> None:
         """Describe the process of a plant at the first of its samples in the file."""

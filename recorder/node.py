@@ -11,7 +11,7 @@ from recorder.core import ReceivedMessage, Recorder
 from recorder.files import RecordingFiles
 from recorder.policy.black_box import AlarmInterval, BlackBox
 from recorder.policy.channel_budget import ChannelBudget
-from recorder.policy.latched import LatchedMessages
+from recorder.policy.latched import STATES, LatchedMessages
 from recorder.policy.rotation import FlushAndRotation
 from recorder.storage.mcap_writer import WriteError
 
@@ -68,9 +68,10 @@ class RecorderNode:
         if received is None:
             return []
         published = self._write(received, now_ns)
-        if received.message is not None and self._channels.has(received.channel):
-            self._latched.update(received.recorded, received.message)
-            ended = self._black_box.on_message(received.message, received.recorded.log_time_ns)
+        content = received.message
+        if content is not None and type(content) in STATES and self._channels.has(received.channel):
+            self._latched.update(received.recorded, content)
+            ended = self._black_box.on_message(content, received.recorded.log_time_ns)
             published += self._save_black_box(ended, now_ns)
         return published
 
@@ -87,7 +88,7 @@ class RecorderNode:
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """Execute a command about the recorder's alarms."""
-        return self._core.on_command(question, now_ns)
+        return self._core.alarms.execute(question, now_ns)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Flush, retry on a full disk, save a black box and report health, each when due."""
@@ -101,7 +102,7 @@ class RecorderNode:
 
     def alarms(self) -> list[Alarm]:
         """The recorder's alarms in their present state."""
-        return self._core.alarms
+        return self._core.alarms.now
 
     def next_tick_ns(self) -> int:
         """Time of the next due action."""
@@ -138,11 +139,12 @@ class RecorderNode:
         if self._core.is_stopped:
             self._core.count_unrecorded(1)
             return []
+        channels, channel = self._channels, received.channel
         try:
-            channels_full = self._channels.needs_new_file(received.channel, now_ns)
+            channels_full = not channels.has(channel) and channels.needs_new_file(channel, now_ns)
             if channels_full or self._rotation.is_full(now_ns, self._files.size_bytes):
                 self._start_file(received.recorded.log_time_ns, now_ns)
-            if not self._channels.admit(received.channel, now_ns):
+            if not channels.admit(channel, now_ns):
                 return self._core.reject_key(received, now_ns)
             self._files.write(received)
         except InputError as error:

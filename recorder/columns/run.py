@@ -90,16 +90,6 @@ class AlarmChange(NamedTuple):
     suspects: Sequence[messages.Suspect]
 
 
-class FaultChange(NamedTuple):
-    """Fault that was injected into the simulated plant or removed from it."""
-
-    time_ns: int
-    cause: str
-    specification: str
-    active: bool
-    onset_ns: int
-
-
 ADAPTIVE, FROZEN, REFERENCE, EQUATIONS = "adaptive", "frozen", "reference", "equations"
 """Purposes of a model: adaptive; frozen since the training and compared with the adaptive one; reference of the charts;
 equations as the reference, with noise levels as parameters."""
@@ -212,7 +202,7 @@ class RunColumns:
     estimates: dict[str, EstimateColumns]
     charts: dict[str, ChartColumns]
     alarms: tuple[AlarmChange, ...]
-    faults: tuple[FaultChange, ...]
+    faults: tuple[messages.Fault, ...]
     reconstructions: dict[str, ReconstructionColumns] = field(default_factory=dict)
     models: dict[tuple[str, str], tuple[Snapshot, ...]] = field(default_factory=dict)
     health: dict[str, tuple[HealthReport, ...]] = field(default_factory=dict)

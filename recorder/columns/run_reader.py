@@ -31,7 +31,6 @@ from recorder.columns.run import (
     AlarmChange,
     ChartColumns,
     EstimateColumns,
-    FaultChange,
     HealthReport,
     PromiseReport,
     ReconstructionColumns,
@@ -109,7 +108,7 @@ class RunReader:
         self._columns: dict[str, _KeyColumns | None] = {}
         self._alarms: list[AlarmChange] = []
         self._newest_changes: dict[str, AlarmChange] = {}
-        self._faults: list[FaultChange] = []
+        self._faults: list[messages.Fault] = []
         self._models: dict[tuple[str, str], list[Snapshot]] = {}
         self._health: dict[str, list[HealthReport]] = {}
         self._promises: list[PromiseReport] = []
@@ -159,9 +158,9 @@ class RunReader:
                 self._newest_changes[change.alarm] = change
                 self._alarms.append(change._replace(time_ns=time_ns))
         elif kind == keys.FAULT:
-            fault = FaultChange(*(getattr(message, name) for name in FaultChange._fields))
-            onset_ns = fault.onset_ns + time_ns - fault.time_ns
-            self._faults.append(fault._replace(time_ns=time_ns, onset_ns=onset_ns))
+            message.onset_ns += time_ns - message.time_ns
+            message.time_ns = time_ns
+            self._faults.append(message)
         elif kind == keys.MODEL:
             self._models.setdefault((into.topic.name, _purpose(message)), []).append(_snapshot(message, time_ns))
         elif kind == keys.PROMISE:

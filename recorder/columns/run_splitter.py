@@ -37,6 +37,16 @@ class _Run:
         elif time_ns < self.first_ns:
             self.first_ns = time_ns
 
+    def add_all(self, times_ns: NDArray[np.int64]) -> None:
+        """Call `add` for each time, at once; at least one."""
+        self.samples += times_ns.size
+        self.first_ns = min(self.first_ns, int(times_ns.min()))
+        newest_ns = np.maximum.accumulate(np.concatenate(([self.last_ns], times_ns)))
+        periods_ns = np.diff(newest_ns)
+        if periods_ns.any():
+            self.period_ns = int(periods_ns[periods_ns > 0][-1])
+            self.last_ns = int(newest_ns[-1])
+
     def covers(self, time_ns: int) -> bool:
         """True if a time is within the run or one sampling period after it."""
         return self.first_ns <= time_ns <= self.last_ns + self.period_ns
@@ -106,15 +116,11 @@ class RunSplitter:
             if not counter.continues(numbers, own_times):
                 return False
         for signal, (numbers, own_times) in stamps.items():
-            counter = self.counters[signal]
-            for number, time_ns in zip(numbers.tolist(), own_times.tolist(), strict=True):
-                counter.update(number, time_ns)
+            self.counters[signal].update_all(numbers, own_times)
             last = self._last[signal]
             last += ((self.current, time_ns) for time_ns in own_times[-2:].tolist())
             del last[:-2]
-        run = self._runs[self.current - 1]
-        for time_ns in times_ns.tolist():
-            run.add(time_ns)
+        self._runs[self.current - 1].add_all(times_ns)
         return True
 
     def span(self, number: int) -> RunSpan:

@@ -23,6 +23,8 @@ SAMPLE = encoding_of(messages.Sample)
 
 BATCH = 2048
 """Usual number of samples in a batch: its fixed cost is then small beside that of its samples."""
+FIRST_BATCH = 64
+"""Number of samples in the first batch: no run has started, so they are added sample by sample."""
 
 _NO_UNIT = unit_digest("")
 

@@ -53,25 +53,36 @@ class _PublisherRun(GapTracker):
         return self.expected
 
     def accept_next(self, number: int, time_ns: int) -> bool:
-        """See `GapTracker`."""
-        return GapTracker.accept_next(self, number, time_ns) and self._add_point(number, time_ns)
+        """See `GapTracker`; False also for the first two samples of a run. Written out: it runs for each sample."""
+        points = self.points
+        if number != self.expected or time_ns <= self.newest_ns or len(points) < 2:
+            return False
+        self.expected, self.newest_ns = number + 1, time_ns
+        points.append((number, time_ns))
+        if len(points) > MAX_POINTS:
+            self._thin_out()
+        return True
+
+    def extend(self, points: list[tuple[int, int]]) -> None:
+        """Call `accept_next` for (number, time) that it accepts, at once."""
+        self.expected, self.newest_ns = points[-1][0] + 1, points[-1][1]
+        at = 0
+        while at < len(points):
+            end = at + MAX_POINTS + 1 - len(self.points)
+            self.points += points[at:end]
+            at = end
+            if len(self.points) > MAX_POINTS:
+                self._thin_out()
 
     def advance(self, number: int, time_ns: int = 0) -> int:
         """Add the newest sample; returns how many were skipped."""
-        self._add_point(number, time_ns)
+        self.points.append((number, time_ns))
+        if len(self.points) > MAX_POINTS:
+            self._thin_out()
         return GapTracker.advance(self, number, time_ns)
 
-    def continues(self, numbers: NDArray[np.int64], times_ns: NDArray[np.int64]) -> bool:
-        """True if `accept_next` would accept each of these samples; at least one."""
-        is_next = numbers[0] == self.expected and times_ns[0] > self.newest_ns
-        return bool(is_next and (np.diff(numbers) == 1).all() and (np.diff(times_ns) > 0).all())
-
-    def _add_point(self, number: int, time_ns: int) -> bool:
-        points = self.points
-        points.append((number, time_ns))
-        if len(points) > MAX_POINTS:
-            del points[1 : MAX_POINTS // 2 : 2]
-        return True
+    def _thin_out(self) -> None:
+        del self.points[1 : MAX_POINTS // 2 : 2]
 
     def is_consistent(self, sequence: int, time_ns: int) -> bool:
         """True if an older number can have this time in this run."""
@@ -134,7 +145,7 @@ class SequenceCounter:
             run = self._run = _PublisherRun()
             run.advance(sequence, time_ns)
             return RunTransition.SAME_RUN
-        if len(run.points) > 1 and run.accept_next(sequence, time_ns):
+        if run.accept_next(sequence, time_ns):
             self._checkpoint = None  # derived from the points when needed
             return RunTransition.SAME_RUN
         if self._checkpoint is None and len(run.points) > 1:
@@ -149,7 +160,15 @@ class SequenceCounter:
     def continues(self, numbers: NDArray[np.int64], times_ns: NDArray[np.int64]) -> bool:
         """True if each of these samples is the next one of the run, as nearly always; at least one."""
         run = self._run
-        return run is not None and len(run.points) > 1 and run.continues(numbers, times_ns)
+        if run is None or len(run.points) < 2 or numbers[0] != run.expected or times_ns[0] <= run.newest_ns:
+            return False
+        return bool((np.diff(numbers) == 1).all() and (np.diff(times_ns) > 0).all())
+
+    def update_all(self, numbers: NDArray[np.int64], times_ns: NDArray[np.int64]) -> None:
+        """Count samples of which `continues` is True, as `update` would count each."""
+        assert self._run is not None, "it continues"
+        self._run.extend(list(zip(numbers.tolist(), times_ns.tolist(), strict=True)))
+        self._checkpoint = None
 
     def _continues(self, run: _PublisherRun, sequence: int, time_ns: int) -> bool:
         """True if a sample fits the run, unless the run consists of a single sample after another run."""

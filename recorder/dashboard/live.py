@@ -33,7 +33,7 @@ from recorder.columns.run_reader import SEGMENT_MESSAGES, RunReader
 from recorder.dashboard.history_query import HistoryQuery, RunHistory, query_history, zero_of
 from recorder.dashboard.renderer import Renderer
 from recorder.dashboard.stream import APPLICATION
-from recorder.dashboard.viewer_process import viewer
+from recorder.dashboard.viewer_process import describe_exit, viewer
 from recorder.panels import PANELS
 
 _ALARM = encoding_of(Alarm)
@@ -323,9 +323,7 @@ def _wait_for(process: subprocess.Popen[bytes], port: int, target: DisplayTarget
 
 
 def _exit_error(code: int, target: DisplayTarget, log: Path) -> InputError:
-    lines = log.read_text(errors="replace").strip().splitlines()
-    cure = "" if target.web else "; it needs a screen, try --web"
-    return InputError(f"the viewer ended with code {code}: {lines[-1] if lines else 'without a message'}{cure}")
+    return InputError(describe_exit(code, log) + ("" if target.web else "; it needs a screen, try --web"))
 
 
 def _stop_with(process: subprocess.Popen[bytes], stop: StopSignal) -> None:

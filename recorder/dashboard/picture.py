@@ -22,7 +22,7 @@ from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.loopback import free_port
 from recorder.dashboard.file import DIAGNOSIS
-from recorder.dashboard.viewer_process import viewer
+from recorder.dashboard.viewer_process import describe_exit, viewer
 from recorder.panels import PANELS
 
 if TYPE_CHECKING:
@@ -60,9 +60,9 @@ def render_tabs(
     with _HeadlessViewer.open(rrd, width, height, deadline) as studio:
         picture = studio.picture(deadline)
         make_folder(folder)
-        for index, (title, tab) in enumerate(studio.tabs().items()):
+        for index, (title, tab) in enumerate(studio.client.tabs.items()):
             if index:
-                studio.open_tab(tab)
+                studio.client.open_tab(tab)
                 picture = studio.picture(time.monotonic() + deadline_s, other_than=picture)
             path = folder / f"{slug(title)}.png"
             with atomic_write(path) as temporary:
@@ -103,11 +103,14 @@ class _HeadlessViewer:
         port: port of the viewer.
         log: file with its output.
         deadline: latest time of its first reply, by the monotonic clock.
+
+    Attributes:
+        client: client of the viewer.
     """
 
     def __init__(self, process: subprocess.Popen[bytes], port: int, log: Path, deadline: float) -> None:
         self._process, self._log = process, log
-        self._client = self._connect(port, deadline)
+        self.client = self._connect(port, deadline)
 
     @classmethod
     @contextmanager
@@ -132,24 +135,16 @@ class _HeadlessViewer:
         """
         before, shows = b"", "nothing was drawn"
         while self._wait_for_poll(deadline, shows):
-            png = self._client.screenshot()
+            png = self.client.screenshot()
             coloured = count_coloured(png)
             shows = f"{coloured} coloured pixels"
             is_complete = (
-                coloured >= LEAST_PIXELS and self._client.is_ready and (not other_than or _differ(png, other_than))
+                coloured >= LEAST_PIXELS and self.client.is_ready and (not other_than or _differ(png, other_than))
             )
             if is_complete and png == before:
                 return png
             before = png
         raise AssertionError("polling continues or raises")
-
-    def tabs(self) -> dict[str, str]:
-        """See `Viewer.tabs`."""
-        return self._client.tabs
-
-    def open_tab(self, tab: str) -> None:
-        """See `Viewer.open_tab`."""
-        self._client.open_tab(tab)
 
     def _connect(self, port: int, deadline: float) -> "Viewer":
         from recorder.dashboard.viewer_client import Viewer
@@ -177,11 +172,8 @@ class _HeadlessViewer:
             code = self._process.wait(POLL_S)
         except subprocess.TimeoutExpired:
             return True
-        lines = self._log.read_text(errors="replace").strip().splitlines()
-        raise InputError(
-            f"no picture: the viewer ended with code {code}: {lines[-1] if lines else 'without a message'}; it needs a "
-            f"graphics driver, on Debian mesa-vulkan-drivers libegl1 libgl1 libxkbcommon-x11-0"
-        )
+        cure = "it needs a graphics driver, on Debian mesa-vulkan-drivers libegl1 libgl1 libxkbcommon-x11-0"
+        raise InputError(f"no picture: {describe_exit(code, self._log)}; {cure}")
 
 
 def _differ(one: bytes, other: bytes) -> bool:

@@ -20,6 +20,12 @@ def viewer_program() -> Path:
     return Path(package.origin).with_name("rerun")
 
 
+def describe_exit(code: int, log: Path) -> str:
+    """Text about a viewer that has exited, with the last line of its output."""
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return f"the viewer ended with code {code}: {lines[-1] if lines else 'without a message'}"
+
+
 @contextmanager
 def viewer(
     *arguments: str, port: int, bind: str, log: Path, environment: Mapping[str, str] | None = None

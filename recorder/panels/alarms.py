@@ -3,7 +3,7 @@
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.records.record import to_minutes
-from recorder.columns.run import AlarmChange, FaultChange, RunColumns
+from recorder.columns.run import AlarmChange, RunColumns
 from recorder.columns.run_reader import LISTED, SUSPECTED
 from recorder.panels.base import (
     ALARM,
@@ -85,7 +85,7 @@ def _suspects_event(change: AlarmChange, zero_ns: int) -> Event:
     return Event(change.time_ns, "suspect", f"{_at(change.time_ns, zero_ns)}  {text}", ALARM)
 
 
-def _fault_event(change: FaultChange, zero_ns: int) -> Event:
+def _fault_event(change: messages.Fault, zero_ns: int) -> Event:
     action = "injected" if change.active else "removed"
     return Event(
         change.time_ns,

@@ -11,6 +11,9 @@ from reactorwatch.contract import messages_pb2 as messages
 from recorder.message import RecordedMessage
 from recorder.policy.channel_budget import MAX_KEYS
 
+STATES = frozenset({messages.ModelSnapshot, messages.Alarm, messages.Baseline, messages.Promise, messages.Fault})
+"""Types of messages that are latched."""
+
 
 class LatchedMessages:
     """Last message of each model, alarm, baseline, promise and fault.
@@ -28,7 +31,7 @@ class LatchedMessages:
         if isinstance(message, messages.ModelSnapshot):
             # models that share a key: the adaptive one, the one held since the training, the reference
             name = (recorded.key, (message.structure, message.reference, message.held))
-        elif isinstance(message, messages.Alarm | messages.Baseline | messages.Promise | messages.Fault):
+        elif type(message) in STATES:
             name = (recorded.key, ("", False, False))
         else:
             return

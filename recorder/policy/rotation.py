@@ -63,9 +63,9 @@ class FlushAndRotation:
 
     def sync_is_due(self, now_ns: int) -> bool:
         """True if something was flushed and the policy asks for a sync now."""
-        self._follow_clock(now_ns)
         if not self._unsynced or self._fsync == "never":
             return False
+        self._follow_clock(now_ns)
         return self._fsync == "chunk" or now_ns - self._synced_ns >= SECOND_NS
 
     def is_full(self, now_ns: int, size_bytes: int) -> bool:

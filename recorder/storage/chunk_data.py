@@ -1,12 +1,11 @@
 """Bounded decompression of MCAP chunks.
 
-A chunk of a few kilobytes may decompress to gigabytes. So its claimed size is checked first. Then it is decompressed in
-pieces, and refused as soon as a piece is no record of the format or exceeds the claimed size.
+A chunk of a few kilobytes may decompress to gigabytes. So its claimed size is checked first, and no more than one byte
+beyond it is decompressed.
 """
 
 import os
 import zlib
-from collections.abc import Iterator
 
 import lz4.frame
 import zstandard
@@ -16,11 +15,10 @@ from mcap.records import Chunk
 LARGEST_MB = "REACTORWATCH_LARGEST_CHUNK_MB"
 """Environment variable that sets the largest chunk that is read."""
 DEFAULT_LARGEST_MB = 32.0
-PIECE_BYTES = 4 << 20
 
 _MB = 1_000_000
 _RECORDS = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE})
-_FIRST_PRIVATE = 0x80
+FIRST_PRIVATE = 0x80
 """Opcodes from here on are private to other programs; their records are skipped."""
 
 
@@ -59,41 +57,28 @@ def chunk_data(chunk: Chunk, indexed_bytes: int | None = None) -> bytes:
         )
     if indexed_bytes is not None and indexed_bytes != claimed:
         raise ValueError(f"the chunk claims to hold {claimed} bytes, and the index {indexed_bytes}")
-    data = bytearray()
-    for piece in _pieces(chunk, claimed + 1):
-        if not data and piece[0] not in _RECORDS and piece[0] < _FIRST_PRIVATE:
-            raise ValueError(f"the chunk begins with a record of kind {piece[0]}, which no chunk may hold")
-        data += piece
-        if len(data) > claimed:
-            raise ValueError(f"the chunk holds more than the {claimed} bytes that it claims")
+    data = _decompress(chunk, claimed)
+    if len(data) > claimed:
+        raise ValueError(f"the chunk holds more than the {claimed} bytes that it claims")
     if len(data) < claimed:
         raise ValueError(f"the chunk holds {len(data)} bytes, and claims {claimed}")
+    if data and data[0] not in _RECORDS and data[0] < FIRST_PRIVATE:
+        raise ValueError(f"the chunk begins with a record of kind {data[0]}, which no chunk may hold")
     crc = chunk.uncompressed_crc
     if crc and zlib.crc32(data) != crc:
         raise ValueError("the checksum of the chunk differs")
-    return bytes(data)
+    return data
 
 
-def _pieces(chunk: Chunk, most_bytes: int) -> Iterator[bytes]:
-    """Non-empty pieces of the content, together at most `most_bytes`."""
+def _decompress(chunk: Chunk, claimed: int) -> bytes:
+    """Content of a chunk; of one that holds more than it claims, at most a byte beyond that."""
     match chunk.compression:
         case "zstd":
             with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
-                while most_bytes > 0 and (piece := reader.read(min(PIECE_BYTES, most_bytes))):
-                    yield piece
-                    most_bytes -= len(piece)
+                return reader.read(claimed + 1)
         case "lz4":
-            decompressor = lz4.frame.LZ4FrameDecompressor()
-            source = chunk.data
-            while most_bytes > 0 and not decompressor.eof:
-                piece = decompressor.decompress(source, min(PIECE_BYTES, most_bytes))
-                if not piece:
-                    return
-                yield piece
-                source = b""
-                most_bytes -= len(piece)
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, claimed + 1))
         case "":
-            if chunk.data:
-                yield chunk.data[:most_bytes]
+            return chunk.data
         case other:
             raise ValueError(f"compression must be zstd, lz4 or none, got {other!r}")

@@ -1,8 +1,8 @@
 """Reader of the index and the chunks of an MCAP file; damage raises a one-line error.
 
 Messages are parsed here (`_messages_of`) and not by the library, which builds an object for each record. They are
-sorted only where the file needs it: messages out of the order of receipt, or no chunks or no index, as files of other
-programs may have it.
+sorted only where the file needs it: messages out of the order of receipt, as files of other programs may have it. Files
+without chunks or without an index are left to `mcap_scan`.
 """
 
 import heapq
@@ -20,8 +20,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, ChunkIndex, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, Chunk, ChunkIndex, Metadata, Schema
 from mcap.summary import Summary
 from mcap.well_known import MessageEncoding
 from mcap.writer import MCAP0_MAGIC
@@ -35,6 +34,8 @@ from recorder.storage.chunk_data import chunk_data
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of the summary offsets, CRC
 RECORD = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the payload
+_MESSAGE_RECORD = struct.Struct("<BQHIQQ")  # both
+_MESSAGE_OPCODE = int(Opcode.MESSAGE)
 
 TABLE_CURE = "the name of a table must end in .csv, .xlsx, .parquet or another ending of a table"
 """Cure for a table that is taken for a recording by its name."""
@@ -95,10 +96,17 @@ def read_summary(path: Path) -> Summary:
 
 
 def is_in_order(summary: Summary) -> bool:
-    """True if every chunk is indexed and the chunks are in the order of receipt without overlap."""
-    chunks = _chunks(summary)
-    is_sorted = all(a.message_end_time <= b.message_start_time for a, b in itertools.pairwise(chunks))
-    return _is_indexed(summary) and is_sorted
+    """True if the chunks are in the order of receipt without overlap."""
+    return all(a.message_end_time <= b.message_start_time for a, b in itertools.pairwise(_chunks(summary)))
+
+
+def is_indexed(summary: Summary) -> bool:
+    """True if the file has chunks, and all of them and their channels are in the index."""
+    chunks = summary.chunk_indexes
+    known = {number for number, channel in summary.channels.items() if channel.schema_id in {0, *summary.schemas}}
+    return bool(chunks) and all(
+        chunk.message_index_offsets and known.issuperset(chunk.message_index_offsets) for chunk in chunks
+    )
 
 
 def span_ns(summary: Summary) -> tuple[int, int]:
@@ -116,7 +124,7 @@ def span_ns(summary: Summary) -> tuple[int, int]:
 
 
 def ordered_messages(path: Path, summary: Summary, wanted: set[int]) -> Iterator[RecordedMessage]:
-    """Messages of the wanted channels in the order of receipt, of a file that `is_in_order`.
+    """Messages of the wanted channels in the order of receipt, of a file that `is_indexed` and `is_in_order`.
 
     Raises:
         InputError: a chunk is damaged; raised when the iteration reaches it.
@@ -128,8 +136,7 @@ def ordered_messages(path: Path, summary: Summary, wanted: set[int]) -> Iterator
             if wanted.isdisjoint(index.message_index_offsets):
                 continue
             try:
-                data = _decompress_chunk(stream, index, size)
-                parsed = list(_messages_of(data, channels))
+                parsed = _messages_of(_decompress_chunk(stream, index, size), channels)
             except DAMAGE as error:
                 where = f"the chunk at byte {index.chunk_start_offset} cannot be read"
                 raise damage_error(path, where, error) from error
@@ -138,53 +145,27 @@ def ordered_messages(path: Path, summary: Summary, wanted: set[int]) -> Iterator
 
 
 def sorted_messages(path: Path, summary: Summary) -> Iterator[RecordedMessage]:
-    """All messages of any MCAP file in the order of receipt; without an index, all are in memory at once.
+    """All messages in the order of receipt, of a file that `is_indexed`; a chunk is read when its first message is due.
 
     Raises:
         InputError: the file is damaged; raised when the iteration reaches the damage.
     """
-    with path.open("rb") as stream:
-        try:
-            if _is_indexed(summary):
-                yield from _sorted_chunks(stream, summary, path.stat().st_size)
-            else:
-                yield from sorted(_unindexed_messages(stream, path.stat().st_size), key=attrgetter("log_time_ns"))
-        except DAMAGE as error:
-            raise damage_error(path, "cannot be read", error) from error
-
-
-def _sorted_chunks(stream: IO[bytes], summary: Summary, size: int) -> Iterator[RecordedMessage]:
-    """Messages of overlapping chunks, each chunk read when its first message is due."""
     channels = {number: keyed_channel(channel, summary.schemas) for number, channel in summary.channels.items()}
     # log time, chunk, position in it: unique, so that no two messages are compared
     waiting: list[tuple[int, int, int, RecordedMessage]] = []
-    for index in sorted(summary.chunk_indexes, key=attrgetter("message_start_time", "chunk_start_offset")):
-        while waiting and waiting[0][0] < index.message_start_time:
-            yield heapq.heappop(waiting)[-1]
-        parsed = _messages_of(_decompress_chunk(stream, index, size), channels, dict(summary.schemas))
-        for position, message in enumerate(parsed):
-            heapq.heappush(waiting, (message.log_time_ns, index.chunk_start_offset, position, message))
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        for index in sorted(summary.chunk_indexes, key=attrgetter("message_start_time", "chunk_start_offset")):
+            while waiting and waiting[0][0] < index.message_start_time:
+                yield heapq.heappop(waiting)[-1]
+            try:
+                parsed = _messages_of(_decompress_chunk(stream, index, size), channels, all_described=True)
+            except DAMAGE as error:
+                raise damage_error(path, "cannot be read", error) from error
+            for position, message in enumerate(parsed):
+                heapq.heappush(waiting, (message.log_time_ns, index.chunk_start_offset, position, message))
     while waiting:
         yield heapq.heappop(waiting)[-1]
-
-
-def _unindexed_messages(stream: IO[bytes], size: int) -> Iterator[RecordedMessage]:
-    """Messages of a file without an index, in the order of the file."""
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, KeyedChannel] = {}
-    reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size)
-    for record in reader.records:
-        match record:
-            case Chunk():
-                yield from _messages_of(chunk_data(record), channels, schemas)
-            case Schema():
-                schemas[record.id] = record
-            case Channel():
-                channels[record.id] = keyed_channel(record, schemas)
-            case Message():
-                channel = channels[record.channel_id]
-                times = record.log_time, record.publish_time
-                yield RecordedMessage(channel.key, record.data, channel.encoding, *times, channel.latched)
 
 
 def metadata_records(path: Path) -> list[Metadata]:
@@ -203,14 +184,6 @@ def metadata_records(path: Path) -> list[Metadata]:
 
 def _chunks(summary: Summary) -> list[ChunkIndex]:
     return sorted(summary.chunk_indexes, key=attrgetter("chunk_start_offset"))
-
-
-def _is_indexed(summary: Summary) -> bool:
-    chunks = summary.chunk_indexes
-    known = {number for number, channel in summary.channels.items() if channel.schema_id in {0, *summary.schemas}}
-    return bool(chunks) and all(
-        chunk.message_index_offsets and known.issuperset(chunk.message_index_offsets) for chunk in chunks
-    )
 
 
 class KeyedChannel(NamedTuple):
@@ -242,41 +215,38 @@ def _decompress_chunk(stream: IO[bytes], index: ChunkIndex, size: int) -> bytes:
 
 
 def _messages_of(
-    data: bytes, channels: dict[int, KeyedChannel], schemas: dict[int, Schema] | None = None
-) -> Iterator[RecordedMessage]:
+    data: bytes, channels: Mapping[int, KeyedChannel], *, all_described: bool = False
+) -> list[RecordedMessage]:
     """Messages of an uncompressed chunk, a sequence of records of opcode, length and content.
 
     Args:
         data: the chunk.
         channels: channels by number; messages of other channels are skipped.
-        schemas: schemas by number, to which those of the chunk are added, as its channels are to `channels`; None
-            ignores both.
+        all_described: True if there are no other channels, so that a message of one is damage.
 
     Raises:
-        ValueError: a record is of an unknown kind, or, with `schemas`, its channel is not described.
+        ValueError: a record is of an unknown kind, or its channel is not described.
     """
-    record, message = RECORD.unpack_from, MESSAGE.unpack_from
+    found: list[RecordedMessage] = []
+    append, new, unpack = found.append, tuple.__new__, _MESSAGE_RECORD.unpack_from  # this runs for each message
     at, end = 0, len(data)
     while at < end:
-        opcode, length = record(data, at)
-        at += RECORD.size
-        if opcode == Opcode.MESSAGE:
-            number, _, log_time, publish_time = message(data, at)
+        opcode = data[at]
+        if opcode == _MESSAGE_OPCODE:
+            _, length, number, _, log_time, publish_time = unpack(data, at)
             channel = channels.get(number)
             if channel is not None:
-                payload = data[at + MESSAGE.size : at + length]
-                yield RecordedMessage(channel.key, payload, channel.encoding, log_time, publish_time, channel.latched)
-            elif schemas is not None:
+                key, encoding, latched = channel
+                payload = data[at + _MESSAGE_RECORD.size : at + RECORD.size + length]
+                append(new(RecordedMessage, (key, payload, encoding, log_time, publish_time, latched)))
+            elif all_described:
                 raise ValueError(f"channel {number} is described nowhere")
-        elif not opcode:
+        elif opcode:
+            _, length = RECORD.unpack_from(data, at)
+        else:
             raise ValueError("the chunk holds a record of kind 0, which the format does not know")
-        elif schemas is not None and opcode == Opcode.SCHEMA:
-            schema = Schema.read(ReadDataStream(io.BytesIO(data[at : at + length])))
-            schemas[schema.id] = schema
-        elif schemas is not None and opcode == Opcode.CHANNEL:
-            described = Channel.read(ReadDataStream(io.BytesIO(data[at : at + length])))
-            channels[described.id] = keyed_channel(described, schemas)
-        at += length
+        at += RECORD.size + length
+    return found
 
 
 def foreign_file_error(path: Path) -> InputError:

@@ -12,6 +12,7 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -23,13 +24,14 @@ from mcap.writer import MCAP0_MAGIC
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import wrap_read_errors
 from recorder.message import RecordedMessage
-from recorder.storage.chunk_data import chunk_data
+from recorder.storage.chunk_data import FIRST_PRIVATE, chunk_data
 from recorder.storage.mcap_chunks import (
     DAMAGE,
     FOOTER,
     LATCHED,
     MESSAGE,
     RECORD,
+    damage_error,
     foreign_file_error,
     keyed_channel,
     read_summary,
@@ -93,6 +95,8 @@ class Scan:
         from_ns: chunks that were received entirely before this time are skipped.
         to_ns: chunks that were received entirely after this time are skipped.
         wanted: selects the topics to read; None reads all.
+        skip_private: True to skip records that are private to other programs; False takes them for damage, as the
+            opcode of any record may be damaged.
 
     Attributes:
         damages: unreadable parts; complete after the pass.
@@ -104,13 +108,21 @@ class Scan:
         InputError: the file does not exist, is empty, or contains nothing of a recording.
     """
 
-    def __init__(self, path: Path, from_ns: int = 0, to_ns: int = LATEST_NS, wanted: Wanted | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        from_ns: int = 0,
+        to_ns: int = LATEST_NS,
+        wanted: Wanted | None = None,
+        *,
+        skip_private: bool = False,
+    ) -> None:
         self.damages: list[Damage] = []
         self.metadata: list[Metadata] = []
         self.profile = ""
         self._attached: list[tuple[int, int]] = []
         self.orphans = 0
-        self._wanted = wanted
+        self._wanted, self._skip_private = wanted, skip_private
         self._path, self._from_ns, self._to_ns = path, from_ns, to_ns
         self._ended = False
         self._channels: dict[int, Channel] = {}
@@ -134,6 +146,16 @@ class Scan:
     def is_intact(self) -> bool:
         """True after the pass if the file has its end and no damage was found."""
         return self._ended and not self.damages and not self.orphans
+
+    def check_intact(self) -> None:
+        """Check after the pass that everything was read.
+
+        Raises:
+            InputError: the file is damaged, or has no end.
+        """
+        if not self.is_intact:
+            damages = "; ".join(map(str, self.damages))
+            raise damage_error(self._path, damages or "some channels are described nowhere")
 
     def __iter__(self) -> Iterator[RawMessage]:
         """Messages in the order of the file."""
@@ -224,7 +246,7 @@ class Scan:
                 if self._bytes[end:] != MCAP0_MAGIC:
                     raise ValueError("the last bytes are not those of a recording")
                 self._ended = True
-            case _ if opcode not in _OPCODES:
+            case _ if opcode not in _OPCODES and not (self._skip_private and opcode >= FIRST_PRIVATE):
                 raise ValueError("of no known kind")
 
     def _may_be_wanted(self, at: int) -> bool:
@@ -309,6 +331,18 @@ class Scan:
             return False
         (data_length,) = _DATA_LENGTH.unpack_from(self._bytes, at + _BEFORE_COMPRESSION + name_length)
         return bool(head + name_length + _DATA_LENGTH.size + data_length == length)
+
+
+def unindexed_messages(path: Path) -> Iterator[RecordedMessage]:
+    """All messages in the order of receipt; they are in memory at once.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    scan = Scan(path, skip_private=True)
+    messages = sorted((stored.recorded_message for stored in scan), key=attrgetter("log_time_ns"))
+    scan.check_intact()
+    yield from messages
 
 
 def profile_of(path: Path) -> str:

@@ -40,6 +40,7 @@ CHUNK_BYTES = 1 << 20
 """Uncompressed size of a chunk, which ends with the message that exceeds it."""
 
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length; channel, sequence, log time, publish time; then the payload
+_MESSAGE_OPCODE = int(Opcode.MESSAGE)  # a plain number is packed faster
 _MESSAGE_HEAD = _MESSAGE.size - 9  # the part that the length counts
 _INDEX = struct.Struct("<BQHI")  # opcode, length; channel, length of the pairs of log time and offset that follow
 _INDEX_HEAD = _INDEX.size - 9
@@ -112,7 +113,7 @@ class McapStream:
             index = self._index[channel] = []
         index += (log_time, len(chunk))
         length = _MESSAGE_HEAD + len(payload)
-        chunk += _MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence, log_time, publish_time)
+        chunk += _MESSAGE.pack(_MESSAGE_OPCODE, length, channel, sequence, log_time, publish_time)
         chunk += payload
         if len(chunk) > CHUNK_BYTES:
             self._end_chunk()

@@ -1,7 +1,8 @@
 """Writer of recordings as MCAP files, on top of `mcap_stream`."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import TracebackType
@@ -70,10 +71,8 @@ class RecordingWriter:
         ] = {}  # by identity, which is stable because the channel is held here
         self._copies: dict[tuple[object, ...], int] = {}
         check_free(path)
-        try:
+        with self._write_errors():
             self._stream = open_part(self._part)
-        except OSError as error:
-            raise self._write_error(error) from error
         self._writer = McapStream(self._stream)
         try:
             self._writer.start(f"reactorwatch {__version__}", profile)
@@ -94,23 +93,26 @@ class RecordingWriter:
         """Bytes written, without the current chunk."""
         return self._stream.tell()
 
-    def write(self, message: RecordedMessage, *, readable: bool = True) -> None:
+    def write(self, message: RecordedMessage, *, readable: bool = True, sequence: int | None = None) -> None:
         """Append a message; the sequence number of a sample becomes that of the MCAP message.
 
         Args:
             message: the message.
             readable: False writes the payload without the schema that its encoding names.
+            sequence: sequence number of a sample, else 0, where it is known; None: it is read from the payload.
 
         Raises:
             WriteError: the file cannot be written, for example because the disk is full.
         """
+        key, payload, encoding, log_time_ns, publish_time_ns, latched = message
         try:
-            name = (message.key, message.encoding, readable, message.latched)
+            name = (key, encoding, readable, latched)
             channel = self._channels.get(name)
             if channel is None:
                 channel = self._channels[name] = self._register(message, readable=readable)
-            number = read_sequence(message.payload) & MAX_SEQUENCE if readable and message.encoding == _SAMPLE else 0
-            self._writer.add_message(channel, message.log_time_ns, message.payload, message.publish_time_ns, number)
+            if sequence is None:
+                sequence = read_sequence(payload) if readable and encoding == _SAMPLE else 0
+            self._writer.add_message(channel, log_time_ns, payload, publish_time_ns, sequence & MAX_SEQUENCE)
         except OSError as error:
             raise self._write_error(error) from error
 
@@ -136,11 +138,9 @@ class RecordingWriter:
         Raises:
             WriteError: as `write`.
         """
-        try:
+        with self._write_errors():
             self._writer.flush()
             self._writer.add_metadata(name, metadata)
-        except OSError as error:
-            raise self._write_error(error) from error
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Append an attachment.
@@ -148,11 +148,9 @@ class RecordingWriter:
         Raises:
             WriteError: as `write`.
         """
-        try:
+        with self._write_errors():
             self._writer.flush()
             self._writer.add_attachment(attachment)
-        except OSError as error:
-            raise self._write_error(error) from error
 
     def flush(self) -> None:
         """End the chunk and hand all bytes to the operating system.
@@ -160,10 +158,8 @@ class RecordingWriter:
         Raises:
             WriteError: the file cannot be written.
         """
-        try:
+        with self._write_errors():
             self._writer.flush()
-        except OSError as error:
-            raise self._write_error(error) from error
 
     def sync(self) -> None:
         """Wait until flushed bytes are on the disk.
@@ -171,10 +167,8 @@ class RecordingWriter:
         Raises:
             WriteError: the file cannot be written.
         """
-        try:
+        with self._write_errors():
             self._stream.sync()
-        except OSError as error:
-            raise self._write_error(error) from error
 
     def close(self) -> None:
         """Complete and rename the file; a second call does nothing.
@@ -185,10 +179,9 @@ class RecordingWriter:
         if self._stream.closed:
             return
         try:
-            self._writer.finish()
-            self._stream.finish(self._path)
-        except OSError as error:
-            raise self._write_error(error) from error
+            with self._write_errors():
+                self._writer.finish()
+                self._stream.finish(self._path)
         finally:
             self._stream.abandon()
 
@@ -239,6 +232,14 @@ class RecordingWriter:
         if number is None:
             number = self._schemas[described] = self._writer.add_schema(name, encoding, data)
         return number
+
+    @contextmanager
+    def _write_errors(self) -> Iterator[None]:
+        """Raise errors of the operating system as `WriteError`."""
+        try:
+            yield
+        except OSError as error:
+            raise self._write_error(error) from error
 
     def _write_error(self, error: OSError) -> WriteError:
         kept = f"; what was written is in {self._part}" if self._part.exists() else ""

@@ -19,7 +19,7 @@ from reactorwatch.records.output import refuse_source
 from recorder.message import RecordedMessage
 from recorder.policy.latched import LatchedMessages
 from recorder.storage.gaps import GAP, from_metadata
-from recorder.storage.mcap_chunks import damage_error, read_summary, span_ns
+from recorder.storage.mcap_chunks import read_summary, span_ns
 from recorder.storage.mcap_scan import LATEST_NS, RawMessage, Scan, Wanted, profile_of
 from recorder.storage.mcap_types import Attachment, Metadata
 from recorder.storage.mcap_writer import METADATA, RecordingWriter
@@ -180,8 +180,8 @@ def _merged_messages(
         for stored in scan:
             if source.first or not stored.latched:
                 yield stored
-        if not (scan.is_intact or tolerant):
-            raise damage_error(source.path, "; ".join(map(str, scan.damages)) or "some channels are described nowhere")
+        if not tolerant:
+            scan.check_intact()
 
     within = [source for source in sources if source.span[1] >= from_ns and source.span[0] <= to_ns]
     for group in group_overlapping(within, lambda source: source.span):

@@ -3,15 +3,11 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import DecodeError, decode
-from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.columns.run_splitter import RunSplitter
 from recorder.storage.gaps import GAP, from_metadata
 from recorder.storage.mcap_chunks import metadata_records
 from recorder.storage.mcap_scan import Scan
@@ -49,19 +45,19 @@ def inspect(path: Path) -> FileInfo:
     Raises:
         InputError: it is no recording, or a file of the folder is damaged.
     """
+    damages: list[str] = []
     if path.is_dir():
         found, metadata = overview(read_messages(path)), read_metadata(path)
         records = [record for file in recordings_in(path) for record in metadata_records(file)]
-        zero_ns = zero_from(metadata, found.starts_ns or 0)
-        return FileInfo(found, metadata, zero_ns, (), _gaps(records), processes_in(records))
-    scan = Scan(path)
-    found = overview(stored.recorded_message for stored in scan)
-    metadata = own_metadata(scan.metadata)
-    damages = [str(damage) for damage in scan.damages]
-    if scan.orphans:
-        damages.append(f"{scan.orphans} messages of channels that are described nowhere")
+    else:
+        scan = Scan(path)
+        found = overview(stored.recorded_message for stored in scan)
+        records, metadata = scan.metadata, own_metadata(scan.metadata)
+        damages += map(str, scan.damages)
+        if scan.orphans:
+            damages.append(f"{scan.orphans} messages of channels that are described nowhere")
     zero_ns = zero_from(metadata, found.starts_ns or 0)
-    return FileInfo(found, metadata, zero_ns, tuple(damages), _gaps(scan.metadata), processes_in(scan.metadata))
+    return FileInfo(found, metadata, zero_ns, tuple(damages), _gaps(records), processes_in(records))
 
 
 def gaps_in(path: Path) -> tuple[Gap, ...]:
@@ -79,19 +75,10 @@ def zero_ns_of(path: Path) -> int:
     Raises:
         InputError: it holds no sample, or it is damaged.
     """
-    splitters: dict[str, RunSplitter] = {}
-    for entry in read_messages(path, {keys.SAMPLE}):
-        try:
-            sample: Any = decode(entry.payload, entry.encoding)
-        except DecodeError:
-            continue
-        topic = keys.parse(entry.key)
-        if isinstance(sample, Sample) and topic is not None:
-            splitter = splitters.setdefault(topic.plant, RunSplitter())
-            splitter.update(topic.name, sample.sequence, sample.time_ns)
-    if not splitters:
+    starts_ns = overview(read_messages(path, {keys.SAMPLE})).starts_ns
+    if starts_ns is None:
         raise InputError(f"{path}: holds no sample")
-    return zero_from(read_metadata(path), min(splitter.runs[0].first_ns for splitter in splitters.values()))
+    return zero_from(read_metadata(path), starts_ns)
 
 
 def _gaps(records: Iterable[Metadata]) -> tuple[Gap, ...]:

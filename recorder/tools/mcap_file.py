@@ -30,16 +30,18 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import list_files
 from reactorwatch.records.record import MINUTE_NS, Record, join_runs
 from recorder.columns.process_annotations import signal_roles
-from recorder.columns.sample_series import BATCH, SAMPLE, SampleSeries
+from recorder.columns.sample_series import BATCH, FIRST_BATCH, SAMPLE, SampleSeries
 from recorder.message import RecordedMessage
 from recorder.storage.mcap_chunks import (
     is_in_order,
+    is_indexed,
     metadata_records,
     ordered_messages,
     read_summary,
     sorted_messages,
     span_ns,
 )
+from recorder.storage.mcap_scan import unindexed_messages
 from recorder.storage.mcap_types import Summary
 from recorder.storage.mcap_writer import RecordingWriter, own_metadata
 from recorder.storage.process_metadata import processes_in
@@ -76,11 +78,11 @@ def read_messages(
         return (kinds is None or topic.kind in kinds) and (plant is None or topic.plant == plant)
 
     def read(file: _File) -> Iterator[RecordedMessage]:
-        if is_in_order(file.summary):
+        if is_indexed(file.summary) and is_in_order(file.summary):
             numbers = {number for number, channel in file.summary.channels.items() if is_selected(channel.topic)}
             found = ordered_messages(file.path, file.summary, numbers)
         else:
-            found = (entry for entry in sorted_messages(file.path, file.summary) if is_selected(entry.key))
+            found = (entry for entry in _all_messages(file) if is_selected(entry.key))
         return found if file.first else (entry for entry in found if not entry.latched)
 
     if len(groups) == len(groups[0]) == 1:
@@ -116,7 +118,7 @@ def sample_topics_in(path: Path) -> set[keys.Topic]:
     for file in _files(path):
         topics = {channel.topic for channel in file.summary.channels.values()}
         if not topics:  # nothing was recorded, or the file's index does not say what
-            topics = {entry.key for entry in sorted_messages(file.path, file.summary)}
+            topics = {entry.key for entry in _all_messages(file)}
         parsed = map(keys.parse, topics)
         found.update(topic for topic in parsed if topic is not None and topic.kind == keys.SAMPLE)
     return found
@@ -182,18 +184,20 @@ def read_record(path: Path, plant: str | None = None, process: Process | None = 
     series = SampleSeries()
     signals: list[str] = []
     payloads: list[bytes] = []
+    batch = FIRST_BATCH
     for entry in read_messages(path, {keys.SAMPLE}, plant):
-        if entry.key not in names:
-            name = entry.key.split("/", 3)[3]
-            names[entry.key] = name if wanted is None or name in wanted else None
-        signal = names[entry.key]
+        key = entry.key
+        if key not in names:
+            name = key.split("/", 3)[3]
+            names[key] = name if wanted is None or name in wanted else None
+        signal = names[key]
         if signal is None or entry.encoding != SAMPLE:
             continue
         signals.append(signal)
         payloads.append(entry.payload)
-        if len(signals) == BATCH:
+        if len(signals) == batch:
             series.add(signals, payloads)
-            signals, payloads = [], []
+            signals, payloads, batch = [], [], BATCH
     series.add(signals, payloads)
     runs, splitter, units = series.runs, series.splitter, series.units
     if not runs:
@@ -244,6 +248,11 @@ class _File(NamedTuple):
     summary: Summary
     span: tuple[int, int]
     first: bool
+
+
+def _all_messages(file: _File) -> Iterator[RecordedMessage]:
+    """Messages of a file in the order of receipt, whatever the file's order is."""
+    return sorted_messages(file.path, file.summary) if is_indexed(file.summary) else unindexed_messages(file.path)
 
 
 def _files(path: Path) -> list[_File]:

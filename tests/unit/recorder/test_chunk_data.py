@@ -143,8 +143,7 @@ def test_every_reader_refuses_it_in_one_line_and_takes_no_more_memory_than_is_al
 
 
 @pytest.mark.parametrize("packing", PACKED)
-def test_a_chunk_within_the_limit_is_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, packing: str) -> None:
-    monkeypatch.setattr("recorder.storage.chunk_data.PIECE_BYTES", 100)
+def test_a_chunk_within_the_limit_is_read_whole(tmp_path: Path, packing: str) -> None:
     data = DESCRIBED + b"".join(map(message, range(1, 200)))
     for indexed in (True, False):
         path = tmp_path / f"{indexed}.mcap"

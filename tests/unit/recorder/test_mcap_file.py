@@ -141,6 +141,20 @@ def test_files_that_other_programs_write_in_another_way_are_read_as_well(
     assert read_metadata(path) == {}
 
 
+def test_records_that_are_private_to_another_program_are_passed_over(tmp_path: Path) -> None:
+    """In a file without chunks: https://mcap.dev/spec#records leaves opcodes from 0x80 on to applications."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start()
+        channel = writer.register_channel("/x", "json", 0)
+        writer.add_message(channel, 2, b"{}", 2)
+        stream.write(b"\x85" + (3).to_bytes(8, "little") + b"abc")
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()  # type: ignore[no-untyped-call]
+    assert [entry.log_time_ns for entry in read_messages(path)] == [1, 2]
+
+
 def test_a_recording_is_never_written_over(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", [])
     with pytest.raises(InputError, match=r"run.mcap: exists already and is not overwritten"):
