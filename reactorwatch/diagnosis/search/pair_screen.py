@@ -20,7 +20,7 @@ from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.bounded_least_squares import solve_bounded
 from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, PiecewiseLinear, Sine
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.screen import KNOTS, Screen, all_finite
+from reactorwatch.diagnosis.search.screen import KNOTS, Part, Screen, all_finite, first_of_each
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect
 
@@ -37,17 +37,17 @@ class CandidatePair:
     """Two causes with profiles that may explain the innovations.
 
     Attributes:
-        parts: for each the effect, its profile and initial parameters.
+        parts: the causes with initial parameters.
         score: predicted gain in BIC.
     """
 
-    parts: tuple[tuple[Effect, FittedProfile, Array], ...]
+    parts: tuple[Part, ...]
     score: float
 
     @property
     def causes(self) -> frozenset[str]:
         """Names of the causes."""
-        return frozenset(effect.name for effect, _, _ in self.parts)
+        return frozenset(part.effect.name for part in self.parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,7 @@ class PairScreen:
         result: dict[tuple[str, float], Block] = {}
         curves = [block for block in blocks if block.profile is self._free]
         by_gain = sorted(curves, key=lambda block: -_gain(block.columns, w)[0])
-        strongest = _of_different_causes(by_gain)[:REMOVED_CAUSES]
+        strongest = first_of_each(by_gain, lambda block: block.effect.name)[:REMOVED_CAUSES]
         for residual in [w, *(w - block.columns @ _gain(block.columns, w)[1] for block in strongest)]:
             about = replace(dynamics, w=residual.reshape(dynamics.w.shape))
             candidates = self._screen.sine_candidates(about, self._screen.static_effects)
@@ -225,9 +225,9 @@ class DynamicSignature:
     g: Array
 
 
-def _part(block: Block, by: Array) -> tuple[Effect, FittedProfile, Array]:
+def _part(block: Block, by: Array) -> Part:
     parameters = np.concatenate([by * (1.0 if block.size is None else block.size), block.shape])
-    return block.effect, block.profile, block.profile.clip(parameters, block.effect.lower, block.effect.upper)
+    return Part(block.effect, block.profile, block.profile.clip(parameters, block.effect.lower, block.effect.upper))
 
 
 def _range(block: Block) -> tuple[Array, Array]:
@@ -242,10 +242,3 @@ def _range(block: Block) -> tuple[Array, Array]:
 def _gain(columns: Array, w: Array) -> tuple[float, Array]:
     unbounded = np.full(columns.shape[1], inf)
     return solve_bounded(columns.T @ columns, columns.T @ w, -unbounded, unbounded)
-
-
-def _of_different_causes(blocks: Sequence[Block]) -> list[Block]:
-    result: dict[str, Block] = {}
-    for block in blocks:
-        result.setdefault(block.effect.name, block)
-    return list(result.values())
