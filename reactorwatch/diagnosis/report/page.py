@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import PurePath
 from shlex import quote
-from types import MappingProxyType
 
 import jinja2
 
@@ -40,9 +39,6 @@ _PAGES = jinja2.Environment(
 )
 
 
-NO_ORIGIN: Mapping[str, str] = MappingProxyType({})
-
-
 def as_page(
     diagnosis: Diagnosis,
     model: ProcessModel,
@@ -52,7 +48,7 @@ def as_page(
     experiment_file: str = "experiment.csv",
     *,
     on_the_bus: bool = True,
-    origin: Mapping[str, str] = NO_ORIGIN,
+    origin: Mapping[str, str] | None = None,
 ) -> str:
     """Page as HTML.
 
@@ -64,7 +60,7 @@ def as_page(
         model_file: name of the extended model's file.
         experiment_file: name of the proposed input's file.
         on_the_bus: true if there are nodes that could use the model.
-        origin: when and from what the page was made, by name; empty: not stated.
+        origin: when and from what the page was made, by name; None: not stated.
 
     Raises:
         ValueError: the diagnosis has no curves.
