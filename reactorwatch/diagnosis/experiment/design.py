@@ -186,15 +186,9 @@ class _ExperimentSearch:
     def _evaluate(
         self, sequence: InputSequence, expected: Array | None = None, least: Array | None = None
     ) -> _Trial | None:
-        """Evidence of one pattern.
+        """Evidence of one pattern; pairs with little are evaluated first.
 
-        Args:
-            sequence: the input.
-            expected: evidence between each pair; pairs with little are evaluated first.
-            least: evidence that each pair must exceed.
-
-        Returns:
-            None if the outputs leave their limits, or a pair has no more evidence than `least`.
+        None if the outputs leave their limits, or a pair has no more evidence than `least`.
         """
         levels = self._levels(sequence, 1)
         runs = self._alternatives.runs(levels)

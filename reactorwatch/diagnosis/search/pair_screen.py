@@ -51,15 +51,10 @@ class CandidatePair:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
-    """Columns of one cause with one kind of profile.
+class _Block:
+    """Columns of one cause with a profile at nonlinear parameters, shape (values, n_linear).
 
-    Attributes:
-        effect: the cause.
-        profile: profile of the effects.
-        shape: nonlinear parameters of the profile.
-        size: magnitude at a coefficient of 1, of an effect with internal states; None: 1.
-        columns: signature of each basis function, shape (values, n_linear).
+    An effect with internal states has a size: its magnitude at a coefficient of 1.
     """
 
     effect: Effect
@@ -101,14 +96,14 @@ class PairScreen:
             return []
         return self._rank(blocks, w, count)
 
-    def _static_blocks(self, dynamics: ErrorDynamics) -> Iterator[Block]:
+    def _static_blocks(self, dynamics: ErrorDynamics) -> Iterator[_Block]:
         """Every static effect as a constant and as a curve."""
         interval_mean, sample_value = self._free.basis_signals(np.empty(0))[:2]
         for cause, effect in enumerate(self._screen.static_effects):
             g = signatures.forward_signatures(dynamics, cause, interval_mean[1:-1], sample_value[2:]).reshape(-1, KNOTS)
             yield from self._blocks_of(effect, None, g)
 
-    def _dynamic_blocks(self, dynamic: Sequence["DynamicSignature"], w: Array) -> Iterator[Block]:
+    def _dynamic_blocks(self, dynamic: Sequence["DynamicSignature"], w: Array) -> Iterator[_Block]:
         """Every effect with internal states as a constant at each magnitude, and as a curve at the best of them."""
         hats = self._free.basis_functions(np.empty(0))[0][2:]
         for effect in dict.fromkeys(item.effect for item in dynamic):
@@ -123,14 +118,14 @@ class PairScreen:
                 if gain == best:
                     yield curve
 
-    def _blocks_of(self, effect: Effect, size: float | None, g: Array) -> Iterator[Block]:
+    def _blocks_of(self, effect: Effect, size: float | None, g: Array) -> Iterator[_Block]:
         if np.all(np.isfinite(g)):
-            yield Block(effect, self._constant, np.empty(0), size, g.sum(axis=1, keepdims=True))
-            yield Block(effect, self._free, np.empty(0), size, g)
+            yield _Block(effect, self._constant, np.empty(0), size, g.sum(axis=1, keepdims=True))
+            yield _Block(effect, self._free, np.empty(0), size, g)
 
-    def _sine_blocks(self, dynamics: ErrorDynamics, blocks: Sequence[Block], w: Array) -> Iterator[Block]:
+    def _sine_blocks(self, dynamics: ErrorDynamics, blocks: Sequence[_Block], w: Array) -> Iterator[_Block]:
         """Sines that stand out, also once the best other cause is removed."""
-        result: dict[tuple[str, float], Block] = {}
+        result: dict[tuple[str, float], _Block] = {}
         curves = [block for block in blocks if block.profile is self._free]
         by_gain = sorted(curves, key=lambda block: -_gain(block.columns, w)[0])
         strongest = first_of_each(by_gain, lambda block: block.effect.name)[:REMOVED_CAUSES]
@@ -146,10 +141,10 @@ class PairScreen:
                     interval_mean, sample_value = self._sine.basis_signals(period)[:2]
                     cause = self._screen.static_effects.index(candidate.effect)
                     g = signatures.forward_signatures(about, cause, interval_mean[1:-1], sample_value[2:])
-                    result[key] = Block(candidate.effect, self._sine, period, None, g.reshape(-1, 2))
+                    result[key] = _Block(candidate.effect, self._sine, period, None, g.reshape(-1, 2))
         yield from result.values()
 
-    def _rank(self, blocks: Sequence[Block], w: Array, count: int) -> list[CandidatePair]:
+    def _rank(self, blocks: Sequence[_Block], w: Array, count: int) -> list[CandidatePair]:
         """Best candidate of each pair of causes.
 
         Bounds only reduce a gain, so the bounded gain is computed for the most promising pairs alone, until the others
@@ -180,7 +175,7 @@ class PairScreen:
         return sorted(result, key=lambda item: -item.score)[:count]
 
     def _bound_gains(
-        self, blocks: Sequence[Block], places: Sequence[NDArray[np.int64]], gram: Array, by: Array
+        self, blocks: Sequence[_Block], places: Sequence[NDArray[np.int64]], gram: Array, by: Array
     ) -> list[tuple[float, int, int]]:
         """Gain in BIC of any two blocks without bounds, the largest first."""
         of_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
@@ -225,12 +220,12 @@ class DynamicSignature:
     g: Array
 
 
-def _part(block: Block, by: Array) -> Part:
+def _part(block: _Block, by: Array) -> Part:
     parameters = np.concatenate([by * (1.0 if block.size is None else block.size), block.shape])
     return Part(block.effect, block.profile, block.profile.clip(parameters, block.effect.lower, block.effect.upper))
 
 
-def _range(block: Block) -> tuple[Array, Array]:
+def _range(block: _Block) -> tuple[Array, Array]:
     """Bounds of the coefficients. Internal states are not linear far beyond a magnitude that was evaluated."""
     effect, count = block.effect, block.columns.shape[1]
     lower, upper = (effect.lower, effect.upper) if not isinstance(block.profile, Sine) else (-inf, inf)

@@ -185,11 +185,7 @@ class Search:
     def _alternate(
         self, best: FittedHypothesis, by_label: dict[Label, FittedHypothesis], dynamic_candidates: Sequence[Candidate]
     ) -> dict[Label, FittedHypothesis]:
-        """Estimate noise levels and search hypotheses in turn.
-
-        Returns:
-            All that were fitted with the noise levels of the best.
-        """
+        """Estimate noise levels and search in turn; returns all that were fitted with the noise levels of the best."""
         searched: FittedHypothesis | None = None
         dropped = set[Label]()
         for _ in range(ROUNDS):
