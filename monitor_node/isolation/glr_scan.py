@@ -129,9 +129,8 @@ class GlrScan:
         part = slice(first, rows - 1)
         dynamics = ErrorDynamics(*(getattr(dynamics, item.name)[part] for item in fields(dynamics)))
         step = np.diff(times[first:rows])[None]
-        result = signatures.onset_scan(dynamics, step, np.ones_like(step), 0.5 * step)
-        a = np.stack([result.step_a, result.other_a[0]], axis=1)
-        b = np.stack([result.step_b, result.other_b[0]], axis=1)
+        both = signatures.onset_scan(dynamics, step, np.ones_like(step), 0.5 * step)
+        a, b = (np.ascontiguousarray(np.swapaxes(item, 0, 1)) for item in both)
         size = a / np.maximum(b, 1e-300)
         # The linear size of a very nonlinear cause may be beyond a bound though a possible size does the same: the less
         # heat transfer, the more a reduction does. So it keeps its ratio; a size of the wrong sign has none.

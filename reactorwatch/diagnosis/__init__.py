@@ -3,7 +3,7 @@
 `diagnose` does it all; the parts, from the bottom up:
 
 - `fitting`: `profiles` of a deviation in time, the `augmented_model` and its `filter`, linearised `signatures`,
-  and `hypothesis`: effects with profiles, fitted to a run.
+  and `hypothesis`: effects with profiles, fitted to a run; `simulation`: parameters of a model, fitted to a run.
 - `search`: `screen` finds hypotheses worth fitting; `search` the best of them and its alternatives.
 - `law`: smooth corrections in each place of the process locate an unknown, and formulas give its law.
 - `unknown_input`: `localise` does so for a disturbance that wanders in time.

@@ -35,22 +35,25 @@ def curves_of(
     hypothesis, signals = best.hypothesis, best.hypothesis.signals(best.fit)
     offsets = hypothesis.offsets(best.fit)
     deviation, deviation_sd = {}, {}
-    for effect, profile, parameters, signal, part in zip(
-        hypothesis.filter.effects, hypothesis.profiles, best.fit.parameters, signals, covariances, strict=True
-    ):
-        slope = profile.derivatives(parameters, profile.difference_steps).sample_value
-        deviation[effect.name], n = signal.sample_value, profile.n_shape
-        deviation_sd[effect.name] = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, part[:n, :n], slope), 0.0))
+    for part, signal, covariance in zip(best.parts, signals, covariances, strict=True):
+        slope = part.profile.derivatives(part.parameters, part.profile.difference_steps).sample_value
+        deviation[part.effect.name], n = signal.sample_value, part.profile.n_shape
+        variance = np.einsum("ki,ij,kj->k", slope, covariance[:n, :n], slope)
+        deviation_sd[part.effect.name] = np.sqrt(np.maximum(variance, 0.0))
     before = simulate_outputs(run, nominal.hypothesis.filter, (), offsets)
     after = before if best is nominal else simulate_outputs(run, hypothesis.filter, signals, offsets)
+
+    def by_output(values: Array) -> dict[str, Array]:
+        return dict(zip(outputs, values.T, strict=True))
+
     return Curves(
         run.time_min,
         dict(zip(model.input_names, run.inputs.T, strict=True)),
-        dict(zip(outputs, whole.measured.T, strict=True)),
-        dict(zip(outputs, before.T, strict=True)),
-        dict(zip(outputs, after.T, strict=True)),
-        dict(zip(outputs, _standardise(nominal).T, strict=True)),
-        dict(zip(outputs, _standardise(best).T, strict=True)),
+        by_output(whole.measured),
+        by_output(before),
+        by_output(after),
+        by_output(_standardise(nominal)),
+        by_output(_standardise(best)),
         deviation,
         deviation_sd,
     )

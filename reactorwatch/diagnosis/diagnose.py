@@ -207,21 +207,14 @@ def diagnose(
 
 
 def _is_unknown(unknown: Localised, result: SearchResult, best: FittedHypothesis, run: Run, log_p: float) -> bool:
-    """Return true if the catalogue does not explain the run but an unknown would.
-
-    Args:
-        unknown: the localised unknown.
-        result: result of the search.
-        best: best hypothesis of the catalogue.
-        run: the record.
-        log_p: minus the decimal logarithm of the p-value that its innovations are white.
-    """
+    """Return true if the catalogue, whose best residual is white with this p-value, does not explain the run."""
     better = unknown.is_better(best)
     if log_p < WHITE:
         return better and bool(best.label)
     if not best.label or log_p >= (MUCH_RESIDUAL if len(best.label) == 1 else MUCH_RESIDUAL_OF_TWO):
         return True
-    return better or not is_near_noise(evaluate_holdout(run, result.nominal, best)[1], _sensor_sd(result))
+    sensor_sd = result.noise.sensor_sd(result.nominal.hypothesis.filter.model.output_names)
+    return better or not is_near_noise(evaluate_holdout(run, result.nominal, best)[1], sensor_sd)
 
 
 def _may_be_unknown(result: SearchResult, best: FittedHypothesis, model: ProcessModel) -> bool:
@@ -253,10 +246,6 @@ def _seems_noisy(result: SearchResult, model: ProcessModel) -> bool:
     own = result.noise.process_sd[: len(model.states)]  # uncertain parameters follow, which are constant
     shares = (sd / state.scale for sd, state in zip(own, model.states, strict=True))
     return max(shares) > NOISY_SHARE
-
-
-def _sensor_sd(result: SearchResult) -> Array:
-    return result.noise.sensor_sd(result.nominal.hypothesis.filter.model.output_names)
 
 
 def _keep_memory() -> None:
@@ -312,8 +301,9 @@ def _noise_sd(result: SearchResult, run: Run, model: ProcessModel, curves: Curve
     if verdict != UNKNOWN:
         return result.noise.sensor_sd(model.output_names)
     simulated = np.column_stack([curves.simulated_before[name] for name in model.output_names])
-    period_min = float(np.median(np.diff(run.time_min)))
-    return estimate_sensor_noise(result.noise, model.output_names, run.measured - simulated, run.measured, period_min)
+    return estimate_sensor_noise(
+        result.noise, model.output_names, run.measured - simulated, run.measured, run.period_min
+    )
 
 
 def _alternative(search: Search, item: FittedHypothesis, noise: Noise, best_bic: float, record: Record) -> Alternative:

@@ -103,10 +103,9 @@ def causes_of(best: FittedHypothesis, covariances: Sequence[Array]) -> list[Caus
         best: fitted hypothesis.
         covariances: covariance of each effect's parameters.
     """
-    hypothesis, causes = best.hypothesis, []
-    for effect, profile, fitted, part in zip(
-        hypothesis.filter.effects, hypothesis.profiles, best.fit.parameters, covariances, strict=True
-    ):
+    causes = []
+    for item, part in zip(best.parts, covariances, strict=True):
+        effect, profile, fitted = item.effect, item.profile, item.parameters
         value = profile.profile_values(fitted)
         slope = {name: np.zeros(fitted.size) for name in value}
         for index in range(fitted.size):
@@ -121,9 +120,9 @@ def causes_of(best: FittedHypothesis, covariances: Sequence[Array]) -> list[Caus
             )
             for name, number in value.items()
         }
-        for index, item in enumerate(profile.constants, start=profile.n_shape):
+        for index, constant in enumerate(profile.constants, start=profile.n_shape):
             sd = sqrt(max(float(part[index, index]), 0.0))
-            parameters[item.name] = Estimate(float(fitted[index]), sd, item.unit)
+            parameters[constant.name] = Estimate(float(fitted[index]), sd, constant.unit)
         causes.append(
             Cause(effect.name, profile.name, effect.labels.get(profile.name, effect.label), effect.location, parameters)
         )

@@ -98,14 +98,17 @@ def is_near_noise(errors: Errors, noise_sd: Array) -> bool:
 
 
 def _onsets(best: FittedHypothesis) -> list[float]:
-    parameters = (
-        profile.profile_values(fitted)
-        for profile, fitted in zip(best.hypothesis.profiles, best.fit.parameters, strict=True)
-    )
+    parameters = (part.profile.profile_values(part.parameters) for part in best.parts)
     return [item["onset"] for item in parameters if "onset" in item]
 
 
-def simulate_outputs(run: Run, ekf: FaultFilter, signals: Sequence[Signal], offsets: Mapping[str, float]) -> Array:
+def simulate_outputs(
+    run: Run,
+    ekf: FaultFilter,
+    signals: Sequence[Signal],
+    offsets: Mapping[str, float],
+    result: FilterResult | None = None,
+) -> Array:
     """Simulated outputs, shape (rows, n_y); NaN where the simulation diverged.
 
     The first rows, and those after a restart of the plant, are the filter's predictions.
@@ -115,13 +118,9 @@ def simulate_outputs(run: Run, ekf: FaultFilter, signals: Sequence[Signal], offs
         ekf: filter of the model.
         signals: deviations in it.
         offsets: offsets of uncertain parameters, by name.
+        result: run of the filter, if it is known.
     """
-    return _simulate(run, ekf, signals, ekf.evaluate(run, signals).innovations, offsets)
-
-
-def _simulate(
-    run: Run, ekf: FaultFilter, signals: Sequence[Signal], result: FilterResult, offsets: Mapping[str, float]
-) -> Array:
+    result = ekf.evaluate(run, signals).innovations if result is None else result
     outputs = np.array(result.prediction)
     whole = ekf.full_model
     inputs = whole.inputs(run.time_min, run.inputs, signals)
@@ -145,13 +144,14 @@ def _errors(
     run: Run, hidden: Array, ekf: FaultFilter, signals: Sequence[Signal], offsets: Mapping[str, float]
 ) -> Errors:
     result = ekf.evaluate(run, signals).innovations
-    free = _simulate(run, ekf, signals, result, offsets)
+    free = simulate_outputs(run, ekf, signals, offsets, result)
     with np.errstate(invalid="ignore"):
         values = hidden[:, None] & np.isfinite(run.measured)
-        return Errors(_rms((run.measured - free)[hidden]), _rms(result.residual[hidden]), values)
+        return Errors(rms((run.measured - free)[hidden]), rms(result.residual[hidden]), values)
 
 
-def _rms(values: Array) -> Array:
-    offsets = np.isfinite(values)
-    count = np.maximum(offsets.sum(axis=0), 1)
-    return np.where(offsets.any(axis=0), np.sqrt(np.sum(np.where(offsets, values, 0.0) ** 2, axis=0) / count), np.nan)
+def rms(values: Array) -> Array:
+    """Root mean square of the finite values of each column; NaN if there is none."""
+    finite = np.isfinite(values)
+    squares = np.sum(np.where(finite, values, 0.0) ** 2, axis=0)
+    return np.where(finite.any(axis=0), np.sqrt(squares / np.maximum(finite.sum(axis=0), 1)), np.nan)

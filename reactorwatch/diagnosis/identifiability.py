@@ -112,10 +112,8 @@ def _least_noncentrality(threshold: float) -> float:
 def _static(search: Search, hypothesis: Hypothesis, fit: Fit, wanted: float) -> list[Visibility]:
     """Effects without internal states, to first order."""
     dynamics = search.screen.dynamics_of_all(hypothesis, fit, ())
-    ones = np.ones((search.run.time_min.size - 2, 1))
-    result = []
-    for index, effect in enumerate(search.screen.static_effects):
-        g = signatures.forward_signatures(dynamics, index, ones, ones).ravel()
+    effects, result = search.screen.static_effects, []
+    for effect, g in zip(effects, signatures.constant_signatures(dynamics, len(effects)).T.copy(), strict=True):
         size = sqrt(wanted / max(float(g @ g), 1e-300))
         signs = [sign for sign in (1.0, -1.0) if effect.lower <= sign * size <= effect.upper and np.all(np.isfinite(g))]
         smallest = size if signs else float("nan")

@@ -17,21 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.bounded_least_squares import solve_bounded
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import (
-    HUBER,
-    FaultFilter,
-    FilterEvaluation,
-    error_dynamics_between,
-)
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvaluation
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
-from reactorwatch.diagnosis.holdout import evaluate_holdout, holdout_rows, is_near_noise
+from reactorwatch.diagnosis.fitting.simulation import FittedSimulation
+from reactorwatch.diagnosis.holdout import evaluate_holdout, holdout_rows, is_near_noise, rms
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult
-from reactorwatch.kalman.error_dynamics import ErrorLinearization
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
@@ -192,11 +186,11 @@ class _SimulationFitter:
         run: Run,
         known: Mapping[str, float],
     ) -> None:
-        self._extended, self._run = model, run
+        extended = model
         for effect in effects:
-            self._extended = effect.extend(self._extended)
+            extended = effect.extend(extended)
         self.names = (*(name for effect in effects for name in _names(effect)), *uncertain)
-        parameters = [self._extended.parameter(name) for name in self.names]
+        parameters = [extended.parameter(name) for name in self.names]
         self._lower = np.array([item.lower for item in parameters])
         self._upper = np.array([item.upper for item in parameters])
         self._mean = np.array([item.value for item in parameters])
@@ -211,11 +205,7 @@ class _SimulationFitter:
             for shift in shifts
         ]
         sd = [max(float(np.nanstd(column)), 1e-12) for column in run.measured.T]
-        self._ekf = FaultFilter(self._extended, (), self._noise(sd), float(np.median(np.diff(run.time_min))))
-        if not run.breaks:
-            self._ekf.limit(None)
-        symbols = [item.symbol for item in parameters]
-        self._errors = ErrorLinearization(self._extended, self._ekf.noise_levels, symbols, symbols)
+        self._simulation = FittedSimulation(extended, self.names, run, _sensor_noise(sd, extended))
 
     def fit(self) -> tuple[Array, FilterEvaluation] | None:
         """Parameters and run of the best fit; None if every start diverges."""
@@ -224,8 +214,9 @@ class _SimulationFitter:
             return None
         best = min(tried, key=lambda item: self._loss(*item))
         for _ in range(ROUNDS):
-            residual = self._run.measured - best[1].innovations.prediction
-            self._ekf.noise = self._noise(np.maximum(_rms(residual), 1e-12).tolist())
+            residual = self._simulation.run.measured - best[1].innovations.prediction
+            ekf = self._simulation.ekf
+            ekf.noise = _sensor_noise(np.maximum(_rms(residual), 1e-12).tolist(), ekf.model)
             best = self._climb(best[0], STEPS) or best
         return best
 
@@ -235,10 +226,10 @@ class _SimulationFitter:
 
     def fit_without(self, hidden: NDArray[np.bool_], start: Array) -> FilterEvaluation:
         """Run of a fit to the other rows."""
-        whole, seen = self._run, np.where(hidden[:, None], np.nan, self._run.measured)
-        self._run = replace(whole, measured=seen)
+        whole = self._simulation.run
+        self._simulation.run = replace(whole, measured=np.where(hidden[:, None], np.nan, whole.measured))
         fitted = self._climb(start, STEPS)
-        self._run = whole
+        self._simulation.run = whole
         return self._evaluate(start) if fitted is None else fitted[1]
 
     def _climb(self, p: Array, steps: int) -> tuple[Array, FilterEvaluation] | None:
@@ -265,25 +256,17 @@ class _SimulationFitter:
         return best
 
     def _evaluate(self, p: Array) -> FilterEvaluation:
-        self._ekf.set_changes(dict(zip(self.names, p.tolist(), strict=True)))
-        return self._ekf.evaluate(self._run, ())
+        return self._simulation.evaluate(self._values(p))
+
+    def _values(self, p: Array) -> dict[str, float]:
+        return dict(zip(self.names, p.tolist(), strict=True))
 
     def _loss(self, p: Array, evaluation: FilterEvaluation) -> float:
         return evaluation.loss + 0.5 * float(np.sum(self._weight * (p - self._mean) ** 2))
 
     def _normal_equations(self, p: Array, evaluation: FilterEvaluation) -> tuple[Array, Array]:
-        self._errors.noise = self._ekf.noise_levels
-        self._errors.changes = dict(zip(self.names, p.tolist(), strict=True))
-        inputs, used = self._ekf.inputs(self._run, ()), self._ekf.used_values(self._run)
-        dynamics = error_dynamics_between(self._errors, self._run, inputs, evaluation.innovations, used)
-        g = signatures.constant_signatures(dynamics, p.size)
-        w = np.nan_to_num(evaluation.w[2:]).ravel()
-        weights = HUBER / np.maximum(np.abs(w), HUBER)
-        information = g.T @ (g * weights[:, None]) + np.diag(self._weight)
-        return information, g.T @ (weights * w) - self._weight * (p - self._mean)
-
-    def _noise(self, sd: Sequence[float]) -> Noise:
-        return Noise(tuple(sd), (0.0,) * len(self._extended.states))
+        information, gradient = self._simulation.normal_equations(self._values(p), evaluation)
+        return information + np.diag(self._weight), gradient - self._weight * (p - self._mean)
 
 
 def _names(effect: Effect) -> tuple[str, ...]:
@@ -300,10 +283,7 @@ def _prior_sds(effect: Effect) -> dict[str, float]:
 def _starts(effect: Effect, values: Array, first: int) -> list[Array]:
     """Initial parameters: the neutral size; of an effect with constants a typical one, at all their start values.
 
-    Args:
-        effect: the effect.
-        values: values of all parameters.
-        first: index of the effect's size.
+    The effect's parameters begin at the index `first` of the values.
     """
     if not effect.constants and not effect.start_values:
         return [values]
@@ -328,24 +308,26 @@ def _as_result(
     """Hypotheses of lasting causes without process noise, about the uncertain parameters of the first."""
     run, best = search.run, fits[0]
     about = model.with_values({name: best.values[name] for name in uncertain})
-    constant, noise = Constant(run.time_min), Noise(tuple(best.error_sd.tolist()), (0.0,) * len(about.states))
-    period_min = float(np.median(np.diff(run.time_min)))
+    constant, noise = Constant(run.time_min), _sensor_noise(best.error_sd.tolist(), about)
     items = []
     for fit in fits:
         profiles = (constant,) * len(fit.effects)
-        hypothesis = Hypothesis(FaultFilter(about, fit.effects, noise, period_min), profiles)
+        hypothesis = Hypothesis(FaultFilter(about, fit.effects, noise, run.period_min), profiles)
         start = [np.array([fit.values[name] for name in _names(effect)]) for effect in fit.effects]
         fitted = hypothesis.evaluate(run, start) if fit is best else hypothesis.fit(run, start)
         items.append(search.score_fit(hypothesis, fitted))
-    nominal = Hypothesis(FaultFilter(about, (), noise, period_min), ())
+    nominal = Hypothesis(FaultFilter(about, (), noise, run.period_min), ())
     without = search.score_fit(nominal, nominal.evaluate(run, ()))
     ordered = [items[0], *sorted(items[1:], key=lambda item: item.bic)]
     sds = {name: best.sds[name] for name in uncertain}
     return LastingResult(SearchResult(noise, noise, without, ordered), sds)
 
 
+def _sensor_noise(sd: Sequence[float], model: ProcessModel) -> Noise:
+    """Noise levels without process noise."""
+    return Noise(tuple(sd), (0.0,) * len(model.states))
+
+
 def _rms(errors: Array) -> Array:
-    """Root mean square of the finite errors of each output; infinite if there is none, as the simulation diverged."""
-    count = np.sum(np.isfinite(errors), axis=0)
-    mean = np.nansum(np.where(np.isfinite(errors), np.square(errors), 0.0), axis=0) / np.maximum(count, 1)
-    return np.asarray(np.where(count > 0, np.sqrt(mean), np.inf))
+    """Root mean square error of each output; infinite where the simulation diverged."""
+    return np.nan_to_num(rms(errors), nan=np.inf, posinf=np.inf)

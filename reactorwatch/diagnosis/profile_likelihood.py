@@ -103,15 +103,7 @@ def _leave_local_optimum(search: Search, best: FittedHypothesis, index: int) -> 
 
 
 class _Scan:
-    """Scan of the likelihood along one parameter.
-
-    Args:
-        search: search of the run.
-        index: index of the effect.
-        number: index of the parameter.
-        reach: initial reach.
-        bounds: bounds of the parameter.
-    """
+    """Scan of the likelihood along one parameter of an effect, from an initial reach on and within bounds."""
 
     def __init__(self, search: Search, index: int, number: int, reach: float, bounds: tuple[float, float]) -> None:
         self._search, self._place, self._number, self._reach, self._bounds = search, index, number, reach, bounds
@@ -200,8 +192,8 @@ def _evaluate(search: Search, best: FittedHypothesis, index: int, number: int, v
 def _evaluate_all(
     search: Search, best: FittedHypothesis, index: int, number: int, values: Sequence[float]
 ) -> list[Fit]:
-    """Evaluate other values of one parameter of one effect in parallel."""
-    thetas = [[item.copy() for item in best.fit.parameters] for _ in values]
-    for parameters, value in zip(thetas, values, strict=True):
-        parameters[index][number] = value
-    return best.hypothesis.evaluate_all(search.run, thetas)
+    """Evaluate other values of one parameter of one effect."""
+    tried = [best.fit.parameters[index].copy() for _ in values]
+    for parameters, value in zip(tried, values, strict=True):
+        parameters[number] = value
+    return list(best.hypothesis.evaluate_values(search.run, best.fit, index, tried))

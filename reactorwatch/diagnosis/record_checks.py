@@ -87,12 +87,9 @@ def make_run(record: Record, model: ProcessModel) -> Run:
 def _breaks(
     time_min: Array, inputs: Array, finite: NDArray[np.bool_]
 ) -> tuple[tuple[int, ...], NDArray[np.intp] | None]:
-    """Rows after a gap in which the inputs changed at an unknown time.
+    """Rows after too long a gap in which the inputs changed at an unknown time; of the other gaps, `Run.missing`.
 
     In a record with irregular rows none counts as missing.
-
-    Returns:
-        Rows after gaps that are too long, and the number of missing rows before the others (see `Run.missing`).
     """
     step = np.diff(time_min)
     period = float(np.median(step))

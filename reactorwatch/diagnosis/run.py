@@ -1,6 +1,7 @@
 """A measured run as input of a diagnosis."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,11 @@ class Run:
     def values(self) -> int:
         """Number of measured values."""
         return int(np.count_nonzero(np.isfinite(self.measured)))
+
+    @cached_property
+    def period_min(self) -> float:
+        """Median sampling period."""
+        return float(np.median(np.diff(self.time_min)))
 
     @property
     def span_min(self) -> float:

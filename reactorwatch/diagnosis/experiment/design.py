@@ -3,7 +3,7 @@
 Every candidate input is simulated under every alternative with the full nonlinear equations. If an output comes nearer
 to its limits than `MARGIN_SD` standard deviations of its noise under any of them, the input is shrunk or dropped. Of
 the rest, the best maximises the evidence between the pair that it separates least
-(`reactorwatch.diagnosis.experiment.alternative` defines the evidence). Pairs that no input separates, such as exact
+(`reactorwatch.diagnosis.experiment.predictions` defines the evidence). Pairs that no input separates, such as exact
 twins, do not count, and are reported.
 
 The design is a pattern of `PATTERN_ROWS` rows. It is repeated until every pair is decided with the probability `SURE`:
@@ -17,8 +17,6 @@ from math import log
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.experiment.alternative import decision_probability
-from reactorwatch.diagnosis.experiment.alternatives import Predictions
 from reactorwatch.diagnosis.experiment.input_sequence import (
     QUIET_ROWS,
     InputRange,
@@ -26,6 +24,7 @@ from reactorwatch.diagnosis.experiment.input_sequence import (
     initial_sequences,
     staircase,
 )
+from reactorwatch.diagnosis.experiment.predictions import Predictions, decision_probability
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.result import LISTED, Experiment, ExperimentCurves, Separation
 from reactorwatch.diagnosis.run import Run
@@ -73,16 +72,11 @@ def propose_experiment(
         given: limits by signal.
     """
     predictions = Predictions(hypotheses[:MOST_ALTERNATIVES], run, model, noise, given, PATTERN_ROWS)
-    return ExperimentSearch(predictions, model).search()
+    return _ExperimentSearch(predictions, model).search()
 
 
-class ExperimentSearch:
-    """Search for the input that separates alternatives best.
-
-    Args:
-        alternatives: the alternatives with their limits.
-        model: process model without their causes.
-    """
+class _ExperimentSearch:
+    """Search for the input that separates alternatives best."""
 
     def __init__(self, alternatives: Predictions, model: ProcessModel) -> None:
         self._alternatives, self._model = alternatives, model
@@ -110,11 +104,7 @@ class ExperimentSearch:
         return f"No experiment is proposed: the outputs do not keep {self._describe_limits()} for long enough."
 
     def _size_experiment(self, sequence: InputSequence, in_reach: Array) -> Experiment | None:
-        """Repeat the pattern as often as needed, each with the same evidence.
-
-        Returns:
-            None if the outputs leave their limits.
-        """
+        """Repeat the pattern as often as needed, each with the same evidence; None if outputs leave their limits."""
         runs = self._alternatives.runs(self._levels(sequence, FEWEST))
         if runs is None:
             return None
@@ -196,15 +186,9 @@ class ExperimentSearch:
     def _evaluate(
         self, sequence: InputSequence, expected: Array | None = None, least: Array | None = None
     ) -> _Trial | None:
-        """Evidence of one pattern.
+        """Evidence of one pattern; pairs with little are evaluated first.
 
-        Args:
-            sequence: the input.
-            expected: evidence between each pair; pairs with little are evaluated first.
-            least: evidence that each pair must exceed.
-
-        Returns:
-            None if the outputs leave their limits, or a pair has no more evidence than `least`.
+        None if the outputs leave their limits, or a pair has no more evidence than `least`.
         """
         levels = self._levels(sequence, 1)
         runs = self._alternatives.runs(levels)
@@ -212,7 +196,8 @@ class ExperimentSearch:
             return None
         evidence = np.zeros(len(self._alternatives.pairs)) if expected is None else expected.copy()
         for index in np.argsort(evidence, kind="stable").tolist():
-            evidence[index] = self._alternatives.noncentrality(self._alternatives.pairs[index], runs)
+            true, other = self._alternatives.pairs[index]
+            evidence[index] = self._alternatives.members[other].noncentrality(runs[true])
             if least is not None and evidence[index] <= least[index] and least[index] > 0.0:
                 return None
         return _Trial(sequence, evidence)

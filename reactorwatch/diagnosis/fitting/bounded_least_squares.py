@@ -1,4 +1,4 @@
-"""Bounded least squares from the normal equations."""
+"""Least squares from the normal equations: bounded solutions and covariances."""
 
 import numpy as np
 
@@ -28,3 +28,10 @@ def solve_bounded(gram: Array, by: Array, lowest: Array, highest: Array) -> tupl
             break
         free &= ~beyond
     return float(solution @ (2.0 * by - gram @ solution)), solution
+
+
+def inverse(information: Array) -> Array:
+    """Pseudo-inverse of an information matrix, scaled so that the units of the parameters do not matter."""
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    inner = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    return np.asarray(inner / np.outer(scale, scale))

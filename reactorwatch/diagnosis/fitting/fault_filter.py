@@ -373,6 +373,11 @@ def huber_clip(w: Array) -> Array:
     return np.asarray(np.clip(np.nan_to_num(w), -HUBER, HUBER))
 
 
+def huber_weights(w: Array) -> Array:
+    """Weights with which least squares minimises the Huber loss of normalised innovations."""
+    return np.asarray(HUBER / np.maximum(np.abs(w), HUBER))
+
+
 @jit
 def _huber_likelihood(
     measured: Array, unseen: NDArray[np.bool_], begins: NDArray[np.intp], whitened: Array, sd: Array, least: Array

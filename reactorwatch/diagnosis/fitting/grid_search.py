@@ -8,13 +8,12 @@ plus that of a run with the deviation throughout after it: one run for each magn
 likely ones are fitted.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import chain
 
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.diagnosis.fitting.fault_filter import huber_loss, huber_row_losses
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Fit, Hypothesis
 from reactorwatch.diagnosis.run import Run
@@ -132,9 +131,9 @@ def _onset_grid(run: Run) -> Array:
 def _onset_losses(run: Run, hypothesis: Hypothesis, best: Fit, sizes: Array) -> list[Array]:
     """Approximate loss of each candidate onset up to a constant, for each magnitude."""
     never = huber_row_losses(hypothesis.innovations_without(run, best, 0))
-    always = _evaluate_values(run, hypothesis, best, 0, [np.array([size, run.time_min[0]]) for size in sizes], best)
+    tried = [np.array([size, run.time_min[0]]) for size in sizes]
     result = []
-    for item in always:
+    for item in hypothesis.evaluate_values(run, best, 0, tried, best):
         gained = never - huber_row_losses(item.w)
         result.append(np.cumsum(gained)[run.input_changes[:-1]] - np.sum(gained))
     return result
@@ -147,7 +146,7 @@ def _fit_onsets(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> l
     size, result = best.parameters[0][0], dict[float, Fit]()
     # Before its onset each run is the same as that with the latest onset.
     latest = hypothesis.evaluate(run, (np.array([size, np.max(onsets)]),))
-    for item in _evaluate_values(run, hypothesis, best, 0, [np.array([size, onset]) for onset in onsets], latest):
+    for item in hypothesis.evaluate_values(run, best, 0, [np.array([size, onset]) for onset in onsets], latest):
         result[round(item.loss, 1)] = item
         if len(result) > _ONSETS:
             del result[max(result)]
@@ -160,16 +159,4 @@ def _best_onset(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> F
 
 def _best_of(run: Run, hypothesis: Hypothesis, best: Fit, index: int, several: Sequence[Array]) -> Fit:
     """Best of a fit and of fits with other parameter values of one effect."""
-    return min(chain([best], _evaluate_values(run, hypothesis, best, index, several, best)), key=lambda item: item.loss)
-
-
-def _evaluate_values(
-    run: Run, hypothesis: Hypothesis, best: Fit, index: int, several: Sequence[Array], like: Fit
-) -> Iterator[Fit]:
-    """Evaluate other parameter values of one effect, in batches; `like` as in `Hypothesis.evaluate`."""
-    for begin in range(0, len(several), LANES):
-        thetas = [
-            [values if other == index else item for other, item in enumerate(best.parameters)]
-            for values in several[begin : begin + LANES]
-        ]
-        yield from hypothesis.evaluate_all(run, thetas, like)
+    return min(chain([best], hypothesis.evaluate_values(run, best, index, several, best)), key=lambda item: item.loss)

@@ -8,14 +8,16 @@ Gauss-Newton steps with Levenberg-Marquardt damping. Derivatives come from the f
 Magnitudes of discontinuous effects have no derivatives and are scanned (`grid_search`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.diagnosis.fitting import signatures
-from reactorwatch.diagnosis.fitting.fault_filter import HUBER, FaultFilter, SharedPrefix, huber_clip
+from reactorwatch.diagnosis.fitting.bounded_least_squares import inverse
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, SharedPrefix, huber_clip, huber_weights
 from reactorwatch.diagnosis.fitting.profiles import FittedProfile, Signal
 from reactorwatch.diagnosis.parameter_priors import last_finite_row, offsets
 from reactorwatch.diagnosis.run import Run
@@ -117,6 +119,22 @@ class Hypothesis:
             for parameters, item in zip(possible, results, strict=True)
         ]
 
+    def evaluate_values(
+        self, run: Run, fit: Fit, index: int, several: Sequence[Array], like: Fit | None = None
+    ) -> Iterator[Fit]:
+        """Evaluate other parameters of one effect, in batches; those of the others stay.
+
+        Args:
+            run: the record.
+            fit: fit with the parameters of the other effects.
+            index: index of the effect.
+            several: sets of parameters of the effect.
+            like: see `evaluate`.
+        """
+        sets = [[values if i == index else item for i, item in enumerate(fit.parameters)] for values in several]
+        for begin in range(0, len(sets), LANES):
+            yield from self.evaluate_all(run, sets[begin : begin + LANES], like)
+
     def _clip(self, parameters: Sequence[Array]) -> tuple[Array, ...]:
         return tuple(
             profile.clip(values, effect.lower, effect.upper)
@@ -146,14 +164,11 @@ class Hypothesis:
             w = np.nan_to_num(best.w[2:]).ravel()
             if not np.any(g) or not np.max(np.abs(g)) < _RUNAWAY:
                 break
-            weights = HUBER / np.maximum(np.abs(w), HUBER)
+            weights = huber_weights(w)
             weighted = g * np.sqrt(weights)[:, None]
             squares = signatures.gram_of_columns(weighted) if self.n_parameters > MANY else weighted.T @ weighted
             information, gradient = squares + self._prior_information(), g.T @ (weights * w)
-            for index, deviation, sd in zip(
-                self.constant_indices, self._deviations(best.parameters), self._constant_sds, strict=True
-            ):
-                gradient[index] -= deviation / sd
+            gradient[self.constant_indices] -= self._deviations(best.parameters) / self._constant_sds
             scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
             information, gradient = information / np.outer(scale, scale), gradient / scale
             before = best
@@ -181,9 +196,7 @@ class Hypothesis:
         An onset matters only where something happens, so the derivative by it depends on the difference step. The step
         is about one standard deviation, and at least `first_difference`.
         """
-        dynamics = None
-        if self.filter.delay_index is None:
-            dynamics = self.filter.error_dynamics(run, self.signals_at(fit.parameters), fit.innovations)
+        dynamics = self.error_dynamics(run, fit) if self.filter.delay_index is None else None
         differences = [np.maximum(item, first_difference) for item in self._difference_steps()]
         for _ in range(_WIDENINGS):
             result = self._covariance(self._jacobian(run, fit, differences, dynamics))
@@ -213,9 +226,7 @@ class Hypothesis:
         """Covariance of the parameters from their Jacobian."""
         self.filter.spend(STEPS_PER_COVARIANCE)
         information = g.T @ g + self._prior_information()
-        scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-        inner = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)
-        return np.asarray(inner / np.outer(scale, scale))
+        return inverse(information)
 
     def _prior_information(self) -> Array:
         """Prior information: the width of each parameter's range; of a constant, the standard deviation of its prior.
@@ -226,8 +237,8 @@ class Hypothesis:
         return np.diag(widths**-2.0)
 
     @property
-    def _constant_sds(self) -> list[float]:
-        return [item.sd for profile in self.profiles for item in profile.constants]
+    def _constant_sds(self) -> Array:
+        return np.array([item.sd for profile in self.profiles for item in profile.constants])
 
     def _deviations(self, parameters: Sequence[Array]) -> Array:
         """Deviations of the effects' own constants from the means of their priors, in standard deviations."""
@@ -275,7 +286,7 @@ class Hypothesis:
         """
         late = self.filter.delay_index
         if dynamics is None and (late is None or (rough and len(self.profiles) > 1)):
-            dynamics = self.filter.error_dynamics(run, self.signals_at(fit.parameters), fit.innovations)
+            dynamics = self.error_dynamics(run, fit)
         columns = []
         for index, (profile, values, moved) in enumerate(zip(self.profiles, fit.parameters, differences, strict=True)):
             if index == late or dynamics is None:
@@ -308,7 +319,7 @@ class Hypothesis:
             parameters = [item.copy() for item in fit.parameters]
             parameters[index][number] += steps[number]
             signals.append(self.signals_at(parameters))
-        unchanged = self.signals_at(fit.parameters)
+        unchanged = self.signals(fit)
         shared = [SharedPrefix(fit.innovations, _count_equal_rows(item, unchanged)) for item in signals]
         before, results = huber_clip(fit.w[2:]), self.filter.evaluate_all(run, signals, shared)
         moves = zip(steps[first:], results, strict=True)
@@ -329,9 +340,10 @@ class Hypothesis:
         Returns:
             Shape (values from the third row on, n_linear).
         """
-        dynamics = self.filter.error_dynamics(run, self.signals_at(fit.parameters), fit.innovations)
         interval_mean, sample_value = profile.basis_signals(np.empty(0))[:2]
-        g = signatures.forward_signatures(dynamics, self.input_index(index), interval_mean[1:-1], sample_value[2:])
+        g = signatures.forward_signatures(
+            self.error_dynamics(run, fit), self.input_index(index), interval_mean[1:-1], sample_value[2:]
+        )
         return g.reshape(-1, profile.n_linear)
 
     def input_index(self, index: int) -> int:
@@ -347,7 +359,7 @@ class Hypothesis:
 
     def innovations_without(self, run: Run, fit: Fit, index: int) -> Array:
         """Normalised innovations of a filter without the deviation at this index, shape (rows, n_y)."""
-        signals = self.signals_at(fit.parameters)
+        signals = self.signals(fit)
         signals[index] = Signal(np.zeros(run.time_min.size), np.zeros(run.time_min.size))
         return self.filter.evaluate(run, signals).w
 
@@ -362,6 +374,10 @@ class Hypothesis:
             result.append(np.maximum(before, np.minimum(values, _WIDER * before)))
             begin += profile.n_parameters
         return result
+
+    def error_dynamics(self, run: Run, fit: Fit) -> ErrorDynamics:
+        """Error equations of the filter about a fit."""
+        return self.filter.error_dynamics(run, self.signals(fit), fit.innovations)
 
     def signals(self, fit: Fit) -> list[Signal]:
         """Deviations of the effects at a fit."""

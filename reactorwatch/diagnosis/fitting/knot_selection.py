@@ -26,18 +26,13 @@ GRID = 161
 _RIDGE = 1e-9
 
 
-def fine_grid(time_min: Array) -> PiecewiseLinear:
-    """Piecewise-linear profile on the fine grid."""
-    return PiecewiseLinear(time_min, GRID)
-
-
 def select_knots(
     grid: PiecewiseLinear, run: Run, hypothesis: Hypothesis, fit: Fit, index: int
 ) -> tuple[PiecewiseLinear, Array]:
     """Select the number of knots with the least predicted BIC; return the curve and its values.
 
     Args:
-        grid: profile from `fine_grid` for the record's rows.
+        grid: profile with `GRID` knots for the record's rows.
         run: the record.
         hypothesis: hypothesis with a piecewise-linear profile at `index`; that effect must not delay an output.
         fit: fit of the hypothesis.

@@ -40,11 +40,9 @@ def _refine_onset(run: Run, hypothesis: Hypothesis, best: Fit, index: int, steps
         size, onset_min = best.parameters[index]
         here = int(np.searchsorted(moves_min, onset_min + size, side="right")) - 1
         near = here + NEAR
-        trials = [
-            [np.array([size, onset]) if other == index else item for other, item in enumerate(best.parameters)]
-            for onset in middles_min[near[(near >= 0) & (near < middles_min.size)]]
-        ]
-        likeliest = min(hypothesis.evaluate_all(run, trials, best), key=lambda item: item.loss, default=best)
+        trials = [np.array([size, onset]) for onset in middles_min[near[(near >= 0) & (near < middles_min.size)]]]
+        fits = hypothesis.evaluate_values(run, best, index, trials, best)
+        likeliest = min(fits, key=lambda item: item.loss, default=best)
         if not likeliest.loss < best.loss - LEAST_GAIN:
             break
         best = hypothesis.fit(run, likeliest.parameters, steps)

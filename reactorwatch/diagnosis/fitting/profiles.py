@@ -41,18 +41,16 @@ class Signal(NamedTuple):
 
 @dataclass(frozen=True)
 class NonlinearParameter:
-    """A parameter that shapes the basis functions.
+    """A parameter that shapes the basis functions, in minutes.
 
     Attributes:
         name: name in the profile.
-        unit: unit of its value.
         lower: smallest value.
         upper: largest value.
         difference: smallest step for numerical derivatives.
     """
 
     name: str
-    unit: str
     lower: float
     upper: float
     difference: float
@@ -66,11 +64,13 @@ class FittedProfile(ABC):
 
     Attributes:
         name: name of the profile.
+        shape_names: names of the parameters that shape the basis functions.
         n_linear: number of basis functions.
         constants: constants of the effect's own, which are fitted after the parameters of the profile.
     """
 
     name: ClassVar[str]
+    shape_names: ClassVar[tuple[str, ...]] = ()
     n_linear: int = 1
     constants: tuple[EffectConstant, ...] = ()
 
@@ -80,10 +80,17 @@ class FittedProfile(ABC):
         self.period_min = float(np.median(np.diff(time_min)))
         self._step = np.diff(time_min)
 
-    @property
+    @cached_property
     def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
         """Parameters that shape the basis functions."""
-        return ()
+        period, span, shortest = self.period_min, self.end_min - self.start_min, 5.0 * self.period_min
+        bounds = {
+            "onset": (self.start_min, self.end_min - period, period / 2),
+            "end": (self.start_min + 2.0 * period, self.end_min, period / 2),
+            "time_constant": (shortest, 3.0 * span, 0.1 * shortest),
+            "period": (4.0 * period, span, 1e-5 * span),
+        }
+        return tuple(NonlinearParameter(name, *bounds[name]) for name in self.shape_names)
 
     @property
     def n_shape(self) -> int:
@@ -188,9 +195,6 @@ class FittedProfile(ABC):
     def _clip_linear(self, by: Array, lower: float, upper: float) -> Array:
         return np.clip(by, lower, upper)
 
-    def _onset(self) -> NonlinearParameter:
-        return NonlinearParameter("onset", "min", self.start_min, self.end_min - self.period_min, self.period_min / 2)
-
 
 class Constant(FittedProfile):
     """Constant deviation over the whole record."""
@@ -206,11 +210,7 @@ class Step(FittedProfile):
     """Step at the onset."""
 
     name = "step"
-
-    @property
-    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
-        """See `FittedProfile`."""
-        return (self._onset(),)
+    shape_names = ("onset",)
 
     def basis_functions(self, shape: Array) -> tuple[Array, Array]:
         """See `FittedProfile`."""
@@ -222,11 +222,7 @@ class Ramp(FittedProfile):
     """Linear growth from the onset to the end of the record."""
 
     name = "ramp"
-
-    @property
-    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
-        """See `FittedProfile`."""
-        return (self._onset(),)
+    shape_names: ClassVar[tuple[str, ...]] = ("onset",)
 
     def basis_functions(self, shape: Array) -> tuple[Array, Array]:
         """See `FittedProfile`."""
@@ -235,19 +231,15 @@ class Ramp(FittedProfile):
 
     def profile_values(self, parameters: Array) -> dict[str, float]:
         """See `FittedProfile`."""
-        return super().profile_values(parameters) | {"end": self.end_min}
+        values = super().profile_values(parameters)
+        return values | {"end": values.get("end", self.end_min)}
 
 
 class EndedRamp(Ramp):
     """Linear growth from the onset to an end, constant afterwards."""
 
     name = "ended_ramp"
-
-    @property
-    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
-        """See `FittedProfile`."""
-        first, last = self.start_min + 2.0 * self.period_min, self.end_min
-        return (self._onset(), NonlinearParameter("end", "min", first, last, self.period_min / 2))
+    shape_names = ("onset", "end")
 
     def basis_functions(self, shape: Array) -> tuple[Array, Array]:
         """See `FittedProfile`."""
@@ -256,21 +248,12 @@ class EndedRamp(Ramp):
         after = np.maximum(age - span, 0.0)
         return ((age - after) / span)[:, None], (0.5 * (age**2 - after**2) / span)[:, None]
 
-    def profile_values(self, parameters: Array) -> dict[str, float]:
-        """See `FittedProfile`."""
-        return super(Ramp, self).profile_values(parameters)
-
 
 class Decay(FittedProfile):
     """First-order approach to the final magnitude."""
 
     name = "decay"
-
-    @property
-    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
-        """See `FittedProfile`."""
-        shortest, longest = 5.0 * self.period_min, 3.0 * (self.end_min - self.start_min)
-        return (self._onset(), NonlinearParameter("time_constant", "min", shortest, longest, 0.1 * shortest))
+    shape_names = ("onset", "time_constant")
 
     def basis_functions(self, shape: Array) -> tuple[Array, Array]:
         """See `FittedProfile`."""
@@ -283,13 +266,8 @@ class Sine(FittedProfile):
     """Sine about zero, from the first row on."""
 
     name = "sine"
+    shape_names: ClassVar[tuple[str, ...]] = ("period",)
     n_linear = 2
-
-    @property
-    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
-        """See `FittedProfile`."""
-        span = self.end_min - self.start_min
-        return (NonlinearParameter("period", "min", 4.0 * self.period_min, span, 1e-5 * span),)
 
     def basis_functions(self, shape: Array) -> tuple[Array, Array]:
         """See `FittedProfile`."""
@@ -312,10 +290,7 @@ class Sine(FittedProfile):
 class LateSine(Sine):
     """Sine about zero that sets in at its onset."""
 
-    @property
-    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
-        """See `FittedProfile`."""
-        return (*super().nonlinear_parameters, self._onset())
+    shape_names = ("period", "onset")
 
     def basis_functions(self, shape: Array) -> tuple[Array, Array]:
         """See `FittedProfile`."""

@@ -16,8 +16,6 @@ generalized likelihood ratio approach to the detection and estimation of jumps i
 Control 21).
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from reactorwatch.arrays import Array
@@ -37,22 +35,6 @@ _DEAD = 1e-150
 """Errors of the state below this are set to 0; its square is still a normal number."""
 
 
-class OnsetScan(NamedTuple):
-    """Projections of profiles that set in right after each row.
-
-    Attributes:
-        step_a: sum(w g) of a unit step, shape (rows - 1, causes).
-        step_b: sum(g g) of a unit step, shape (rows - 1, causes).
-        other_a: sum(w g) of each other profile, shape (others, rows - 1, causes).
-        other_b: sum(g g) of each other profile, shape (others, rows - 1, causes).
-    """
-
-    step_a: Array
-    step_b: Array
-    other_a: Array
-    other_b: Array
-
-
 def forward_signatures(dynamics: ErrorDynamics, cause: int, interval_mean: Array, sample_value: Array) -> Array:
     """Signatures of profiles of one cause, shape (rows - 1, n_y, profiles).
 
@@ -62,20 +44,21 @@ def forward_signatures(dynamics: ErrorDynamics, cause: int, interval_mean: Array
         interval_mean: mean deviation from each row to the next, shape (rows - 1, profiles).
         sample_value: deviation at each row but the first, shape (rows - 1, profiles).
     """
-    G, D = np.ascontiguousarray(dynamics.G[:, :, cause]), np.ascontiguousarray(dynamics.D[:, :, cause])
-    return np.asarray(_forward_signatures(*_matrices(dynamics), G, D, interval_mean, sample_value))
+    one = slice(cause, cause + 1)
+    return np.asarray(_forward_signatures(*_matrices(dynamics, one), interval_mean, sample_value))
 
 
 def constant_signatures(dynamics: ErrorDynamics, causes: int) -> Array:
     """Signatures of a unit deviation of each of the first causes in all rows, shape (values, causes)."""
-    G, D = np.ascontiguousarray(dynamics.G[:, :, :causes]), np.ascontiguousarray(dynamics.D[:, :, :causes])
-    return np.asarray(_constant_signatures(*_matrices(dynamics), G, D)).reshape(-1, causes)
+    ones = np.ones((len(dynamics.F), 1))
+    g = _forward_signatures(*_matrices(dynamics, slice(0, causes)), ones, ones)
+    return np.asarray(g).reshape(g.shape[0] * g.shape[1], causes)
 
 
 def gram(dynamics: ErrorDynamics, cause: int, interval_mean: Array, sample_value: Array) -> tuple[Array, Array]:
     """Sums w g of such signatures, shape (profiles,), and g g of each two, shape (profiles, profiles)."""
-    G, D = np.ascontiguousarray(dynamics.G[:, :, cause]), np.ascontiguousarray(dynamics.D[:, :, cause])
-    a, b = _gram(*_matrices(dynamics), G, D, np.ascontiguousarray(dynamics.w), interval_mean, sample_value)
+    one, w = slice(cause, cause + 1), np.ascontiguousarray(dynamics.w)
+    a, b = _gram(*_matrices(dynamics, one), w, interval_mean, sample_value)
     return np.asarray(a), np.asarray(b)
 
 
@@ -93,51 +76,38 @@ def gram_of_columns(columns: Array) -> Array:
 
 def adjoint(dynamics: ErrorDynamics) -> tuple[Array, Array]:
     """Derivatives of sum(w g) by each interval's mean and by the value at its end, shapes (rows - 1, causes)."""
-    interval_mean, sample_value = _adjoint(*_matrices(dynamics), *_inputs_and_innovations(dynamics))
+    interval_mean, sample_value = _adjoint(*_matrices(dynamics), np.ascontiguousarray(dynamics.w))
     return np.asarray(interval_mean), np.asarray(sample_value)
 
 
-def onset_scan(dynamics: ErrorDynamics, beta: Array, gamma: Array, mean: Array) -> OnsetScan:
-    """Scan all onsets of a step and of other profiles.
+def onset_scan(dynamics: ErrorDynamics, beta: Array, gamma: Array, mean: Array) -> tuple[Array, Array]:
+    """Scan all onsets of a unit step and of other profiles that set in right after each row.
 
     Args:
         dynamics: error equations between the rows.
         beta: see the module, shape (others, rows - 1).
         gamma: see the module, shape (others, rows - 1).
         mean: the mean deviation of an interval is a + mean b, shape (others, rows - 1).
+
+    Returns:
+        sum(w g) and sum(g g) of the step, then of each other profile, each of shape (1 + others, rows - 1, causes).
     """
-    return OnsetScan(*_onset_scan(*_matrices(dynamics), *_inputs_and_innovations(dynamics), beta, gamma, mean))
+    a, b = _onset_scan(*_matrices(dynamics), np.ascontiguousarray(dynamics.w), beta, gamma, mean)
+    return np.asarray(a), np.asarray(b)
 
 
-def _matrices(dynamics: ErrorDynamics) -> tuple[Array, Array, Array, Array]:
-    return dynamics.F, dynamics.H, dynamics.K, dynamics.whitening
-
-
-def _inputs_and_innovations(dynamics: ErrorDynamics) -> tuple[Array, Array, Array]:
-    return np.ascontiguousarray(dynamics.G), np.ascontiguousarray(dynamics.D), np.ascontiguousarray(dynamics.w)
+def _matrices(dynamics: ErrorDynamics, causes: slice = slice(None)) -> tuple[Array, Array, Array, Array, Array, Array]:
+    G, D = np.ascontiguousarray(dynamics.G[:, :, causes]), np.ascontiguousarray(dynamics.D[:, :, causes])
+    return dynamics.F, dynamics.H, dynamics.K, dynamics.whitening, G, D
 
 
 @jit
 def _forward_signatures(
     F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, interval_mean: Array, sample_value: Array
 ) -> Array:
-    rows, n_x, n_y, profiles = F.shape[0], F.shape[1], H.shape[1], interval_mean.shape[1]
-    result = np.zeros((rows, n_y, profiles))
-    _propagate(F, H, K, whitening, G, D, interval_mean, sample_value, 0, np.zeros((n_x, profiles)), result)
-    return result
-
-
-@jit
-def _constant_signatures(F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array) -> Array:
-    rows, n_x, n_y, causes = F.shape[0], F.shape[1], H.shape[1], G.shape[2]
-    result, e, before = np.zeros((rows, n_y, causes)), np.zeros((n_x, causes)), np.zeros((n_x, causes))
-    innovation, K_minus = np.zeros((n_y, causes)), np.zeros((n_x, n_y))
-    for k in range(rows):
-        before[:], e[:], innovation[:], K_minus[:] = e, G[k], D[k], -K[k]
-        _add(e, F[k], before)
-        _add(innovation, H[k], e)
-        _add(e, K_minus, innovation)
-        _add(result[k], whitening[k], innovation)
+    columns = G.shape[2] * interval_mean.shape[1]
+    result, e = np.zeros((F.shape[0], H.shape[1], columns)), np.zeros((F.shape[1], columns))
+    _propagate(F, H, K, whitening, G, D, interval_mean, sample_value, 0, e, result)
     return result
 
 
@@ -180,41 +150,52 @@ def _propagate(
     e: Array,
     result: Array,
 ) -> None:
-    """Add the signatures of rows from `begin` on to zeros; `e` holds the errors of the state and is updated."""
-    n_x, n_y, profiles = F.shape[1], H.shape[1], interval_mean.shape[1]
-    predicted, innovation = np.zeros((n_x, profiles)), np.zeros((n_y, profiles))
-    for index in range(result.shape[0]):  # profiles innermost, for SIMD
+    """Add the signatures of rows from `begin` on to zeros; `e` holds the errors of the state and is updated.
+
+    The columns are profiles of one cause, or causes with one profile.
+    """
+    n_x, n_y, columns = F.shape[1], H.shape[1], e.shape[1]
+    predicted, innovation = np.zeros((n_x, columns)), np.zeros((n_y, columns))
+    for index in range(result.shape[0]):  # columns innermost, for SIMD
         k = begin + index
+        _multiply(predicted, G, interval_mean, k)
+        _multiply(innovation, D, sample_value, k)
         for i in range(n_x):
-            by = G[k, i]
-            for c in range(profiles):
-                predicted[i, c] = by * interval_mean[k, c]
             for j in range(n_x):
                 by = F[k, i, j]
-                for c in range(profiles):
+                for c in range(columns):
                     predicted[i, c] += by * e[j, c]
         for i in range(n_y):
-            by = D[k, i]
-            for c in range(profiles):
-                innovation[i, c] = by * sample_value[k, c]
             for j in range(n_x):
                 by = H[k, i, j]
-                for c in range(profiles):
+                for c in range(columns):
                     innovation[i, c] += by * predicted[j, c]
         for i in range(n_x):
-            for c in range(profiles):
+            for c in range(columns):
                 e[i, c] = predicted[i, c]
             for j in range(n_y):
                 by = K[k, i, j]
-                for c in range(profiles):
+                for c in range(columns):
                     e[i, c] -= by * innovation[j, c]
-            for c in range(profiles):  # denormal numbers take a hundred times as long to multiply
+            for c in range(columns):  # denormal numbers take a hundred times as long to multiply
                 e[i, c] = e[i, c] if abs(e[i, c]) > _DEAD else 0.0
         for i in range(n_y):
             for j in range(i + 1):
                 by = whitening[k, i, j]
-                for c in range(profiles):
+                for c in range(columns):
                     result[index, i, c] += by * innovation[j, c]
+
+
+@jit
+def _multiply(into: Array, by: Array, profiles: Array, k: int) -> None:
+    """Set to the products of the causes and the profiles of a row; there is one cause or one profile."""
+    for i in range(into.shape[0]):
+        if by.shape[2] == 1:
+            for c in range(into.shape[1]):
+                into[i, c] = by[k, i, 0] * profiles[k, c]
+        else:
+            for c in range(into.shape[1]):
+                into[i, c] = by[k, i, c] * profiles[k, 0]
 
 
 @jit
@@ -287,15 +268,14 @@ def _mix(into: Array, share: float, one: Array, slope: float, other: Array) -> N
 @jit
 def _onset_scan(
     F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, w: Array, beta: Array, gamma: Array, mean: Array
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array]:
     """Backward recursion: with z = (e, a, b) after a row, sum(g g) = z'N z and sum(w g) = n'z.
 
     All causes share N_ee and n_e. Over a row e <- A e + m a + mb b and g = V e + v a + vb b. The parts of a and b come
     from what acts on the state (mg, vg) and on the sensor (md, vd), in other proportions for each other profile.
     """
     rows, n_x, n_y, causes, others = F.shape[0], F.shape[1], H.shape[1], G.shape[2], beta.shape[0]
-    step_a, step_b = np.zeros((rows, causes)), np.zeros((rows, causes))
-    other_a, other_b = np.zeros((others, rows, causes)), np.zeros((others, rows, causes))
+    all_a, all_b = np.zeros((1 + others, rows, causes)), np.zeros((1 + others, rows, causes))
     one = (1, causes)  # scalars of each cause have two axes, too
     N_ee, n_e, N_before, n_before = np.zeros((n_x, n_x)), np.zeros((n_x, 1)), np.zeros((n_x, n_x)), np.zeros((n_x, 1))
     N_ea, N_aa, n_a = np.zeros((n_x, causes)), np.zeros(one), np.zeros(one)
@@ -343,7 +323,7 @@ def _onset_scan(
             _add_transposed(n_b[o], of_row, vb)
             _add_transposed(N_eb[o], A, q)
             _add_transposed(N_eb[o], V, vb)
-            other_a[o, k], other_b[o, k] = n_b[o, 0], N_bb[o, 0]
+            all_a[1 + o, k], all_b[1 + o, k] = n_b[o, 0], N_bb[o, 0]
         q[:] = N_ea
         _add(q, N_ee, m)
         _add_dots(N_aa, m, q)
@@ -354,7 +334,7 @@ def _onset_scan(
         N_ea[:] = 0.0
         _add_transposed(N_ea, A, q)
         _add_transposed(N_ea, V, v)
-        step_a[k], step_b[k] = n_a[0], N_aa[0]
+        all_a[0, k], all_b[0, k] = n_a[0], N_aa[0]
         n_before[:] = 0.0
         _add(NA, N_ee, A)
         _add_transposed(N_before, A, NA)
@@ -363,4 +343,4 @@ def _onset_scan(
         _add_transposed(n_before, V, of_row)
         _mix(N_ee, 0.5, N_before, 0.5, N_before.T)
         n_e[:] = n_before
-    return step_a, step_b, other_a, other_b
+    return all_a, all_b

@@ -7,12 +7,14 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import signatures
+from reactorwatch.diagnosis.fitting.bounded_least_squares import inverse
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
+from reactorwatch.diagnosis.law.fit import ShapeFit
 from reactorwatch.diagnosis.law.path import variables_along
 from reactorwatch.diagnosis.law.shapes import coefficient_effect
-from reactorwatch.diagnosis.law.unknown import FittedLaw, PlaceFit, Unknown
+from reactorwatch.diagnosis.law.unknown import FittedLaw, Unknown
 from reactorwatch.diagnosis.result import LISTED, Estimate, HeldOut, Law, LawCurve, RivalLaw
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
@@ -28,11 +30,12 @@ LEAST_CORRELATION = 0.5
 
 def law_hypothesis(law: FittedLaw, run: Run) -> FittedHypothesis:
     """The law as a hypothesis whose parameters shift those of the law."""
-    shape, period_min = law.fitter.shape, float(np.median(np.diff(run.time_min)))
-    ekf = FaultFilter(shape.model, [coefficient_effect(name) for name in shape.parameters], law.fit.noise, period_min)
-    hypothesis = Hypothesis(ekf, [Constant(run.time_min)] * law.fit.coefficients.size)
-    parameters = tuple(np.array([value]) for value in law.fit.coefficients)
-    return FittedHypothesis(hypothesis, Fit(parameters, *law.fit.evaluation), law.bic)
+    shape, fit = law.fit.shape, law.fit
+    effects = [coefficient_effect(name) for name in shape.parameters]
+    ekf = FaultFilter(shape.model, effects, fit.noise, run.period_min)
+    hypothesis = Hypothesis(ekf, [Constant(run.time_min)] * fit.coefficients.size)
+    parameters = tuple(np.array([value]) for value in fit.coefficients)
+    return FittedHypothesis(hypothesis, Fit(parameters, *fit.evaluation), law.bic)
 
 
 def describe_law(model: ProcessModel, run: Run, found: Unknown, held_out: dict[str, HeldOut]) -> Law:
@@ -46,8 +49,8 @@ def describe_law(model: ProcessModel, run: Run, found: Unknown, held_out: dict[s
     """
     best = found.laws[0]
     law, units = best.law, best.law.units(model)
-    information, _ = best.fitter.normal_equations(best.fit)
-    sd = np.sqrt(np.maximum(np.diag(_inverse(information)), 0.0))
+    information, _ = best.fit.fitter.normal_equations(best.fit)
+    sd = np.sqrt(np.maximum(np.diag(inverse(information)), 0.0))
     parameters = {
         name: Estimate(value, float(sd[index]), units[name])
         for index, (name, value) in enumerate(law.parameters.items())
@@ -86,19 +89,17 @@ def describe_term(place: Place) -> str:
     return f"added to the {'input' if place.kind == INPUT else 'reading of'} {place.of}"
 
 
-def _curves(model: ProcessModel, run: Run, best: FittedLaw, smooth: PlaceFit) -> tuple[LawCurve, ...]:
+def _curves(model: ProcessModel, run: Run, best: FittedLaw, smooth: ShapeFit) -> tuple[LawCurve, ...]:
     """Smooth correction and formula over each variable of the law."""
-    x, law = smooth.fit.evaluation.innovations.x, best.law
-    lag_min = smooth.fit.shape.lag_min(smooth.fit.coefficients)
-    variables = variables_along(model, run, x, best.place, lag_min)
+    x, law = smooth.evaluation.innovations.x, best.law
+    variables = variables_along(model, run, x, best.place, smooth.lag_min)
     formula = find_form(law.form).expression(
         [variables[name] for name in law.variables], list(law.parameters.values()), law.references
     )
-    basis = smooth.fit.shape.basis(x, run.inputs)
-    basis = basis[:, : len(smooth.fit.shape.terms)]
-    active = np.flatnonzero(smooth.fit.coefficients[: basis.shape[1]])
-    information, _ = smooth.fitter.normal_equations(smooth.fit)
-    covariance = _inverse(information[np.ix_(active, active)])
+    basis = smooth.shape.basis(x, run.inputs)[:, : len(smooth.shape.terms)]
+    active = np.flatnonzero(smooth.coefficients[: basis.shape[1]])
+    information, _ = smooth.fitter.normal_equations(smooth)
+    covariance = inverse(information[np.ix_(active, active)])
     known = np.all(np.isfinite(basis), axis=1)
     result = []
     for name in law.variables:
@@ -110,7 +111,7 @@ def _curves(model: ProcessModel, run: Run, best: FittedLaw, smooth: PlaceFit) ->
                 name,
                 unit_of_variable(model, name),
                 _means(variables[name], groups),
-                mean @ smooth.fit.coefficients[active],
+                mean @ smooth.coefficients[active],
                 np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", mean, covariance, mean), 0.0)),
                 _means(formula, groups),
             )
@@ -126,23 +127,17 @@ def _correlations(model: ProcessModel, run: Run, best: FittedLaw) -> dict[str, t
     """The model's parameter that each parameter of the law is correlated with most, if it were uncertain."""
     names = [item.name for item in model.parameters if item.value != 0.0]
     n_law = best.fit.coefficients.size
-    dynamics = best.fitter.dynamics(best.fit, names)
+    dynamics = best.fit.fitter.dynamics(best.fit, names)
     g = signatures.constant_signatures(dynamics, n_law + len(names))
     result = {}
     for index, name in enumerate(best.law.parameters):
         largest = ("", 0.0)
         for other, parameter in enumerate(names, start=n_law):
             chosen = [*range(n_law), other]
-            part = _inverse(g[:, chosen].T @ g[:, chosen])
+            part = inverse(g[:, chosen].T @ g[:, chosen])
             scale = float(np.sqrt(part[index, index] * part[-1, -1]))
             value = float(part[index, -1]) / scale if scale > 0.0 else 0.0
             largest = max(largest, (parameter, value), key=lambda item: abs(item[1]))
         if abs(largest[1]) >= LEAST_CORRELATION:
             result[name] = largest
     return result
-
-
-def _inverse(information: Array) -> Array:
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    inner = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)
-    return np.asarray(inner / np.outer(scale, scale))

@@ -1,32 +1,23 @@
 """Fit of a smooth correction inside the simulation, by damped Gauss-Newton steps from zero.
 
-A filter without process noise is a simulation whose start is estimated from the first rows. Every step solves for all
-coefficients at once, and keeps those functions that lower the BIC (forward selection, then backward elimination, on the
-normal equations), so that a simple law is not beaten by a richer place.
+Every step solves for all coefficients at once, and keeps those functions that lower the BIC (forward selection, then
+backward elimination, on the normal equations), so that a simple law is not beaten by a richer place.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from math import log
 
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import (
-    HUBER,
-    FaultFilter,
-    FilterEvaluation,
-    error_dynamics_between,
-)
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvaluation
+from reactorwatch.diagnosis.fitting.simulation import FittedSimulation
 from reactorwatch.diagnosis.law.shapes import LARGEST, Shape
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
-from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.kalman.error_dynamics import ErrorDynamics
+from reactorwatch.process.places import Place
 
 MOST_TERMS = 6
 """Largest number of functions of a correction."""
@@ -44,18 +35,33 @@ class ShapeFit:
     """A fitted correction.
 
     Attributes:
-        shape: the shape.
+        fitter: fitter of its shape, for other noise levels.
         noise: noise levels of the fit.
         coefficients: coefficients of its functions; 0 of those that are not needed.
         evaluation: run of the filter.
         bic: twice the loss plus the charge for the coefficients; noise levels are not charged.
     """
 
-    shape: Shape
+    fitter: "ShapeFitter"
     noise: Noise
     coefficients: Array
     evaluation: FilterEvaluation
     bic: float
+
+    @property
+    def shape(self) -> Shape:
+        """Shape of the correction."""
+        return self.fitter.shape
+
+    @property
+    def place(self) -> Place:
+        """Place of the correction."""
+        return self.shape.place
+
+    @property
+    def lag_min(self) -> float:
+        """Time constant with which the correction lags behind its variables; 0: none."""
+        return self.shape.lag_min(self.coefficients)
 
 
 class ShapeFitter:
@@ -69,22 +75,17 @@ class ShapeFitter:
 
     def __init__(self, shape: Shape, run: Run, noise: Noise) -> None:
         self.shape, self._run = shape, run
-        period_min = float(np.median(np.diff(run.time_min)))
-        self.ekf = FaultFilter(shape.model, (), noise, period_min)
-        if not run.breaks:  # a fit that loses an unstable plant is given up instead of started again in each row
-            self.ekf.limit(None)
+        self._simulation = FittedSimulation(shape.model, shape.parameters, run, noise)
         self._first = np.array([shape.model.parameter(name).value for name in shape.parameters])
-        self._errors = self._linearization(shape.parameters)
 
     def evaluate(self, coefficients: Array, select: bool = True) -> ShapeFit:
         """Run the filter at these coefficients; with `select`, those that are 0 are not charged."""
-        self._use(coefficients)
-        return self._fit_of(coefficients, self.ekf.evaluate(self._run, ()), select)
+        return self._fit_of(coefficients, self._simulation.evaluate(self._values(coefficients)), select)
 
     def _fit_of(self, coefficients: Array, evaluation: FilterEvaluation, select: bool) -> ShapeFit:
         charged = np.count_nonzero(coefficients) if select else coefficients.size
         bic = 2.0 * evaluation.loss + charged * log(self._run.values)
-        return ShapeFit(self.shape, self.ekf.noise, coefficients, evaluation, float(bic))
+        return ShapeFit(self, self._simulation.ekf.noise, coefficients, evaluation, float(bic))
 
     def fit(
         self, start: Array, noise: Noise, steps: int, select: bool = True, first: FilterEvaluation | None = None
@@ -98,7 +99,7 @@ class ShapeFitter:
             select: whether to keep only those functions that lower the BIC.
             first: run of the filter at the initial coefficients, if it is known.
         """
-        self.ekf.noise = noise
+        self._simulation.ekf.noise = noise
         best = self.evaluate(start, select) if first is None else self._fit_of(start, first, select)
         for _ in range(steps):
             target = self._target(best, select)
@@ -117,36 +118,22 @@ class ShapeFitter:
 
     def dynamics(self, fit: ShapeFit, further: Sequence[str] = ()) -> ErrorDynamics:
         """Error equations about a fit, for its coefficients and further parameters of the model."""
-        self.ekf.noise = fit.noise
-        errors = self._linearization((*self.shape.parameters, *further)) if further else self._errors
-        errors.noise = self.ekf.noise_levels
-        errors.changes = self.ekf.noise.parameter_changes | self._values(fit.coefficients)
-        inputs, used = self.ekf.inputs(self._run, ()), self.ekf.used_values(self._run)
-        return error_dynamics_between(errors, self._run, inputs, fit.evaluation.innovations, used)
+        self._simulation.ekf.noise = fit.noise
+        return self._simulation.dynamics(self._values(fit.coefficients), fit.evaluation, further)
 
-    def _linearization(self, names: Sequence[str]) -> ErrorLinearization:
-        return _linearization(self.ekf.model, tuple(names)).with_noise(self.ekf.noise_levels)
+    def normal_equations(self, fit: ShapeFit) -> tuple[Array, Array]:
+        """Information and gradient of all coefficients at a fit."""
+        self._simulation.ekf.noise = fit.noise
+        return self._simulation.normal_equations(self._values(fit.coefficients), fit.evaluation)
 
     def estimate_noise(self, fit: ShapeFit, noise: Noise, smallest_sd: Sequence[float]) -> Noise:
         """Noise levels under a fit by maximum likelihood; `noise` has the sensors with coloured noise."""
-        self.ekf.noise = noise
         extended = self.shape.model.with_values(self._values(fit.coefficients))
-        ekf = FaultFilter(extended, (), noise, float(np.median(np.diff(self._run.time_min))))
-        return ekf.estimate_noise(self._run, (), smallest_sd)
-
-    def _use(self, coefficients: Array) -> None:
-        self.ekf.set_changes(self._values(coefficients))
+        return FaultFilter(extended, (), noise, self._run.period_min).estimate_noise(self._run, (), smallest_sd)
 
     def _values(self, coefficients: Array) -> dict[str, float]:
         values = np.clip(self._first + coefficients, -LARGEST, LARGEST)
         return {**self.shape.scales, **dict(zip(self.shape.parameters, values.tolist(), strict=True))}
-
-    def normal_equations(self, fit: ShapeFit) -> tuple[Array, Array]:
-        """Information and gradient of all coefficients at a fit."""
-        g = signatures.constant_signatures(self.dynamics(fit), fit.coefficients.size)
-        w = np.nan_to_num(fit.evaluation.w[2:]).ravel()
-        weights = HUBER / np.maximum(np.abs(w), HUBER)
-        return g.T @ (g * weights[:, None]), g.T @ (weights * w)
 
     def _target(self, fit: ShapeFit, select: bool) -> Array | None:
         information, gradient = self.normal_equations(fit)
@@ -158,14 +145,6 @@ class ShapeFitter:
         if chosen:
             result[chosen] = _solve(information, by, chosen)[0]
         return result
-
-
-@lru_cache(maxsize=MODEL_CACHE_SIZE)
-def _linearization(model: ProcessModel, names: tuple[str, ...]) -> ErrorLinearization:
-    """Error equations of a model for some of its parameters; cached with what is compiled from them."""
-    symbols = [model.parameter(name).symbol for name in names]
-    unknown = NoiseLevels((1.0,) * len(model.outputs), (0.0,) * len(model.states))
-    return ErrorLinearization(model, unknown, symbols, symbols)
 
 
 def select_terms(information: Array, by: Array, charge: float) -> list[int]:

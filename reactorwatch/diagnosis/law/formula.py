@@ -14,7 +14,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import signatures
-from reactorwatch.diagnosis.fitting.fault_filter import HUBER
+from reactorwatch.diagnosis.fitting.fault_filter import huber_weights
 from reactorwatch.diagnosis.fitting.profiles import hat_functions
 from reactorwatch.diagnosis.law.fit import ShapeFit
 from reactorwatch.diagnosis.law.shapes import Shape
@@ -56,19 +56,6 @@ _CONVERGED = 0.01
 _DAMPINGS = (1e-6, 1e-2, 1.0, 100.0)
 
 
-@dataclass(frozen=True, eq=False)
-class CandidateLaw:
-    """A form with parameters.
-
-    Attributes:
-        law: the law.
-        bic: predicted BIC.
-    """
-
-    law: ExtendedLaw
-    bic: float
-
-
 class FormulaSearch:
     """Fits forms about the path of a smooth correction.
 
@@ -76,22 +63,19 @@ class FormulaSearch:
     loss is a quadratic form of these values and a form is fitted in well under a millisecond.
 
     Args:
-        place: place of the correction.
         fit: fit of the correction.
         dynamics: error equations about it.
         run: the record.
         variables: variables of the place along the path, each of shape (rows,).
     """
 
-    def __init__(
-        self, place: Place, fit: ShapeFit, dynamics: ErrorDynamics, run: Run, variables: Mapping[str, Array]
-    ) -> None:
-        self._place, self._dynamics, self._unit = place, dynamics, fit.shape.unit_size
-        self._lag_min = fit.shape.lag_min(fit.coefficients)
+    def __init__(self, fit: ShapeFit, dynamics: ErrorDynamics, run: Run, variables: Mapping[str, Array]) -> None:
+        self._place, self._dynamics, self._unit = fit.place, dynamics, fit.shape.unit_size
+        self._lag_min = fit.lag_min
         self._variables = {name: item for name, item in variables.items() if np.ptp(item) > 0.0}
         self._charge = log(run.values)
         w = np.nan_to_num(fit.evaluation.w[2:])
-        self._weights = np.sqrt(HUBER / np.maximum(np.abs(w), HUBER)).ravel()
+        self._weights = np.sqrt(huber_weights(w)).ravel()
         free = fit.shape.corrections(fit.evaluation.innovations.x, run.inputs, fit.coefficients)
         self._apart, self._ratio, ratio = len(fit.shape.terms), 0.0, 0.0
         self._target = w.ravel() + self._response(free[:, :1])[:, 0]
@@ -100,8 +84,8 @@ class FormulaSearch:
             ratio = float(free[:, 0] @ free[:, 1]) / max(float(free[:, 0] @ free[:, 0]), 1e-300)
         self._ratio = ratio
 
-    def candidates(self) -> list[CandidateLaw]:
-        """Best fit of every form with every choice of variables, the best first."""
+    def candidates(self) -> list[tuple[float, ExtendedLaw]]:
+        """Best fit of every form with every choice of variables with its predicted BIC, the best first."""
         result = []
         for count in (1, 2):
             for names in combinations(self._variables, count):
@@ -110,8 +94,9 @@ class FormulaSearch:
                 grid = self._grid(names)
                 for form in FORMS:
                     if form.variables == count:
-                        result += [self._best(form, order, grid) for order in _orders(form, names)]
-        return sorted((item for item in result if item is not None), key=lambda item: item.bic)
+                        orders = [names] if form.symmetric else permutations(names)
+                        result += [self._best(form, order, grid) for order in orders]
+        return sorted((item for item in result if item is not None), key=lambda item: item[0])
 
     def _grid(self, names: Sequence[str]) -> "_Grid":
         """Quadratic form of the values at the knots of these variables."""
@@ -146,15 +131,13 @@ class FormulaSearch:
         )
         return np.asarray(g.reshape(-1, columns.shape[1]))
 
-    def _best(self, form: Form, names: Sequence[str], grid: "_Grid") -> CandidateLaw | None:
-        if form.positive and min(float(np.min(grid.variables[name])) for name in names) <= 0.0:
+    def _best(self, form: Form, names: Sequence[str], grid: "_Grid") -> tuple[float, ExtendedLaw] | None:
+        fitter = _FormFitter(form, names, grid)
+        if form.positive and min(float(np.min(item)) for item in fitter.values) <= 0.0:
             return None
-        references = [round_reference(grid.means[name], grid.spreads[name]) for name in names]
-        starts = [_start_form(form, names, references, start, grid) for start in _starts(form, names, grid)]
-        starts = sorted(starts, key=lambda item: item[0])[:MOST_STARTS]
-        fits = [_fit_form(form, names, references, loss, p, grid) for loss, p in starts]
-        loss, p = min(fits, key=lambda item: item[0])
-        if not (np.isfinite(loss) and _is_in_bounds(form, p, [grid.variables[name] for name in names])):
+        starts = sorted((fitter.start(item) for item in fitter.starts()), key=lambda item: item[0])[:MOST_STARTS]
+        loss, p = min((fitter.fit(*item) for item in starts), key=lambda item: item[0])
+        if not (np.isfinite(loss) and fitter.is_in_bounds(p)):
             return None
         parameters = {item.name: float(value) for item, value in zip(form.parameters, p, strict=True)}
         if self._place.apart:
@@ -163,21 +146,15 @@ class FormulaSearch:
             parameters[LAG] = self._lag_min
         values = [self._variables[name] for name in names]
         ranges = {name: (float(np.min(item)), float(np.max(item))) for name, item in zip(names, values, strict=True)}
-        law = ExtendedLaw(self._place.name, form.key, tuple(names), tuple(references), parameters, ranges)
-        return CandidateLaw(law, loss + len(parameters) * self._charge)
+        law = ExtendedLaw(self._place.name, form.key, tuple(names), tuple(fitter.references), parameters, ranges)
+        return loss + len(parameters) * self._charge, law
 
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Quadratic form of the correction's values at knots: twice the loss.
+    """Twice the loss as a quadratic form of the values at the knots, zero and its slopes there first.
 
-    Attributes:
-        variables: variables at the knots.
-        means: mean of each variable.
-        spreads: standard deviation of each variable.
-        information: curvature, shape (knots, knots).
-        gradient: negative half of the slope at zero, shape (knots,).
-        constant: value at zero.
+    With the variables at the knots, and their means and standard deviations along the path.
     """
 
     variables: Mapping[str, Array]
@@ -194,110 +171,94 @@ class _Grid:
         return float(self.constant - 2.0 * self.gradient @ course + course @ self.information @ course)
 
 
-def _is_in_bounds(form: Form, p: Array, values: Sequence[Array]) -> bool:
-    """Return true if the positions of a form are where its formula differs from a simpler one."""
-    for item, value in zip(form.parameters, p.tolist(), strict=True):
-        low, high = float(np.min(values[item.of])), float(np.max(values[item.of]))
-        share = (value - low) / (high - low)
-        if item.kind == POSITION and not form.position[0] < share < form.position[1]:
-            return False
-    return True
+class _FormFitter:
+    """Fits a form of some variables to the values at the knots; losses are twice the negative log likelihood."""
 
+    def __init__(self, form: Form, names: Sequence[str], grid: _Grid) -> None:
+        self._form, self._grid = form, grid
+        self.values = [grid.variables[name] for name in names]
+        self._means, self._spreads = ([of[name] for name in names] for of in (grid.means, grid.spreads))
+        self.references = [round_reference(*item) for item in zip(self._means, self._spreads, strict=True)]
 
-def _orders(form: Form, names: Sequence[str]) -> list[tuple[str, ...]]:
-    return [tuple(names)] if form.symmetric else list(permutations(names))
+    def _course(self, p: Array) -> Array:
+        return np.asarray(self._form.expression(self.values, p, self.references))
 
+    def starts(self) -> list[Array]:
+        """Initial nonlinear parameters; gains follow from the first step."""
+        starts, exponents = [np.zeros(len(self._form.parameters))], EXPONENTS[self._form.variables]
+        for index, item in enumerate(self._form.parameters):
+            mean, spread = self._means[item.of], self._spreads[item.of]
+            options = {
+                EXPONENT: exponents,
+                RATE: [exponent / max(abs(mean), spread) for exponent in exponents],
+                POSITION: [mean + position * spread for position in POSITIONS],
+            }.get(item.kind, (0.0,))
+            starts = [np.array([*start[:index], option, *start[index + 1 :]]) for start in starts for option in options]
+        return starts
 
-def _starts(form: Form, names: Sequence[str], grid: _Grid) -> list[Array]:
-    """Initial nonlinear parameters; gains follow from the first step."""
-    starts = [np.zeros(len(form.parameters))]
-    for index, item in enumerate(form.parameters):
-        mean, spread = grid.means[names[item.of]], grid.spreads[names[item.of]]
-        options = {
-            EXPONENT: EXPONENTS[form.variables],
-            RATE: [exponent / max(abs(mean), spread) for exponent in EXPONENTS[form.variables]],
-            POSITION: [mean + position * spread for position in POSITIONS],
-        }.get(item.kind, (0.0,))
-        starts = [np.array([*start[:index], option, *start[index + 1 :]]) for start in starts for option in options]
-    return starts
+    def start(self, start: Array) -> tuple[float, Array]:
+        """Loss and parameters, of which the linear ones are fitted."""
+        linear = [i for i, item in enumerate(self._form.parameters) if item.kind in (GAIN, SLOPE, CURVATURE)]
+        columns = []
+        with np.errstate(over="ignore", invalid="ignore"):
+            for index in linear:
+                unit = start.copy()
+                unit[index] = 1.0
+                columns.append(self._course(unit))
+            g, p = np.column_stack(columns), start.copy()
+            p[linear] = np.linalg.lstsq(g.T @ self._grid.information @ g, g.T @ self._grid.gradient, rcond=1e-12)[0]
+            return self._grid.loss(self._course(p)), p
 
-
-def _start_form(
-    form: Form, names: Sequence[str], references: Sequence[float], start: Array, grid: _Grid
-) -> tuple[float, Array]:
-    """Twice the loss of a form and its parameters, of which the linear ones are fitted."""
-    values = [grid.variables[name] for name in names]
-    linear = [index for index, item in enumerate(form.parameters) if item.kind in (GAIN, SLOPE, CURVATURE)]
-    with np.errstate(over="ignore", invalid="ignore"):
-        p = _solve_linear(form, values, references, start, linear, grid)
-        return grid.loss(form.expression(values, p, references)), p
-
-
-def _fit_form(
-    form: Form, names: Sequence[str], references: Sequence[float], best: float, p: Array, grid: _Grid
-) -> tuple[float, Array]:
-    """Twice the loss of a form and its parameters, by damped Gauss-Newton steps on the values at the knots."""
-    values = [grid.variables[name] for name in names]
-    with np.errstate(over="ignore", invalid="ignore"):
-        course = form.expression(values, p, references)
-        for _ in range(STEPS):
-            if not np.isfinite(best):
-                break
-            columns = np.column_stack([_slope(form, values, p, references, i, names, grid) for i in range(p.size)])
-            size = np.sqrt(np.maximum(np.sum(columns * (grid.information @ columns), axis=0), 1e-300))
-            columns = columns / size
-            information = columns.T @ grid.information @ columns
-            gradient = columns.T @ (grid.gradient - grid.information @ course)
-            before = best
-            for damping in _DAMPINGS:
-                trial = p + np.linalg.solve(information + damping * np.eye(p.size), gradient) / size
-                moved = form.expression(values, trial, references)
-                loss = grid.loss(moved)
-                if loss < best:
-                    p, best, course = trial, loss, moved
+    def fit(self, best: float, p: Array) -> tuple[float, Array]:
+        """Loss and parameters, by damped Gauss-Newton steps from a start."""
+        grid = self._grid
+        with np.errstate(over="ignore", invalid="ignore"):
+            course = self._course(p)
+            for _ in range(STEPS):
+                if not np.isfinite(best):
                     break
-            if before - best < _CONVERGED:
-                break
-    return best, p
+                columns = np.column_stack([self._slope(p, i) for i in range(p.size)])
+                size = np.sqrt(np.maximum(np.sum(columns * (grid.information @ columns), axis=0), 1e-300))
+                columns = columns / size
+                information = columns.T @ grid.information @ columns
+                gradient = columns.T @ (grid.gradient - grid.information @ course)
+                before = best
+                for damping in _DAMPINGS:
+                    trial = p + np.linalg.solve(information + damping * np.eye(p.size), gradient) / size
+                    moved = self._course(trial)
+                    loss = grid.loss(moved)
+                    if loss < best:
+                        p, best, course = trial, loss, moved
+                        break
+                if before - best < _CONVERGED:
+                    break
+        return best, p
 
+    def _slope(self, p: Array, i: int) -> Array:
+        """Derivative of the course by a parameter."""
+        item = self._form.parameters[i]
+        spread = self._spreads[item.of]
+        unit = {EXPONENT: 1.0, RATE: 1.0 / spread, POSITION: spread}.get(item.kind, max(abs(p[i]), 1e-9))
+        low, high = p.copy(), p.copy()
+        low[i] -= _DIFFERENCE * unit
+        high[i] += _DIFFERENCE * unit
+        return np.asarray((self._course(high) - self._course(low)) / (2.0 * _DIFFERENCE * unit))
 
-def _slope(
-    form: Form,
-    values: Sequence[Array],
-    p: Array,
-    references: Sequence[float],
-    i: int,
-    names: Sequence[str],
-    grid: _Grid,
-) -> Array:
-    spread = grid.spreads[names[form.parameters[i].of]]
-    unit = {EXPONENT: 1.0, RATE: 1.0 / spread, POSITION: spread}.get(form.parameters[i].kind, max(abs(p[i]), 1e-9))
-    low, high = p.copy(), p.copy()
-    low[i] -= _DIFFERENCE * unit
-    high[i] += _DIFFERENCE * unit
-    difference = form.expression(values, high, references) - form.expression(values, low, references)
-    return np.asarray(difference / (2.0 * _DIFFERENCE * unit))
-
-
-def _solve_linear(
-    form: Form, values: Sequence[Array], references: Sequence[float], start: Array, linear: Sequence[int], grid: _Grid
-) -> Array:
-    columns = []
-    for index in linear:
-        unit = start.copy()
-        unit[index] = 1.0
-        columns.append(form.expression(values, unit, references))
-    g = np.column_stack(columns)
-    result = start.copy()
-    result[list(linear)] = np.linalg.lstsq(g.T @ grid.information @ g, g.T @ grid.gradient, rcond=1e-12)[0]
-    return result
+    def is_in_bounds(self, p: Array) -> bool:
+        """Return true if the positions of the form are where its formula differs from a simpler one."""
+        for item, value in zip(self._form.parameters, p.tolist(), strict=True):
+            low, high = float(np.min(self.values[item.of])), float(np.max(self.values[item.of]))
+            share = (value - low) / (high - low)
+            if item.kind == POSITION and not self._form.position[0] < share < self._form.position[1]:
+                return False
+        return True
 
 
 def law_shape(model: ProcessModel, place: Place, law: ExtendedLaw) -> Shape:
     """Model with a law, as a shape whose coefficients shift the law's parameters."""
     extended = law.extend(model)
     names = extended.parameter_names[-len(law.parameters) :]
-    return Shape(place, extended, names, names, 1.0, ())
+    return Shape(place, extended, names, 1.0, ())
 
 
 def round_reference(mean: float, spread: float) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.diagnosis.fitting.fault_filter import FilterEvaluation, huber_loss
+from reactorwatch.diagnosis.fitting.hypothesis import Fit
 from reactorwatch.diagnosis.law.unknown import (
     FittedLaw,
     StartedPlaces,
@@ -69,7 +70,7 @@ class Localised:
     @property
     def approximation(self) -> float:
         """BIC of the best law over that of the smooth correction; negative if it explains more."""
-        return self.found.laws[0].bic - self.found.places[0].fit.bic if self.found.laws else np.inf
+        return self.found.laws[0].bic - self.found.places[0].bic if self.found.laws else np.inf
 
     @property
     def locations(self) -> dict[str, float]:
@@ -118,7 +119,7 @@ class UnknownSearch:
         return (
             law.log_p < DOUBTFUL
             and len(law.law.parameters) <= SIMPLE
-            and law.bic < self._evidence.places[0].fit.bic + LISTED
+            and law.bic < self._evidence.places[0].bic + LISTED
         )
 
     def localise(self, explained_bic: float = np.inf) -> Localised:
@@ -129,14 +130,14 @@ class UnknownSearch:
                 which a free curve in time cannot improve; infinite: there is none.
         """
         limit = explained_bic + HOPELESS * self._run.values
-        if self._first_places.fits[0].fit.bic > limit:
+        if self._first_places.fits[0].bic > limit:
             return Localised(Unknown(tuple(self._first_places.fits), (), self._first_places.free, np.inf), None)
         found, curve = self._evidence, None
         if np.isinf(explained_bic) and (found.log_p >= WHITE or _is_noisy(found, self._model)):
             curve = locate(self._model, self._effects, self._run, self._nominal.fit, self._noise)
             if curve is not None:
-                count = np.count_nonzero(found.places[0].fit.coefficients)
-                of_law = _evaluate_on(found.places[0].fit.evaluation, curve.used) + count * log(self._run.values)
+                count = np.count_nonzero(found.places[0].coefficients)
+                of_law = _evaluate_on(found.places[0].evaluation, curve.used) + count * log(self._run.values)
                 curve = curve if curve.bic < of_law - CURVE_MARGIN else None
         return Localised(found, curve)
 
@@ -156,11 +157,10 @@ def _is_noisy(found: Unknown, model: ProcessModel) -> bool:
 
 def _bic_on(fitted: FittedHypothesis, used: NDArray[np.bool_]) -> float:
     """BIC of a hypothesis of the catalogue, by some of the values alone."""
-    evaluation = FilterEvaluation(fitted.fit.loss, fitted.fit.w, fitted.fit.innovations)
-    return _evaluate_on(evaluation, used) - 2.0 * fitted.fit.loss + fitted.bic
+    return _evaluate_on(fitted.fit, used) - 2.0 * fitted.fit.loss + fitted.bic
 
 
-def _evaluate_on(evaluation: FilterEvaluation, used: NDArray[np.bool_]) -> float:
+def _evaluate_on(evaluation: FilterEvaluation | Fit, used: NDArray[np.bool_]) -> float:
     """Twice the loss of some of the values."""
     w, sd = evaluation.w, evaluation.innovations.conditional_sd
     counted = used & np.isfinite(w) & np.isfinite(sd)

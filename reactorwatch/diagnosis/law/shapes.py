@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.law.path import Scale, evaluate_along
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.process.effect import Effect, ParameterShift
 from reactorwatch.process.law import add_lag_states
@@ -32,14 +33,6 @@ LARGEST = 1e12
 _BOUND = 1e6
 
 
-@dataclass(frozen=True)
-class Scale:
-    """Mean and spread of a variable along the record."""
-
-    mean: float
-    spread: float
-
-
 @dataclass(frozen=True, eq=False)
 class Shape:
     """A model with smooth corrections.
@@ -48,7 +41,6 @@ class Shape:
         place: the place.
         model: model with corrections, whose coefficients are parameters.
         parameters: names of the coefficients among the model's parameters.
-        functions: functions of the correction as text, one for each coefficient.
         unit_size: correction at a unit coefficient of the constant function, the first one.
         terms: functions of the correction in the place itself as expressions.
         apart: functions of the correction apart from it; empty: none.
@@ -58,7 +50,6 @@ class Shape:
     place: Place
     model: ProcessModel
     parameters: tuple[str, ...]
-    functions: tuple[str, ...]
     unit_size: float
     terms: tuple[ca.SX, ...]
     apart: tuple[ca.SX, ...] = ()
@@ -78,18 +69,8 @@ class Shape:
 
     def basis(self, x: Array, inputs: Array) -> Array:
         """Functions of the corrections along a path, shape (rows, functions), in their unit."""
-        symbols = [*self.model.arguments(), self.model.clock.now, self.model.clock.middle]
-        function = ca.Function("basis", symbols, [ca.vertcat(*self.terms, *self.apart)])
-        none = np.zeros((1, len(x)))
-        own = bridge_gaps(x[:, : len(self.model.states)])
-        values = function(own.T, np.nan_to_num(inputs.T), self.model.values(self.scales), none, none)
-        return np.asarray(self.unit_size * np.array(values).T)
-
-
-def bridge_gaps(x: Array) -> Array:
-    """A path without its gaps, in which no row is known; they are bridged by straight lines."""
-    rows, known = np.arange(len(x)), np.flatnonzero(np.all(np.isfinite(x), axis=1))
-    return x if known.size == rows.size else np.column_stack([np.interp(rows, known, item[known]) for item in x.T])
+        functions = (*self.terms, *self.apart)
+        return self.unit_size * evaluate_along(self.model, functions, x, inputs, np.zeros(len(x)), self.scales).T
 
 
 def make_shape(model: ProcessModel, place: Place, scales: Mapping[str, Scale]) -> Shape:
@@ -100,102 +81,75 @@ def make_shape(model: ProcessModel, place: Place, scales: Mapping[str, Scale]) -
         place: one of its places.
         scales: scales of the variables by name; of an output's rate as `d(name)`.
     """
-    built = _build(model, place.name)
+    shape, scaled = _build(model, place.name)
     parts = (place, *([find_place(model, place.apart)] if place.apart else []))
     units = {f"law.{index}.unit": _typical(model, part, scales) for index, part in enumerate(parts)}
-    values = {name: float(getattr(scales[of], what)) for name, (what, of) in built.scaled.items()}
-    unit = _typical(model, place, scales)
-    return replace(built.shape, unit_size=unit, scales=units | values)
-
-
-@dataclass(frozen=True, eq=False)
-class _Built:
-    """Shape of a place without the scales of a record.
-
-    Attributes:
-        shape: the shape.
-        scaled: for each parameter of a scale its kind, `mean` or `spread`, and the variable.
-    """
-
-    shape: Shape
-    scaled: Mapping[str, tuple[str, str]]
+    values = {name: float(getattr(scales[of], what)) for name, (what, of) in scaled.items()}
+    return replace(shape, unit_size=_typical(model, place, scales), scales=units | values)
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
-def _build(model: ProcessModel, name: str) -> _Built:
-    """Build the shape of a place, once for all records, with everything that is compiled from its model."""
+def _build(model: ProcessModel, name: str) -> tuple[Shape, Mapping[str, tuple[str, str]]]:
+    """Shape of a place without the scales of a record, built once with everything that is compiled from its model.
+
+    Also, for each parameter of a scale, its kind, `mean` or `spread`, and the variable.
+    """
     place = find_place(model, name)
-    parts = [_part(model, place, place.variables)]
-    if place.apart:
-        parts.append(_part(model, find_place(model, place.apart), place.variables, order=1))
     parameters: list[Parameter] = []
-    names: list[str] = []
     coefficients: list[Parameter] = []
     scaled: dict[str, tuple[str, str]] = {}
     extended, terms, apart = model, list[ca.SX](), list[ca.SX]()
     lag = _constant("law.lag")
-    for index, part in enumerate(parts):
-        z, symbols = {}, list(part.arguments.values())
+    for index, part in enumerate((place, *([find_place(model, place.apart)] if place.apart else []))):
+        arguments = _arguments(model, part, place.variables)
+        z, symbols = {}, list(arguments.values())
         if place.lag_min:
             lag_min = place.lag_min * ca.exp(lag.symbol)
-            extended, symbols = add_lag_states(extended, lag_min, list(part.arguments), symbols)
-        for name, expression in zip(part.arguments, symbols, strict=True):
-            mean, spread = (_constant(f"law.{index}.{what}.{name}") for what in ("mean", "spread"))
+            extended, symbols = add_lag_states(extended, lag_min, list(arguments), symbols)
+        for variable, expression in zip(arguments, symbols, strict=True):
+            mean, spread = (_constant(f"law.{index}.{what}.{variable}") for what in ("mean", "spread"))
             parameters += [mean, replace(spread, value=1.0)]
-            scaled |= {mean.name: ("mean", name), spread.name: ("spread", name)}
-            z[name] = (expression - mean.symbol) / spread.symbol
+            scaled |= {mean.name: ("mean", variable), spread.name: ("spread", variable)}
+            z[variable] = (expression - mean.symbol) / spread.symbol
         correction = ca.SX(0)
-        for text, function in _functions(part.place, z, part.order):
+        for function in _functions(part, z, order=1 if index else 2):
             coefficient = _constant(f"law.c{len(coefficients)}")
             coefficients.append(coefficient)
-            names.append(text)
             correction += coefficient.symbol * function
             (apart if index else terms).append(function)
         size = _constant(f"law.{index}.unit")
         parameters.append(replace(size, value=1.0))
-        extended = correct(extended, part.place, size.symbol * correction)
+        extended = correct(extended, part, size.symbol * correction)
     if place.lag_min:
         coefficients.append(lag)
-        names.append("logarithm of the lag's ratio")
     extended = replace(extended, parameters=(*extended.parameters, *parameters, *coefficients))
-    chosen = tuple(item.name for item in coefficients)
-    return _Built(Shape(place, extended, chosen, tuple(names), 1.0, tuple(terms), tuple(apart)), scaled)
+    names = tuple(item.name for item in coefficients)
+    return Shape(place, extended, names, 1.0, tuple(terms), tuple(apart)), scaled
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A place with the expressions of its arguments."""
-
-    place: Place
-    arguments: Mapping[str, ca.SX]
-    order: int
-
-
-def _part(model: ProcessModel, place: Place, variables: Sequence[str], order: int = 2) -> _Part:
+def _arguments(model: ProcessModel, place: Place, variables: Sequence[str]) -> dict[str, ca.SX]:
+    """Arguments of a correction by name; that of a sensor also depends on the output and its rate."""
     arguments = {name: variable_expression(model, name) for name in variables}
     if place.kind == SENSOR:
         (output,) = (item for item in model.outputs if item.name == place.of)
         arguments[place.of] = output.expression
         slope = ca.mtimes(ca.jacobian(output.expression, model.arguments()[0]), ca.vertcat(*model.rhs))
         arguments[f"d({place.of})"] = slope
-    return _Part(place, arguments, order)
+    return arguments
 
 
-def _functions(place: Place, z: Mapping[str, ca.SX], order: int) -> list[tuple[str, ca.SX]]:
+def _functions(place: Place, z: Mapping[str, ca.SX], order: int) -> list[ca.SX]:
     """Functions of a correction: powers, products and hinges, and for a sensor the direction of movement."""
-    plain = [(name, item) for name, item in z.items() if not name.startswith("d(")]
-    result = [("1", ca.SX(1)), *plain]
+    plain = [item for name, item in z.items() if not name.startswith("d(")]
+    moving = [item for name, item in z.items() if name.startswith("d(")]
+    result = [ca.SX(1), *plain]
     if order > 1:
-        result += [(f"{name}^2", item**2) for name, item in plain]
-        result += [(f"{one[0]} {other[0]}", one[1] * other[1]) for one, other in combinations(plain, 2)]
-        first, item = plain[0]
+        result += [item**2 for item in plain]
+        result += [one * other for one, other in combinations(plain, 2)]
         if place.kind != CAPACITY:
-            result.append((f"{first}^3", item**3))
-            result += [(f"max({first} - {at:g}, 0)", ca.fmax(item - at, 0)) for at in HINGES]
-    moving = [(name, item) for name, item in z.items() if name.startswith("d(")]
-    result += [(f"{name}", item) for name, item in moving]
-    result += [(f"direction of {name}", ca.tanh(QUICK * item)) for name, item in moving]
-    return result
+            result.append(plain[0] ** 3)
+            result += [ca.fmax(plain[0] - at, 0) for at in HINGES]
+    return [*result, *moving, *(ca.tanh(QUICK * item) for item in moving)]
 
 
 def _typical(model: ProcessModel, place: Place, scales: Mapping[str, Scale]) -> float:

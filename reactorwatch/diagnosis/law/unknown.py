@@ -18,8 +18,8 @@ from reactorwatch.diagnosis.fitting.fault_filter import HUBER, FilterEvaluation
 from reactorwatch.diagnosis.fitting.hypothesis import Fit
 from reactorwatch.diagnosis.law.fit import ShapeFit, ShapeFitter
 from reactorwatch.diagnosis.law.formula import FormulaSearch, law_shape
-from reactorwatch.diagnosis.law.path import scales_along, variables_along
-from reactorwatch.diagnosis.law.shapes import Scale, make_shape
+from reactorwatch.diagnosis.law.path import Scale, scales_along, variables_along
+from reactorwatch.diagnosis.law.shapes import Shape, make_shape
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.sensor_noise import estimate_sensor_noise
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p
@@ -59,16 +59,17 @@ class FittedLaw:
     Attributes:
         law: the law with fitted parameters.
         fit: fit of its parameters.
-        fitter: fitter, for covariances.
-        place: place of the law.
         log_p: largest minus decimal logarithm of the p-value that its innovations are white.
     """
 
     law: ExtendedLaw
     fit: ShapeFit
-    fitter: ShapeFitter
-    place: Place
     log_p: float
+
+    @property
+    def place(self) -> Place:
+        """Place of the law."""
+        return self.fit.place
 
     @property
     def bic(self) -> float:
@@ -78,23 +79,6 @@ class FittedLaw:
     def noise_sd(self, model: ProcessModel) -> Array:
         """Standard deviation of each sensor's noise, shape (n_y,)."""
         return self.fit.noise.sensor_sd(model.output_names)
-
-
-@dataclass(frozen=True, eq=False)
-class PlaceFit:
-    """The best smooth correction of a place.
-
-    Attributes:
-        place: the place.
-        fit: fit of the correction.
-        fitter: fitter, for other noise levels.
-        nominal: run of its filter without any correction, with process noise.
-    """
-
-    place: Place
-    fit: ShapeFit
-    fitter: ShapeFitter
-    nominal: FilterEvaluation
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +92,7 @@ class Unknown:
         log_p: largest minus decimal logarithm of the p-value that the innovations of the best one are white.
     """
 
-    places: tuple[PlaceFit, ...]
+    places: tuple[ShapeFit, ...]
     laws: tuple[FittedLaw, ...]
     noise: Noise
     log_p: float
@@ -116,17 +100,16 @@ class Unknown:
     @property
     def bic(self) -> float:
         """BIC of the best correction or law."""
-        return min([self.places[0].fit.bic, *(law.bic for law in self.laws)])
+        return min([self.places[0].bic, *(law.bic for law in self.laws)])
 
     @property
     def locations(self) -> dict[str, float]:
         """BIC of each location over that of the best, the best first."""
         result: dict[str, float] = {}
-        for location, bic in (
-            *((item.place.location, item.fit.bic) for item in self.places),
-            *((item.place.location, item.bic) for item in self.laws),
-        ):
-            result[location] = min(bic - self.bic, result.get(location, np.inf))
+        found: tuple[ShapeFit | FittedLaw, ...] = (*self.places, *self.laws)
+        for item in found:
+            location = item.place.location
+            result[location] = min(item.bic - self.bic, result.get(location, np.inf))
         return dict(sorted(result.items(), key=lambda item: item[1]))
 
 
@@ -142,7 +125,7 @@ class StartedPlaces:
         wide: noise levels of their first steps.
     """
 
-    fits: list["PlaceFit"]
+    fits: list[ShapeFit]
     apart: list[Place]
     scales: Mapping[str, Scale]
     free: Noise
@@ -151,7 +134,7 @@ class StartedPlaces:
     @property
     def misfit(self) -> float:
         """Mean square of the best correction's normalised innovations."""
-        return float(np.nanmean(np.square(self.fits[0].fit.evaluation.w)))
+        return float(np.nanmean(np.square(self.fits[0].evaluation.w)))
 
 
 def start_places(model: ProcessModel, run: Run, nominal: Fit, noise: Noise) -> StartedPlaces:
@@ -163,18 +146,17 @@ def start_places(model: ProcessModel, run: Run, nominal: Fit, noise: Noise) -> S
         nominal: fit without any cause.
         noise: noise levels of its filter.
     """
-    declared, period_min = places_of(model), float(np.median(np.diff(run.time_min)))
+    declared = places_of(model)
     places = [place for place in declared if not any(place.name == item.apart for item in declared)]
     scales = scales_along(model, run, nominal.innovations.x, declared)
     residual = nominal.innovations.residual
-    sensor_sd = estimate_sensor_noise(noise, model.output_names, residual, run.measured, period_min)
+    sensor_sd = estimate_sensor_noise(noise, model.output_names, residual, run.measured, run.period_min)
     own = len(model.states)  # states of uncertain parameters follow
     wide = Noise(tuple(sensor_sd.tolist()), noise.process_sd[:own], noise.colored)
     free = Noise(wide.measurement_sd, (0.0,) * own, noise.colored)
     alone, apart = ([place for place in places if bool(place.apart) is flag] for flag in (False, True))
-    started: list[PlaceFit] = []
-    for place in alone:
-        started.append(_start(model, place, scales, run, wide, started))
+    nominals: dict[tuple[str, ...], FilterEvaluation] = {}
+    started = [_start(make_shape(model, place, scales), run, wide, nominals) for place in alone]
     return StartedPlaces(_fit_all(started, free), apart, scales, free, wide)
 
 
@@ -187,95 +169,84 @@ def fit_places(model: ProcessModel, run: Run, started: StartedPlaces) -> Unknown
         started: corrections with the sensors' noise alone.
     """
     fits, wide, free = list(started.fits), started.wide, started.free
-    if _log_p(fits[0].fit, run) >= DOUBTFUL or any(item.location == fits[0].place.location for item in started.apart):
-        fits += _fit_all([_start(model, place, started.scales, run, wide) for place in started.apart], free)
+    if _log_p(fits[0], run) >= DOUBTFUL or any(item.location == fits[0].place.location for item in started.apart):
+        shapes = [make_shape(model, place, started.scales) for place in started.apart]
+        fits += _fit_all([_start(shape, run, wide, {}) for shape in shapes], free)
         fits.sort(key=_bic)
     levels = _likely_noise(model, run, fits[0], free, wide)
-    fits = sorted((_refit(item, levels) for item in fits if item.fit.bic < fits[0].fit.bic + FAR), key=_bic)
-    return Unknown(tuple(fits), (), levels, _log_p(fits[0].fit, run))
+    fits = sorted((_refit(item, levels) for item in fits if item.bic < fits[0].bic + FAR), key=_bic)
+    return Unknown(tuple(fits), (), levels, _log_p(fits[0], run))
 
 
 def find_laws(model: ProcessModel, run: Run, found: Unknown) -> Unknown:
     """Fit laws in the best places."""
     laws: list[FittedLaw] = []
     for item in found.places[:NEAREST]:
-        if item.fit.bic < found.places[0].fit.bic + NEAR:
+        if item.bic < found.places[0].bic + NEAR:
             laws += _find_laws(model, item, run, found.noise)
     if not laws:
         return found
-    laws.sort(key=lambda item: item.bic)
-    best = min(found.places[0].fit, laws[0].fit, key=lambda item: item.bic)
+    laws.sort(key=_bic)
+    best = min(found.places[0], laws[0].fit, key=_bic)
     return replace(found, laws=tuple(laws), log_p=_log_p(best, run))
 
 
-def _likely_noise(model: ProcessModel, run: Run, best: PlaceFit, free: Noise, wide: Noise) -> Noise:
+def _likely_noise(model: ProcessModel, run: Run, best: ShapeFit, free: Noise, wide: Noise) -> Noise:
     """Noise levels under the best correction or, if that has a kink between two hinges, under a law.
 
     Process noise is estimated only where the residual calls for it.
     """
-    fits = [best.fit]
-    if _log_p(best.fit, run) >= DOUBTFUL:
+    fits = [best]
+    if _log_p(best, run) >= DOUBTFUL:
         fits += [law.fit for law in _find_laws(model, best, run, free)[:1]]
-    fit = min(fits, key=lambda item: item.bic)
+    fit = min(fits, key=_bic)
     if _log_p(fit, run) < DOUBTFUL:
         rms = np.sqrt(np.nanmean(np.square(np.clip(fit.evaluation.w, -HUBER, HUBER)), axis=0))
         return Noise(tuple((np.array(free.measurement_sd) * rms).tolist()), free.process_sd, free.colored)
     smallest = [SMALLEST_SHARE * item for item in wide.measurement_sd]
-    found = best.fitter.estimate_noise(best.fit, wide, smallest)
+    found = best.fitter.estimate_noise(best, wide, smallest)
     # The states that a correction adds, such as that of a lag, are its own; other corrections do not have them.
     return Noise(found.measurement_sd, found.process_sd[: len(model.states)], found.colored)
 
 
-def _start(
-    model: ProcessModel,
-    place: Place,
-    scales: Mapping[str, Scale],
-    run: Run,
-    wide: Noise,
-    others: Sequence[PlaceFit] = (),
-) -> PlaceFit:
+def _start(shape: Shape, run: Run, wide: Noise, nominals: dict[tuple[str, ...], FilterEvaluation]) -> ShapeFit:
     """First steps of a fit, with process noise; without any correction all filters with the same states are equal."""
-    fitter = ShapeFitter(make_shape(model, place, scales), run, wide)
-    alike = (item for item in others if item.fitter.shape.model.state_names == fitter.shape.model.state_names)
-    first = next((item.nominal for item in alike), None)
-    nominal = fitter.evaluate(np.zeros(len(fitter.shape.parameters))).evaluation if first is None else first
-    zero = np.zeros(len(fitter.shape.parameters))
-    return PlaceFit(place, fitter.fit(zero, wide, FIRST_STEPS, first=nominal), fitter, nominal)
+    fitter, zero, states = ShapeFitter(shape, run, wide), np.zeros(len(shape.parameters)), shape.model.state_names
+    if states not in nominals:
+        nominals[states] = fitter.evaluate(zero).evaluation
+    return fitter.fit(zero, wide, FIRST_STEPS, first=nominals[states])
 
 
-def _fit_all(started: list[PlaceFit], free: Noise) -> list[PlaceFit]:
+def _fit_all(started: Sequence[ShapeFit], free: Noise) -> list[ShapeFit]:
     """Fits without process noise of the most promising places, the best first."""
     started = sorted(started, key=_bic)
-    near = [item for i, item in enumerate(started) if i < PROMISING or item.fit.bic < started[0].fit.bic + NEAR]
+    near = [item for i, item in enumerate(started) if i < PROMISING or item.bic < started[0].bic + NEAR]
     return sorted((_refit(item, free) for item in near), key=_bic)
 
 
-def _refit(item: PlaceFit, noise: Noise) -> PlaceFit:
-    return replace(item, fit=item.fitter.fit(item.fit.coefficients, noise, STEPS))
+def _refit(item: ShapeFit, noise: Noise) -> ShapeFit:
+    return item.fitter.fit(item.coefficients, noise, STEPS)
 
 
-def _bic(item: PlaceFit) -> float:
-    return item.fit.bic
+def _bic(item: ShapeFit | FittedLaw) -> float:
+    return item.bic
 
 
 def _log_p(fit: ShapeFit, run: Run) -> float:
     return float(np.max(minus_log10_p(fit.evaluation.w, run.inputs)))
 
 
-def _find_laws(model: ProcessModel, item: PlaceFit, run: Run, noise: Noise) -> list[FittedLaw]:
-    """Best forms in a place, fitted inside the simulation."""
-    dynamics = item.fitter.dynamics(item.fit)
-    lag_min = item.fit.shape.lag_min(item.fit.coefficients)
-    variables = variables_along(model, run, item.fit.evaluation.innovations.x, item.place, lag_min)
-    candidates = FormulaSearch(item.place, item.fit, dynamics, run, variables).candidates()
+def _find_laws(model: ProcessModel, smooth: ShapeFit, run: Run, noise: Noise) -> list[FittedLaw]:
+    """Best forms in the place of a smooth correction, fitted inside the simulation."""
+    variables = variables_along(model, run, smooth.evaluation.innovations.x, smooth.place, smooth.lag_min)
+    candidates = FormulaSearch(smooth, smooth.fitter.dynamics(smooth), run, variables).candidates()
     result = []
-    for candidate in candidates[:FORMULAS]:
-        if candidate.bic > candidates[0].bic + WORTH:
+    for bic, law in candidates[:FORMULAS]:
+        if bic > candidates[0][0] + WORTH:
             break
-        fitter = ShapeFitter(law_shape(model, item.place, candidate.law), run, noise)
-        fit = fitter.fit(np.zeros(len(candidate.law.parameters)), noise, STEPS, select=False)
-        values = dict(zip(candidate.law.parameters, fit.coefficients.tolist(), strict=True))
-        moved = {name: value + values[name] for name, value in candidate.law.parameters.items()}
-        law = msgspec.structs.replace(candidate.law, parameters=moved)
-        result.append(FittedLaw(law, fit, fitter, item.place, _log_p(fit, run)))
-    return sorted(result, key=lambda item: item.bic)
+        fitter = ShapeFitter(law_shape(model, smooth.place, law), run, noise)
+        fit = fitter.fit(np.zeros(len(law.parameters)), noise, STEPS, select=False)
+        moved = zip(law.parameters.items(), fit.coefficients.tolist(), strict=True)
+        law = msgspec.structs.replace(law, parameters={name: value + by for (name, value), by in moved})
+        result.append(FittedLaw(law, fit, _log_p(fit, run)))
+    return sorted(result, key=_bic)

@@ -16,16 +16,32 @@ LONGEST, LONGEST_NEW = 60, 30
 
 _SUM, _PRODUCT, _SIGN, _ATOM = 1, 2, 3, 4
 _DEPTH = 50
-_FUNCTIONS = {
+_SPACE = '<mspace width="0.2em"/>'
+_NAMES = {
     ca.OP_FMAX: "max", ca.OP_FMIN: "min", ca.OP_SIN: "sin", ca.OP_COS: "cos", ca.OP_TAN: "tan", ca.OP_TANH: "tanh",
     ca.OP_SINH: "sinh", ca.OP_COSH: "cosh", ca.OP_ATAN: "arctan", ca.OP_LOG: "ln", ca.OP_SIGN: "sign",
     ca.OP_FABS: "abs", ca.OP_ERF: "erf", ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil",
 }  # fmt: skip
-_WITH_SIGN = {
-    ca.OP_ADD, ca.OP_SUB, ca.OP_NEG, ca.OP_MUL, ca.OP_TWICE, ca.OP_DIV, ca.OP_INV, ca.OP_EXP, ca.OP_SQ, ca.OP_POW,
-    ca.OP_CONSTPOW, ca.OP_SQRT, ca.OP_IF_ELSE_ZERO, ca.OP_NOT,
-}  # fmt: skip
 _RELATIONS = {ca.OP_LT: "&lt;", ca.OP_LE: "≤", ca.OP_EQ: "=", ca.OP_NE: "≠", ca.OP_AND: "∧", ca.OP_OR: "∨"}
+_POWER = ("<msup><mrow>{}</mrow><mrow>{}</mrow></msup>", _ATOM, (_ATOM, 0))
+_FORMS: dict[int, tuple[str, int, tuple[int, ...]]] = {
+    ca.OP_ADD: ("{}<mo>+</mo>{}", _SUM, (_SUM, _SUM)),
+    ca.OP_SUB: ("{}<mo>−</mo>{}", _SUM, (_SUM, _PRODUCT)),
+    ca.OP_NEG: ("<mo>−</mo>{}", _SUM, (_PRODUCT,)),
+    ca.OP_MUL: (f"{{}}{_SPACE}{{}}", _PRODUCT, (_PRODUCT, _PRODUCT)),
+    ca.OP_TWICE: (f"<mn>2</mn>{_SPACE}{{}}", _PRODUCT, (_PRODUCT,)),
+    ca.OP_DIV: ("<mfrac><mrow>{}</mrow><mrow>{}</mrow></mfrac>", _ATOM, (0, 0)),
+    ca.OP_INV: ("<mfrac><mn>1</mn><mrow>{}</mrow></mfrac>", _ATOM, (0,)),
+    ca.OP_EXP: ("<msup><mi>e</mi><mrow>{}</mrow></msup>", _ATOM, (0,)),
+    ca.OP_SQ: ("<msup><mrow>{}</mrow><mn>2</mn></msup>", _ATOM, (_ATOM,)),
+    ca.OP_POW: _POWER,
+    ca.OP_CONSTPOW: _POWER,
+    ca.OP_SQRT: ("<msqrt>{}</msqrt>", _ATOM, (0,)),
+    ca.OP_IF_ELSE_ZERO: (f"{{1}}{_SPACE}<mo>[</mo>{{0}}<mo>]</mo>", _PRODUCT, (0, _PRODUCT)),
+    ca.OP_NOT: ("<mo>¬</mo>{}", _SIGN, (_ATOM,)),
+    **{key: (f"{{}}<mo>{sign}</mo>{{}}", _SUM, (_SUM, _SUM)) for key, sign in _RELATIONS.items()},
+}
+"""For each operation its text, its precedence, and the precedence that each operand needs."""
 
 
 def to_mathml(expression: ca.SX, before: ca.SX | None = None, new: ca.SX | None = None) -> str:
@@ -103,46 +119,18 @@ class _Writer:
         if now.is_symbolic():
             return name(now.name())
         op, parts = now.op(), [now.dep(index) for index in range(now.n_dep())]
-
-        def part(index: int, inner: int = 0) -> str:
-            return self.text(parts[index], before[index] if depends_on(parts[index], self._new) else None, inner)
-
-        match op:
-            case ca.OP_ADD:
-                return _within(f"{part(0, _SUM)}<mo>+</mo>{part(1, _SUM)}", _SUM, binds)
-            case ca.OP_SUB:
-                return _within(f"{part(0, _SUM)}<mo>−</mo>{part(1, _PRODUCT)}", _SUM, binds)
-            case ca.OP_NEG:
-                return _within(f"<mo>−</mo>{part(0, _PRODUCT)}", _SUM, binds)
-            case ca.OP_MUL:
-                sign = "<mo>·</mo>" if parts[1].is_constant() else '<mspace width="0.2em"/>'
-                return _within(f"{part(0, _PRODUCT)}{sign}{part(1, _PRODUCT)}", _PRODUCT, binds)
-            case ca.OP_TWICE:
-                return _within(f'<mn>2</mn><mspace width="0.2em"/>{part(0, _PRODUCT)}', _PRODUCT, binds)
-            case ca.OP_DIV:
-                return f"<mfrac><mrow>{part(0)}</mrow><mrow>{part(1)}</mrow></mfrac>"
-            case ca.OP_INV:
-                return f"<mfrac><mn>1</mn><mrow>{part(0)}</mrow></mfrac>"
-            case ca.OP_EXP:
-                return f"<msup><mi>e</mi><mrow>{part(0)}</mrow></msup>"
-            case ca.OP_SQ:
-                return f"<msup><mrow>{part(0, _ATOM)}</mrow><mn>2</mn></msup>"
-            case ca.OP_POW | ca.OP_CONSTPOW:
-                return f"<msup><mrow>{part(0, _ATOM)}</mrow><mrow>{part(1)}</mrow></msup>"
-            case ca.OP_SQRT:
-                return f"<msqrt>{part(0)}</msqrt>"
-            case ca.OP_IF_ELSE_ZERO:
-                return _within(
-                    f'{part(1, _PRODUCT)}<mspace width="0.2em"/><mo>[</mo>{part(0)}<mo>]</mo>', _PRODUCT, binds
-                )
-            case ca.OP_NOT:
-                return _within(f"<mo>¬</mo>{part(0, _ATOM)}", _SIGN, binds)
-            case _ if op in _RELATIONS:
-                return _within(f"{part(0, _SUM)}<mo>{_RELATIONS[op]}</mo>{part(1, _SUM)}", _SUM, binds)
-            case _ if op in _FUNCTIONS:
-                listed = "<mo>,</mo>".join(part(index) for index in range(len(parts)))
-                return f'<mi mathvariant="normal">{_FUNCTIONS[op]}</mi><mo>(</mo>{listed}<mo>)</mo>'
-        raise ValueError(f"operation {op} has no sign")
+        if op not in _FORMS and op not in _NAMES:
+            raise ValueError(f"operation {op} has no sign")
+        form, own, inner = _FORMS.get(op, ("", _ATOM, (0,) * len(parts)))
+        if op == ca.OP_MUL and parts[1].is_constant():
+            form = form.replace(_SPACE, "<mo>·</mo>")
+        texts = [
+            self.text(part, was if depends_on(part, self._new) else None, needed)
+            for part, was, needed in zip(parts, before, inner, strict=False)
+        ]
+        if op in _NAMES:
+            return f'<mi mathvariant="normal">{_NAMES[op]}</mi><mo>(</mo>{"<mo>,</mo>".join(texts)}<mo>)</mo>'
+        return _within(form.format(*texts), own, binds)
 
 
 def depends_on(expression: ca.SX, symbols: ca.SX) -> bool:
@@ -169,7 +157,7 @@ def _count(expression: ca.SX, so_far: int, enough: int) -> int:
     so_far += 1
     if expression.is_symbolic() or expression.is_constant():
         return so_far
-    if expression.op() not in _WITH_SIGN | _FUNCTIONS.keys() | _RELATIONS.keys():
+    if expression.op() not in _FORMS and expression.op() not in _NAMES:
         return enough + 1
     for index in range(expression.n_dep()):
         if so_far > enough:

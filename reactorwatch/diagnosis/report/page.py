@@ -1,11 +1,9 @@
 """A diagnosis as one self-contained page without scripts, readable in light and dark mode."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from math import isfinite
 from pathlib import PurePath
 from shlex import quote
-from types import MappingProxyType
 
 import jinja2
 
@@ -41,30 +39,6 @@ _PAGES = jinja2.Environment(
 )
 
 
-NO_ORIGIN: Mapping[str, str] = MappingProxyType({})
-
-
-@dataclass(frozen=True)
-class _CauseRow:
-    name: str
-    profile: str
-    label: str
-    place: str
-    size: str
-    when: str
-    symbol: str
-    course: str
-    parameters: tuple[tuple[str, str], ...]
-
-
-@dataclass(frozen=True)
-class _AlternativeRow:
-    label: str
-    place: str
-    size: str
-    when: str
-
-
 def as_page(
     diagnosis: Diagnosis,
     model: ProcessModel,
@@ -74,7 +48,7 @@ def as_page(
     experiment_file: str = "experiment.csv",
     *,
     on_the_bus: bool = True,
-    origin: Mapping[str, str] = NO_ORIGIN,
+    origin: Mapping[str, str] | None = None,
 ) -> str:
     """Page as HTML.
 
@@ -86,15 +60,16 @@ def as_page(
         model_file: name of the extended model's file.
         experiment_file: name of the proposed input's file.
         on_the_bus: true if there are nodes that could use the model.
-        origin: when and from what the page was made, by name; empty: not stated.
+        origin: when and from what the page was made, by name; None: not stated.
 
     Raises:
         ValueError: the diagnosis has no curves.
     """
     catalogue = {effect.name: effect for effect in effects}
     causing = [catalogue[cause.cause] for cause in diagnosis.causes]
-    meant = meanings(causing)
-    rivals = _alternatives(diagnosis, effects) if diagnosis.verdict == AMBIGUOUS else []
+    rivals: list[tuple[tuple[Cause, ...], float]] = []
+    if diagnosis.verdict == AMBIGUOUS:
+        rivals = [(diagnosis.causes, 0.0), *((item.explanation, item.delta_bic) for item in diagnosis.alternatives)]
     return _PAGES.get_template("page.html.j2").render(
         diagnosis=diagnosis,
         file=file,
@@ -105,13 +80,14 @@ def as_page(
             else describe_verdict(diagnosis)
         ),
         place=describe_location(diagnosis) if diagnosis.verdict != NOMINAL else "",
-        causes=[
-            _describe_cause(diagnosis, effects, cause, item.symbol)
-            for cause, item in zip(diagnosis.causes, meant, strict=True)
-        ],
         alternatives=rivals,
-        parameters=[(name, describe_parameter(item)) for name, item in diagnosis.parameters.items()],
-        meanings=meant,
+        where=describe_place,
+        when=describe_timing,
+        size=lambda cause: describe_size(cause, effects),
+        course=lambda name: next((item.meaning for item in PROFILES if item.name == name), name),
+        numbers=lambda cause: _parameters(cause, effects),
+        parameter=describe_parameter,
+        meanings=meanings(causing),
         equations=balances(model, causing),
         outputs=pictures.outputs(diagnosis, model),
         closer=pictures.closer(diagnosis, model) if diagnosis.causes else [],
@@ -125,52 +101,24 @@ def as_page(
         white=WHITE,
         evidence=_evidence(diagnosis, effects),
         experiment=[] if diagnosis.experiment is None else pictures.experiment(diagnosis.experiment, model),
-        separations=[] if diagnosis.experiment is None else _separations(diagnosis.experiment),
         experiment_file=experiment_file,
         experiment_command=_experiment_command(diagnosis.experiment, experiment_file, model.name),
         model_file=model_file,
         commands=_commands(file, model_file, on_the_bus=on_the_bus),
         origin=origin,
         error=lambda value: f"{value:.3g}" if isfinite(value) else "ran away",
+        percent=lambda share: "over 99 %" if share > 0.99 else f"{100.0 * share:.0f} %",
     )
 
 
-def _alternatives(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[list[_AlternativeRow], str]]:
-    """All explanations that the record does not separate, and the difference of each to the first in BIC."""
-    explanations = [(diagnosis.causes, 0.0), *((item.explanation, item.delta_bic) for item in diagnosis.alternatives)]
+def _parameters(cause: Cause, effects: Sequence[Effect]) -> list[tuple[str, str]]:
+    """Parameters of a cause, each with its name; a curve is better seen than read."""
+    size = f"{describe_size(cause, effects)}; m = {format_interval(cause.parameters['size'])}"
     return [
-        (
-            [
-                _AlternativeRow(
-                    item.label, describe_place(item.location), describe_size(item, effects), describe_timing(item)
-                )
-                for item in causes
-            ],
-            f"{worse:.1f}",
-        )
-        for causes, worse in explanations
+        (name.replace("_", " "), size if name == "size" else format_interval(item))
+        for name, item in cause.parameters.items()
+        if cause.profile != FREE_NAME or name == "size"
     ]
-
-
-def _describe_cause(diagnosis: Diagnosis, effects: Sequence[Effect], cause: Cause, symbol: str) -> _CauseRow:
-    profile = next((item for item in PROFILES if item.name == cause.profile), None)
-    return _CauseRow(
-        cause.cause,
-        cause.profile,
-        cause.label,
-        describe_place(cause.location),
-        describe_size(cause, effects),
-        describe_timing(cause, diagnosis.curves),
-        symbol,
-        cause.profile if profile is None else profile.meaning,
-        tuple(
-            (name.replace("_", " "), f"{describe_size(cause, effects)}; m = {format_interval(item)}")
-            if name == "size"
-            else (name.replace("_", " "), format_interval(item))
-            for name, item in cause.parameters.items()
-            if cause.profile != FREE_NAME or name == "size"  # a curve is better seen than read
-        ),
-    )
 
 
 def _strips(item: Difference) -> list[tuple[str, list[tuple[str, str, int]]]]:
@@ -201,17 +149,6 @@ def _evidence(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[str
     rows = [(best, "0")]
     rows += [(describe_causes(item.causes, effects), f"{item.delta_bic:.1f}") for item in diagnosis.alternatives]
     return [*rows, ("the simulation as it was", f"{diagnosis.gain.delta_bic:,.1f}")]
-
-
-def _separations(experiment: Experiment) -> list[tuple[str, str, str]]:
-    return [
-        (" or ".join(item.between), f"{item.expected_delta_bic:.1f}", _percent(item.probability))
-        for item in experiment.separations
-    ]
-
-
-def _percent(share: float) -> str:
-    return "over 99 %" if share > 0.99 else f"{100.0 * share:.0f} %"
 
 
 def _experiment_command(experiment: Experiment | None, experiment_file: str, process: str) -> str:

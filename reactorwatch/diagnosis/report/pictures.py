@@ -8,7 +8,7 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.report.svg import Band, Line, plot
 from reactorwatch.diagnosis.result import NOMINAL, SD_95, Cause, Curves, Diagnosis, Experiment
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import Output, ProcessModel
 
 BEFORE_ROWS, AFTER_ROWS = 100, 200
 """Rows of the close-up, before and after its centre."""
@@ -16,11 +16,7 @@ BEFORE_ROWS, AFTER_ROWS = 100, 200
 RESIDUALS_SHOWN = (4.0, 0.99, 1.25)
 """Axis of residuals: at least this many standard deviations, or this factor times this quantile."""
 
-MEASURED = ("measured", "measured")
-BEFORE = ("simulation as it was", "before")
-AFTER = ("extended simulation", "after")
-RIGHT = ("simulation", "after")
-LIMITS = ("limits", "limit")
+EXTENDED = "extended simulation"
 
 
 @dataclass(frozen=True)
@@ -38,35 +34,39 @@ class Picture:
     drawing: str
 
 
+def _draw(
+    title: str,
+    alternative: str,
+    time_min: Array,
+    items: Sequence[Line | Band],
+    moments_min: Sequence[float] = (),
+    shown: tuple[float, float] | None = None,
+    unit: str = "min",
+) -> Picture:
+    """Picture with a text alternative; for the other arguments see `plot`."""
+    legend = dict.fromkeys((item.text, item.kind) for item in items if item.text)
+    return Picture(title, tuple(legend), plot(alternative, time_min, items, moments_min, shown, unit))
+
+
 def outputs(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
     """Measurements of each output, with the simulation before and with the extended one."""
-    curves = _curves(diagnosis)
-    moments = _onsets(diagnosis.causes)
-    result = []
-    for output in model.outputs:
-        if diagnosis.verdict == NOMINAL:
-            lines = [(MEASURED, curves.measured), (RIGHT, curves.simulated_before)]
-        else:
-            lines = [(MEASURED, curves.measured), (BEFORE, curves.simulated_before)]
-        result.append(_picture(f"{output.name}, {output.unit}", curves, output.name, lines, moments))
-        if diagnosis.is_extended:
-            lines[1] = (AFTER, curves.simulated_after)
-            result.append(_picture(f"{output.name}, {output.unit}", curves, output.name, lines, moments))
-    return result
+    nominal = diagnosis.verdict == NOMINAL
+    simulations = [("simulation", "after") if nominal else ("simulation as it was", "before")]
+    simulations += [(EXTENDED, "after")] if diagnosis.is_extended else []
+    return [
+        _picture(diagnosis, output, [simulation], slice(None)) for output in model.outputs for simulation in simulations
+    ]
 
 
 def closer(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
     """Close-up of the rows where the two models differ: outputs and inputs."""
     curves = _curves(diagnosis)
     rows = _rows_of_interest(curves, diagnosis.causes)
-    moments = _onsets(diagnosis.causes)
-    lines = [(MEASURED, curves.measured), (BEFORE, curves.simulated_before), (AFTER, curves.simulated_after)]
-    result = [
-        _picture(f"{output.name}, {output.unit}", curves, output.name, lines, moments, rows) for output in model.outputs
-    ]
+    both = [("simulation as it was", "before"), (EXTENDED, "after")]
+    result = [_picture(diagnosis, output, both, rows) for output in model.outputs]
     for item in model.inputs:
-        drawing = plot(item.name, curves.time_min[rows], [Line(curves.inputs[item.name][rows], "input", held=True)])
-        result.append(Picture(f"{item.name}, {item.unit}", ((item.meaning, "input"),), drawing))
+        line = Line(curves.inputs[item.name][rows], "input", item.meaning, held=True)
+        result.append(_draw(f"{item.name}, {item.unit}", item.name, curves.time_min[rows], [line]))
     return result
 
 
@@ -88,16 +88,10 @@ def residuals(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
             least, share, more = RESIDUALS_SHOWN
             finite = np.abs(values[np.isfinite(values)])
             reach = max(more * float(np.quantile(finite, share)) if finite.size else 0.0, least)
-            drawing = plot(
-                f"residual of {output.name}, {text}",
-                curves.time_min,
-                [Line(values, kind)],
-                [Band(-ends, ends, "expected")],
-                _onsets(diagnosis.causes),
-                (-reach, reach),
-            )
-            legend = ((text, kind), ("95 % of noise", "expected"))
-            result.append(Picture(f"Residual of {output.name}, standard deviations", legend, drawing))
+            items: list[Line | Band] = [Line(values, kind, text), Band(-ends, ends, "expected", "95 % of noise")]
+            alternative, title = f"residual of {output.name}, {text}", f"Residual of {output.name}, standard deviations"
+            moments = _onsets(diagnosis.causes)
+            result.append(_draw(title, alternative, curves.time_min, items, moments, (-reach, reach)))
     return result
 
 
@@ -105,18 +99,11 @@ def courses(diagnosis: Diagnosis) -> list[Picture]:
     """Deviation of each cause over time, with its 95 % band."""
     curves, result = _curves(diagnosis), []
     for cause in diagnosis.causes:
-        course = curves.deviation[cause.cause]
-        lower, upper = interval(cause, curves)
-        unit = cause.parameters["size"].unit
-        drawing = plot(
-            f"course of {cause.label}",
-            curves.time_min,
-            [Line(course, "after")],
-            [Band(lower, upper, "certain")],
-            shown=_with_zero(course, lower, upper),
-        )
-        title = f"Size m of: {cause.label}{'' if unit == '1' else f', {unit}'}"
-        result.append(Picture(title, (("most likely", "after"), ("95 % interval", "certain")), drawing))
+        course, ends = curves.deviation[cause.cause], interval(cause, curves)
+        items: list[Line | Band] = [Line(course, "after", "most likely"), Band(*ends, "certain", "95 % interval")]
+        title = f"Size m of: {cause.label}{_unit(cause.parameters['size'].unit)}"
+        shown = _with_zero(course, *ends)
+        result.append(_draw(title, f"course of {cause.label}", curves.time_min, items, shown=shown))
     return result
 
 
@@ -125,29 +112,24 @@ def experiment(proposed: Experiment, model: ProcessModel) -> list[Picture]:
     curves = proposed.curves
     if curves is None:
         raise ValueError("an experiment without its curves cannot be drawn")
-    names = list(curves.outputs)
-    kinds = [f"alternative{index}" for index in range(len(names))]
-    item = model.inputs[0]
-    lines = [Line(curves.level, "input", held=True), *_limits(proposed, item.name, curves.time_min.size)]
-    drawing = plot(f"proposed {item.name}", curves.time_min, lines)
-    result = [Picture(f"{item.name}, {item.unit}", ((item.meaning, "input"), LIMITS), drawing)]
-    for output in model.outputs:
-        values = [curves.outputs[name][output.name] for name in names]
-        lines = [Line(column, kind) for column, kind in zip(values, kinds, strict=True)]
-        drawing = plot(
-            f"predicted {output.name}", curves.time_min, [*lines, *_limits(proposed, output.name, curves.time_min.size)]
-        )
-        legend = tuple(zip(names, kinds, strict=True))
-        result.append(Picture(f"{output.name}, {output.unit}, as predicted under each", (*legend, LIMITS), drawing))
-        lines = [Line(column - values[0], kind) for column, kind in zip(values[1:], kinds[1:], strict=True)]
-        drawing = plot(f"differences of predicted {output.name}", curves.time_min, lines)
-        title = f"{output.name}, {output.unit}, less what is predicted under {names[0]}"
-        result.append(Picture(title, legend[1:], drawing))
+    first, item = next(iter(curves.outputs)), model.inputs[0]
+    limits = {
+        name: [Line(np.full(curves.time_min.size, end), "limit", "limits") for end in proposed.limits[name]]
+        for name in (item.name, *model.output_names)
+    }
+    items = [Line(curves.level, "input", item.meaning, held=True), *limits[item.name]]
+    result = [_draw(f"{item.name}, {item.unit}", f"proposed {item.name}", curves.time_min, items)]
+    for name, unit in ((output.name, output.unit) for output in model.outputs):
+        lines = [
+            Line(columns[name], f"alternative{index}", label)
+            for index, (label, columns) in enumerate(curves.outputs.items())
+        ]
+        title = f"{name}, {unit}, as predicted under each"
+        result.append(_draw(title, f"predicted {name}", curves.time_min, [*lines, *limits[name]]))
+        apart = [Line(line.values - lines[0].values, line.kind, line.text) for line in lines[1:]]
+        title = f"{name}, {unit}, less what is predicted under {first}"
+        result.append(_draw(title, f"differences of predicted {name}", curves.time_min, apart))
     return result
-
-
-def _limits(proposed: Experiment, name: str, rows: int) -> list[Line]:
-    return [Line(np.full(rows, end), "limit") for end in proposed.limits[name]]
 
 
 def law(diagnosis: Diagnosis) -> list[Picture]:
@@ -157,17 +139,16 @@ def law(diagnosis: Diagnosis) -> list[Picture]:
     result = []
     for curve in diagnosis.law.curves:
         half = SD_95 * curve.smooth_sd
-        drawing = plot(
-            f"missing term over {curve.variable}",
-            curve.values,
-            [Line(curve.smooth, "after"), Line(curve.formula, "limit")],
-            [Band(curve.smooth - half, curve.smooth + half, "certain")],
-            shown=_with_zero(curve.smooth, curve.smooth - half, curve.smooth + half),
-            unit=curve.unit,
-        )
-        unit = "" if diagnosis.law.unit == "1" else f", {diagnosis.law.unit}"
-        legend = (("smooth curve", "after"), ("95 % interval", "certain"), (diagnosis.law.formula, "limit"))
-        result.append(Picture(f"Missing term{unit}, over {curve.variable}", legend, drawing))
+        ends = curve.smooth - half, curve.smooth + half
+        items: list[Line | Band] = [
+            Line(curve.smooth, "after", "smooth curve"),
+            Band(*ends, "certain", "95 % interval"),
+            Line(curve.formula, "limit", diagnosis.law.formula),
+        ]
+        title = f"Missing term{_unit(diagnosis.law.unit)}, over {curve.variable}"
+        shown = _with_zero(curve.smooth, *ends)
+        alternative = f"missing term over {curve.variable}"
+        result.append(_draw(title, alternative, curve.values, items, shown=shown, unit=curve.unit))
     return result
 
 
@@ -177,14 +158,13 @@ def unknown_course(diagnosis: Diagnosis) -> list[Picture]:
     unknown = curves.unknown
     if unknown is None:
         return []
-    drawing = plot(
-        "course of the unknown input",
-        curves.time_min,
-        [Line(unknown.size, "after")],
-        shown=_with_zero(unknown.size, unknown.size, unknown.size),
-    )
-    unit = "" if unknown.unit == "1" else f", {unknown.unit}"
-    return [Picture(f"Estimated as the size of: {unknown.label}{unit}", (("most likely", "after"),), drawing)]
+    title, shown = f"Estimated as the size of: {unknown.label}{_unit(unknown.unit)}", _with_zero(*(unknown.size,) * 3)
+    line = Line(unknown.size, "after", "most likely")
+    return [_draw(title, "course of the unknown input", curves.time_min, [line], shown=shown)]
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else f", {unit}"
 
 
 def interval(cause: Cause, curves: Curves) -> tuple[Array, Array]:
@@ -201,23 +181,19 @@ def interval(cause: Cause, curves: Curves) -> tuple[Array, Array]:
     return np.clip(lower, min(ends), max(ends)), np.clip(upper, min(ends), max(ends))
 
 
-def _picture(
-    title: str,
-    curves: Curves,
-    output: str,
-    lines: Sequence[tuple[tuple[str, str], dict[str, Array]]],
-    moments_min: Sequence[float],
-    rows: slice = slice(None),
-) -> Picture:
-    drawn = [Line(columns[output][rows], kind) for (_, kind), columns in lines]
-    measured = curves.measured[output][rows]
-    models = np.concatenate([curves.simulated_before[output][rows], curves.simulated_after[output][rows], measured])
-    finite = models[np.isfinite(models)]
-    shown = (float(finite.min()), float(finite.max())) if finite.size else None  # one scale for before and after
-    drawing = plot(
-        f"{title}: {', '.join(text for (text, _), _ in lines)}", curves.time_min[rows], drawn, (), moments_min, shown
+def _picture(diagnosis: Diagnosis, output: Output, simulations: Sequence[tuple[str, str]], rows: slice) -> Picture:
+    """Measurements of an output and simulations by text and kind, all on the scale of both simulations."""
+    curves, title = _curves(diagnosis), f"{output.name}, {output.unit}"
+    measured, before, after = (
+        columns[output.name][rows] for columns in (curves.measured, curves.simulated_before, curves.simulated_after)
     )
-    return Picture(title, tuple(key for key, _ in lines), drawing)
+    models = np.concatenate([before, after, measured])
+    finite = models[np.isfinite(models)]
+    shown = (float(finite.min()), float(finite.max())) if finite.size else None
+    lines = [Line(measured, "measured", "measured")]
+    lines += [Line(after if text == EXTENDED else before, kind, text) for text, kind in simulations]
+    alternative = f"{title}: {', '.join(line.text for line in lines)}"
+    return _draw(title, alternative, curves.time_min[rows], lines, _onsets(diagnosis.causes), shown)
 
 
 def _rows_of_interest(curves: Curves, causes: Sequence[Cause]) -> slice:

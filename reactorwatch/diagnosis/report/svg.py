@@ -29,28 +29,40 @@ class Line:
     Attributes:
         values: shape (rows,); NaN leaves a gap.
         kind: class in the style sheet.
+        text: text in the legend; empty: none.
         held: true if each value holds until the next row.
     """
 
     values: Array
     kind: str
+    text: str = ""
     held: bool = False
+
+    @property
+    def extent(self) -> tuple[Array, ...]:
+        """Values that the axis has to show."""
+        return (self.values,)
 
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Area between two lines, each of shape (rows,)."""
+    """Area between two lines, each of shape (rows,); `kind` and `text` as those of a line."""
 
     lower: Array
     upper: Array
     kind: str
+    text: str = ""
+
+    @property
+    def extent(self) -> tuple[Array, ...]:
+        """Values that the axis has to show."""
+        return self.lower, self.upper
 
 
 def plot(
     title: str,
     time_min: Array,
-    lines: Sequence[Line],
-    bands: Sequence[Band] = (),
+    items: Sequence[Line | Band],
     moments_min: Sequence[float] = (),
     shown: tuple[float, float] | None = None,
     unit: str = "min",
@@ -60,15 +72,12 @@ def plot(
     Args:
         title: text alternative.
         time_min: shape (rows,), at least two.
-        lines: lines in drawing order, above the bands.
-        bands: areas.
+        items: lines and bands in drawing order; lines are above the bands.
         moments_min: times of vertical lines.
         shown: lowest and highest value of the axis; None: those of the data.
         unit: unit of the horizontal axis, if it is another variable than time.
     """
-    values = np.concatenate(
-        [*(line.values for line in lines), *(part for band in bands for part in (band.lower, band.upper))]
-    )
+    values = np.concatenate([values for item in items for values in item.extent])
     finite = values[np.isfinite(values)]
     across = _Time(float(time_min[0]), float(time_min[-1]))
     low, high = shown or (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
@@ -78,9 +87,9 @@ def plot(
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">',
         _grid(up),
         f'<svg {area} viewBox="{LEFT} {TOP} {WIDTH - LEFT - RIGHT} {HEIGHT - TOP - BOTTOM}">',  # cuts off
-        *(_band(band, time_min, across, up) for band in bands),
+        *(_band(item, time_min, across, up) for item in items if isinstance(item, Band)),
         *(_vertical(across.place(moment)) for moment in moments_min if across.first <= moment <= across.last),
-        *(_line(line, time_min, across, up) for line in lines),
+        *(_line(item, time_min, across, up) for item in items if isinstance(item, Line)),
         "</svg>",
         _frame(across, up, unit),
         "</svg>",
@@ -120,22 +129,24 @@ class _Time:
     last: float
 
     def place(self, time_min: float) -> float:
-        share = (time_min - self.first) / (self.last - self.first)
-        return LEFT + share * (WIDTH - LEFT - RIGHT)
+        return float(self.places(np.array(time_min)))
+
+    def places(self, time_min: Array) -> Array:
+        return LEFT + (time_min - self.first) / (self.last - self.first) * (WIDTH - LEFT - RIGHT)
 
     def ticks(self) -> list[tuple[float, str]]:
         result = axis(self.first, self.last, 8)
-        return [
-            (self.place(float(tick)), label)
-            for tick, label in zip(result.ticks, result.labels, strict=True)
-            if self.first <= tick <= self.last
-        ]
+        ticks = zip(result.ticks, result.labels, strict=True)
+        return [(self.place(float(tick)), label) for tick, label in ticks if self.first <= tick <= self.last]
+
+
+def _heights(up: Axis, values: Array) -> Array:
+    return np.asarray(TOP + (1.0 - up.share(values)) * (HEIGHT - TOP - BOTTOM))
 
 
 def _line(line: Line, time_min: Array, across: _Time, up: Axis) -> str:
     times, values = decimate(time_min, line.values)
-    x = LEFT + (times - across.first) / (across.last - across.first) * (WIDTH - LEFT - RIGHT)
-    y = TOP + (1.0 - up.share(values)) * (HEIGHT - TOP - BOTTOM)
+    x, y = across.places(times), _heights(up, values)
     step = np.diff(times, prepend=times[0])
     begins = ~np.isfinite(np.append(np.nan, y[:-1])) | (step > GAP * max(float(np.median(step[1:])), 1e-12))
     drawn = []
@@ -151,8 +162,7 @@ def _band(band: Band, time_min: Array, across: _Time, up: Axis) -> str:
     edges = []
     for values in (band.lower, band.upper):
         times, kept = decimate(time_min, values, columns)
-        x = LEFT + (times - across.first) / (across.last - across.first) * (WIDTH - LEFT - RIGHT)
-        y = TOP + (1.0 - up.share(kept)) * (HEIGHT - TOP - BOTTOM)
+        x, y = across.places(times), _heights(up, kept)
         there = np.isfinite(y)
         edges.append(
             [f"{at:.1f} {height:.1f}" for at, height in zip(x[there].tolist(), y[there].tolist(), strict=True)]
@@ -165,8 +175,7 @@ def _vertical(x: float) -> str:
 
 
 def _grid(up: Axis) -> str:
-    heights = TOP + (1.0 - up.share(up.ticks)) * (HEIGHT - TOP - BOTTOM)
-    drawn = "".join(f"M{LEFT} {y:.1f}H{WIDTH - RIGHT}" for y in heights.tolist())
+    drawn = "".join(f"M{LEFT} {y:.1f}H{WIDTH - RIGHT}" for y in _heights(up, up.ticks).tolist())
     return f'<path class="grid" d="{drawn}"/>'
 
 
@@ -180,7 +189,6 @@ def _frame(across: _Time, up: Axis, unit: str) -> str:
         at, anchor = (place, "middle") if place < WIDTH - LABEL_ROOM else (WIDTH - RIGHT, "end")
         spare = " spare" if (len(ticks) - number) % 2 else ""  # left out where the text is large
         parts.append(f'<text class="across{spare}" x="{at:.1f}" y="{floor + 17}" text-anchor="{anchor}">{label}</text>')
-    for share, label in zip(up.share(up.ticks).tolist(), up.labels, strict=True):
-        y = TOP + (1.0 - share) * (floor - TOP)
+    for y, label in zip(_heights(up, up.ticks).tolist(), up.labels, strict=True):
         parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
     return "".join(parts)

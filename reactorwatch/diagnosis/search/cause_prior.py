@@ -6,7 +6,6 @@ that are both there from the beginning have 1/n of the prior odds of one, known 
 set in later are not charged for it: one may follow from the other, and a time of its own is evidence of each.
 """
 
-from dataclasses import dataclass
 from math import log
 
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
@@ -19,20 +18,10 @@ FROM_BEGINNING = frozenset(("constant", "sine", "free"))
 """Profiles without an onset."""
 
 
-@dataclass(frozen=True)
-class CausePrior:
-    """Prior of the hypotheses of one search.
-
-    Attributes:
-        n_causes: number of possible causes.
-    """
-
-    n_causes: int
-
-    def cost(self, hypothesis: Hypothesis) -> float:
-        """Minus twice the logarithm of the prior odds of a hypothesis against a single named cause."""
-        effects, profiles = hypothesis.filter.effects, hypothesis.profiles
-        result = SOURCE_COST * sum(effect.is_source for effect in effects)
-        if len(effects) > 1 and all(profile.name in FROM_BEGINNING for profile in profiles):
-            result += 2.0 * log(self.n_causes)
-        return result
+def prior_cost(hypothesis: Hypothesis, n_causes: int) -> float:
+    """Minus twice the logarithm of the prior odds of a hypothesis against a single named cause, of so many possible."""
+    effects, profiles = hypothesis.filter.effects, hypothesis.profiles
+    result = SOURCE_COST * sum(effect.is_source for effect in effects)
+    if len(effects) > 1 and all(profile.name in FROM_BEGINNING for profile in profiles):
+        result += 2.0 * log(n_causes)
+    return result

@@ -106,23 +106,23 @@ class DynamicEffectsScreen:
         t = self._run.time_min
         candidates = [_candidate(effect, self._constant, a.sum(), b.sum(), ())]
         later_a, later_b = _sums_to_end(a), _sums_to_end(b)
-        index = _best(later_a, later_b, effect)
-        candidates.append(_candidate(effect, self._step, later_a[index], later_b[index], (t[index],)))
         moments = [_sums_to_end(item * t**power) for item in (a, b) for power in (0, 1, 2)]
         span = np.maximum(t[-1] - t, self._ramp.period_min)
         grown_a = (moments[1] - t * moments[0]) / span
         grown_b = np.maximum(moments[5] - 2 * t * moments[4] + t**2 * moments[3], 0.0) / span**2
-        index = _best(grown_a, grown_b, effect)
-        candidates.append(_candidate(effect, self._ramp, grown_a[index], grown_b[index], (t[index],)))
+        onsets: list[tuple[FittedProfile, Array, Array, tuple[float, ...]]]
+        onsets = [(self._step, later_a, later_b, ()), (self._ramp, grown_a, grown_b, ())]
         for share in DECAYS:
             constant = share * self._run.span_min
             remaining = np.exp((t[-1] - t) / constant)  # backwards from the end
             short_a, short_b, shorter_b = (
                 _sums_to_end(item * w) / w for item, w in ((a, remaining), (b, remaining), (b, remaining**2))
             )
-            grown_a, grown_b = later_a - short_a, np.maximum(later_b - 2.0 * short_b + shorter_b, 0.0)
-            index = _best(grown_a, grown_b, effect)
-            candidates.append(_candidate(effect, self._decay, grown_a[index], grown_b[index], (t[index], constant)))
+            grown_b = np.maximum(later_b - 2.0 * short_b + shorter_b, 0.0)
+            onsets.append((self._decay, later_a - short_a, grown_b, (constant,)))
+        for profile, of_a, of_b, shape in onsets:
+            index = _best(of_a, of_b, effect)
+            candidates.append(_candidate(effect, profile, of_a[index], of_b[index], (t[index], *shape)))
         hats = self._free.basis_functions(np.empty(0))[0]
         A, B = hats.T @ a, hats.T @ (hats * b[:, None])
         by = np.clip(np.asarray(np.linalg.lstsq(B, A, rcond=1e-9)[0]), effect.lower, effect.upper)

@@ -20,7 +20,7 @@ from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.bounded_least_squares import solve_bounded
 from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, PiecewiseLinear, Sine
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.screen import KNOTS, Screen, all_finite
+from reactorwatch.diagnosis.search.screen import KNOTS, Part, Screen, all_finite, first_of_each
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect
 
@@ -37,29 +37,24 @@ class CandidatePair:
     """Two causes with profiles that may explain the innovations.
 
     Attributes:
-        parts: for each the effect, its profile and initial parameters.
+        parts: the causes with initial parameters.
         score: predicted gain in BIC.
     """
 
-    parts: tuple[tuple[Effect, FittedProfile, Array], ...]
+    parts: tuple[Part, ...]
     score: float
 
     @property
     def causes(self) -> frozenset[str]:
         """Names of the causes."""
-        return frozenset(effect.name for effect, _, _ in self.parts)
+        return frozenset(part.effect.name for part in self.parts)
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
-    """Columns of one cause with one kind of profile.
+class _Block:
+    """Columns of one cause with a profile at nonlinear parameters, shape (values, n_linear).
 
-    Attributes:
-        effect: the cause.
-        profile: profile of the effects.
-        shape: nonlinear parameters of the profile.
-        size: magnitude at a coefficient of 1, of an effect with internal states; None: 1.
-        columns: signature of each basis function, shape (values, n_linear).
+    An effect with internal states has a size: its magnitude at a coefficient of 1.
     """
 
     effect: Effect
@@ -101,14 +96,14 @@ class PairScreen:
             return []
         return self._rank(blocks, w, count)
 
-    def _static_blocks(self, dynamics: ErrorDynamics) -> Iterator[Block]:
+    def _static_blocks(self, dynamics: ErrorDynamics) -> Iterator[_Block]:
         """Every static effect as a constant and as a curve."""
         interval_mean, sample_value = self._free.basis_signals(np.empty(0))[:2]
         for cause, effect in enumerate(self._screen.static_effects):
             g = signatures.forward_signatures(dynamics, cause, interval_mean[1:-1], sample_value[2:]).reshape(-1, KNOTS)
             yield from self._blocks_of(effect, None, g)
 
-    def _dynamic_blocks(self, dynamic: Sequence["DynamicSignature"], w: Array) -> Iterator[Block]:
+    def _dynamic_blocks(self, dynamic: Sequence["DynamicSignature"], w: Array) -> Iterator[_Block]:
         """Every effect with internal states as a constant at each magnitude, and as a curve at the best of them."""
         hats = self._free.basis_functions(np.empty(0))[0][2:]
         for effect in dict.fromkeys(item.effect for item in dynamic):
@@ -123,17 +118,17 @@ class PairScreen:
                 if gain == best:
                     yield curve
 
-    def _blocks_of(self, effect: Effect, size: float | None, g: Array) -> Iterator[Block]:
+    def _blocks_of(self, effect: Effect, size: float | None, g: Array) -> Iterator[_Block]:
         if np.all(np.isfinite(g)):
-            yield Block(effect, self._constant, np.empty(0), size, g.sum(axis=1, keepdims=True))
-            yield Block(effect, self._free, np.empty(0), size, g)
+            yield _Block(effect, self._constant, np.empty(0), size, g.sum(axis=1, keepdims=True))
+            yield _Block(effect, self._free, np.empty(0), size, g)
 
-    def _sine_blocks(self, dynamics: ErrorDynamics, blocks: Sequence[Block], w: Array) -> Iterator[Block]:
+    def _sine_blocks(self, dynamics: ErrorDynamics, blocks: Sequence[_Block], w: Array) -> Iterator[_Block]:
         """Sines that stand out, also once the best other cause is removed."""
-        result: dict[tuple[str, float], Block] = {}
+        result: dict[tuple[str, float], _Block] = {}
         curves = [block for block in blocks if block.profile is self._free]
         by_gain = sorted(curves, key=lambda block: -_gain(block.columns, w)[0])
-        strongest = _of_different_causes(by_gain)[:REMOVED_CAUSES]
+        strongest = first_of_each(by_gain, lambda block: block.effect.name)[:REMOVED_CAUSES]
         for residual in [w, *(w - block.columns @ _gain(block.columns, w)[1] for block in strongest)]:
             about = replace(dynamics, w=residual.reshape(dynamics.w.shape))
             candidates = self._screen.sine_candidates(about, self._screen.static_effects)
@@ -146,10 +141,10 @@ class PairScreen:
                     interval_mean, sample_value = self._sine.basis_signals(period)[:2]
                     cause = self._screen.static_effects.index(candidate.effect)
                     g = signatures.forward_signatures(about, cause, interval_mean[1:-1], sample_value[2:])
-                    result[key] = Block(candidate.effect, self._sine, period, None, g.reshape(-1, 2))
+                    result[key] = _Block(candidate.effect, self._sine, period, None, g.reshape(-1, 2))
         yield from result.values()
 
-    def _rank(self, blocks: Sequence[Block], w: Array, count: int) -> list[CandidatePair]:
+    def _rank(self, blocks: Sequence[_Block], w: Array, count: int) -> list[CandidatePair]:
         """Best candidate of each pair of causes.
 
         Bounds only reduce a gain, so the bounded gain is computed for the most promising pairs alone, until the others
@@ -180,7 +175,7 @@ class PairScreen:
         return sorted(result, key=lambda item: -item.score)[:count]
 
     def _bound_gains(
-        self, blocks: Sequence[Block], places: Sequence[NDArray[np.int64]], gram: Array, by: Array
+        self, blocks: Sequence[_Block], places: Sequence[NDArray[np.int64]], gram: Array, by: Array
     ) -> list[tuple[float, int, int]]:
         """Gain in BIC of any two blocks without bounds, the largest first."""
         of_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
@@ -225,12 +220,12 @@ class DynamicSignature:
     g: Array
 
 
-def _part(block: Block, by: Array) -> tuple[Effect, FittedProfile, Array]:
+def _part(block: _Block, by: Array) -> Part:
     parameters = np.concatenate([by * (1.0 if block.size is None else block.size), block.shape])
-    return block.effect, block.profile, block.profile.clip(parameters, block.effect.lower, block.effect.upper)
+    return Part(block.effect, block.profile, block.profile.clip(parameters, block.effect.lower, block.effect.upper))
 
 
-def _range(block: Block) -> tuple[Array, Array]:
+def _range(block: _Block) -> tuple[Array, Array]:
     """Bounds of the coefficients. Internal states are not linear far beyond a magnitude that was evaluated."""
     effect, count = block.effect, block.columns.shape[1]
     lower, upper = (effect.lower, effect.upper) if not isinstance(block.profile, Sine) else (-inf, inf)
@@ -242,10 +237,3 @@ def _range(block: Block) -> tuple[Array, Array]:
 def _gain(columns: Array, w: Array) -> tuple[float, Array]:
     unbounded = np.full(columns.shape[1], inf)
     return solve_bounded(columns.T @ columns, columns.T @ w, -unbounded, unbounded)
-
-
-def _of_different_causes(blocks: Sequence[Block]) -> list[Block]:
-    result: dict[str, Block] = {}
-    for block in blocks:
-        result.setdefault(block.effect.name, block)
-    return list(result.values())

@@ -12,18 +12,16 @@ for whatever explains the remainder better, until nothing does. A pair is a stro
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from math import inf
 
 import numpy as np
 
-from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.fault_filter import FilterEvaluation, huber_clip
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Hypothesis
-from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, PiecewiseLinear, Signal
+from reactorwatch.diagnosis.fitting.profiles import Constant, PiecewiseLinear, Signal
 from reactorwatch.diagnosis.search.pair_screen import CandidatePair, DynamicSignature, PairScreen, can_be_together
-from reactorwatch.diagnosis.search.screen import KNOTS, Candidate
+from reactorwatch.diagnosis.search.screen import KNOTS, Candidate, Part
 from reactorwatch.diagnosis.search.search import IN_QUESTION, FittedHypothesis, Label, Search, SearchResult, keep_best
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p
 from reactorwatch.process.effect import Effect
@@ -45,15 +43,6 @@ ROUGH_STEPS, EXCHANGE_STEPS = 3, 6
 _NEAR = 0.05  # fraction of a pair's gain that a rough fit may lack
 
 
-@dataclass(frozen=True, eq=False)
-class Part:
-    """One cause of a pair."""
-
-    effect: Effect
-    profile: FittedProfile
-    parameters: Array
-
-
 def search_pairs(search: Search, result: SearchResult) -> SearchResult:
     """Search for pairs if the best single cause leaves enough for a second one.
 
@@ -64,7 +53,7 @@ def search_pairs(search: Search, result: SearchResult) -> SearchResult:
     single = result.best
     if not _may_have_second_cause(search, single):
         return result
-    pairs = PairSearch(search, result)
+    pairs = _PairSearch(search, result)
     best, by_label = pairs.search()
     if best is not None and pairs.gain(best) >= LEAST_PAIR_GAIN:
         return SearchResult(search.noise, result.nominal_noise, result.nominal, sorted(by_label.values(), key=_bic))
@@ -86,16 +75,8 @@ def _may_have_second_cause(search: Search, single: FittedHypothesis) -> bool:
     return any(candidate.score(search.run.values) > LEAST_PAIR_GAIN for candidate in candidates)
 
 
-class PairSearch:
-    """Searches one run for two causes.
-
-    Args:
-        search: search of the run.
-        result: result for single causes.
-
-    Attributes:
-        single: best single cause.
-    """
+class _PairSearch:
+    """Searches one run for two causes; `single` is the best single cause."""
 
     def __init__(self, search: Search, result: SearchResult) -> None:
         self._search, self._run, self._result = search, search.run, result
@@ -113,7 +94,7 @@ class PairSearch:
         if best is None:
             return None, {}
         self._search.update_noise(best)
-        return self._exchange(self._fit(_parts(best)))
+        return self._exchange(self._fit(best.parts))
 
     def _search_curves(self) -> FittedHypothesis | None:
         """Find the best pair with curves, and give each cause its simplest adequate profile."""
@@ -122,12 +103,12 @@ class PairSearch:
         candidates = self._screen_pairs(self._result.best)
         for _ in range(ROUNDS):
             untried = self._skip_tried(candidates, best)
-            rough = sorted((self._fit(_parts_of(item), ROUGH_STEPS) for item in untried), key=_bic)
+            rough = sorted((self._fit(item.parts, ROUGH_STEPS) for item in untried), key=_bic)
             if not rough:
                 break
             if best is None:
                 search.update_noise(rough[0])
-                rough = sorted((self._fit(_parts(item), ROUGH_STEPS) for item in rough[:AGAIN]), key=_bic)
+                rough = sorted((self._fit(item.parts, ROUGH_STEPS) for item in rough[:AGAIN]), key=_bic)
             before, near = best, min(item.bic for item in (*rough, best) if item is not None)
             near += _NEAR * max(nominal.bic - near, 0.0)
             refined = [self._refine(item) for item in rough[:REFINED] if item.bic <= near]
@@ -135,7 +116,7 @@ class PairSearch:
             if best is before:
                 break
             search.update_noise(best)
-            best = self._fit(_parts(best))
+            best = self._fit(best.parts)
             if self._largest_gain(best) < LEAST_PAIR_GAIN:
                 return None
             if not np.any(minus_log10_p(best.fit.w, self._run.inputs) > DOUBTFUL):
@@ -152,25 +133,25 @@ class PairSearch:
             nominal = self._result.nominal
             candidates = search.screen.candidates(nominal.hypothesis, nominal.fit)
             candidates = self._select_simple([item for item in candidates if not item.effect.is_source])
-            simple = [self._fit([_part_of(candidate)], EXCHANGE_STEPS) for candidate in candidates]
+            simple = [self._fit([candidate], EXCHANGE_STEPS) for candidate in candidates]
         if not simple:
             return None
         first = min(simple, key=_bic)
         search.update_noise(first)
         first = search.refit(first)
-        (part,) = _parts(first)
+        (part,) = first.parts
         candidates = search.screen.candidates(first.hypothesis, first.fit)
         others = [effect for effect in search.screen.dynamic_effects if can_be_together(effect, part.effect)]
         candidates += search.dynamic_screen.candidates(first.fit, partial(self._evaluate_with, [part]), others)
         candidates = self._select_simple([item for item in candidates if can_be_together(item.effect, part.effect)])
-        pairs = [self._fit([part, _part_of(candidate)], EXCHANGE_STEPS) for candidate in candidates]
+        pairs = [self._fit([part, candidate], EXCHANGE_STEPS) for candidate in candidates]
         if not pairs:
             return None
         best = min(pairs, key=_bic)
         search.update_noise(best)
-        best = self._exchange(self._fit(_parts(best)), curves=False)[0]
+        best = self._exchange(self._fit(best.parts), curves=False)[0]
         search.update_noise(best)
-        return self._fit(_parts(best))
+        return self._fit(best.parts)
 
     def _select_simple(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         """Select the best candidates of different causes that are not curves."""
@@ -181,7 +162,7 @@ class PairSearch:
     def gain(self, pair: FittedHypothesis) -> float:
         """Gain of a pair in BIC over the best single cause, either of the two included, at the present noise levels."""
         singles = [self._search.refit(self.single)] if self.single.label else [self._search.fit_nominal()]
-        singles += [self._fit([part]) for part in _parts(pair)]
+        singles += [self._fit([part]) for part in pair.parts]
         self.single = min(singles, key=_bic)
         return self.single.bic - pair.bic
 
@@ -213,7 +194,7 @@ class PairSearch:
         for turn in range(EXCHANGES):
             if turn:
                 search.update_noise(best)
-                best = self._fit(_parts(best))
+                best = self._fit(best.parts)
             best = search.with_selected_knots(best, EXCHANGE_STEPS)
             by_label, unchanged = {best.label: best}, best
             for index in (0, 1):
@@ -226,7 +207,7 @@ class PairSearch:
                     if isinstance(candidate.profile, PiecewiseLinear) and item.bic < best.bic + IN_QUESTION:
                         item = search.with_selected_knots(item, EXCHANGE_STEPS)
                     if item.bic < best.bic + NEAR_BEST:
-                        keep_best(by_label, self._fit(_parts(item), scan=candidate.effect.is_discontinuous))
+                        keep_best(by_label, self._fit(item.parts, scan=candidate.effect.is_discontinuous))
             best = min(by_label.values(), key=_bic)
             if best.label == unchanged.label:
                 break
@@ -249,26 +230,19 @@ class PairSearch:
                 for candidate in self._search.select(candidates, MOST_PROFILES, -inf, of_a_cause=MOST_PROFILES)
             ]
             best = min(items if provisional and items else [*items, about], key=_bic)
-        return self._fit(_parts(best))
+        return self._fit(best.parts)
 
     def _select_new(self, candidates: Sequence[Candidate], pair: FittedHypothesis) -> list[Candidate]:
         """Select candidates that differ from the pair's parts.
 
         With nonlinear parameters the same profile may have another optimum.
         """
-        fixed = [item for item in _parts(pair) if not item.profile.nonlinear_parameters]
-        kinds = {(item.effect.name, item.profile.name) for item in fixed}
-        return [item for item in candidates if (item.effect.name, item.profile.name) not in kinds]
+        fixed = {item.label for item in pair.parts if not item.profile.nonlinear_parameters}
+        return [item for item in candidates if item.label not in fixed]
 
     def _candidates(self, pair: FittedHypothesis, index: int, own: bool = False) -> list[Candidate]:
-        """Candidates to replace one cause of a pair.
-
-        Args:
-            pair: the pair.
-            index: index of the cause to replace.
-            own: only that cause itself, with any profile.
-        """
-        search, parts = self._search, _parts(pair)
+        """Candidates to replace one cause of a pair; with `own` that cause itself alone, with any profile."""
+        search, parts = self._search, pair.parts
         effect, other = parts[index].effect, parts[1 - index]
         candidates: list[Candidate] = []
         if not own or effect in search.screen.static_effects:
@@ -300,7 +274,7 @@ class PairSearch:
 
     def _dynamic_signatures(self, about: FittedHypothesis) -> list[DynamicSignature]:
         result = []
-        parts = _parts(about)
+        parts = about.parts
         own = {part.effect.name: index for index, part in enumerate(parts)}
         for effect in self._search.screen.dynamic_effects:
             starts = effect.start_values or (effect.typical,)
@@ -328,26 +302,10 @@ class PairSearch:
         return tuple(sorted(effects, key=lambda effect: self._order[effect.name]))
 
 
-def _parts_of(candidate: CandidatePair) -> list[Part]:
-    return [Part(*part) for part in candidate.parts]
-
-
-def _parts(fitted: FittedHypothesis) -> list[Part]:
-    hypothesis = fitted.hypothesis
-    whole = zip(hypothesis.filter.effects, hypothesis.profiles, fitted.fit.parameters, strict=True)
-    return [Part(*item) for item in whole]
-
-
-def _part_of(candidate: Candidate) -> Part:
-    return Part(candidate.effect, candidate.profile, candidate.parameters)
-
-
 def _replace_part(fitted: FittedHypothesis, index: int, candidate: Candidate, knots: int = KNOTS) -> list[Part]:
     """Replace one of the two; a curve gets at least this many knots."""
-    parts, part = _parts(fitted), _part_of(candidate)
-    parts[index] = (
-        _refine_knots(part, knots) if isinstance(candidate.profile, PiecewiseLinear) and knots > KNOTS else part
-    )
+    curve, parts = isinstance(candidate.profile, PiecewiseLinear), fitted.parts
+    parts[index] = _refine_knots(candidate, knots) if curve and knots > KNOTS else candidate
     return parts
 
 

@@ -8,9 +8,10 @@ causes that stand out are found.
 Effects with internal states, such as a lag, have no infinitesimal deviation; see `dynamic_effects_screen`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import inf, log
+from typing import TypeVar
 
 import numpy as np
 
@@ -49,23 +50,37 @@ _WELL_INSIDE = 0.6
 EDGE_ROWS = 5
 """Rows at both ends of the record without candidates of an onset."""
 
-_INNER = slice(EDGE_ROWS, -EDGE_ROWS)
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
-    """A cause with a profile that may explain the innovations.
+class Part:
+    """A cause with a profile, as part of an explanation.
 
     Attributes:
         effect: the cause.
         profile: profile of its deviation.
-        parameters: initial parameters for a fit.
-        gain: twice the log likelihood ratio that the linear model predicts.
+        parameters: parameters of the profile.
     """
 
     effect: Effect
     profile: FittedProfile
     parameters: Array
+
+    @property
+    def label(self) -> tuple[str, str]:
+        """Names of cause and profile."""
+        return self.effect.name, self.profile.name
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate(Part):
+    """A cause with a profile and initial parameters that may explain the innovations.
+
+    Attributes:
+        gain: twice the log likelihood ratio that the linear model predicts.
+    """
+
     gain: float
 
     def score(self, values: int) -> float:
@@ -95,7 +110,6 @@ class Screen:
         self.static_effects = tuple(effect for effect in effects if effect.extend(model).state_names == names)
         self.dynamic_effects = tuple(effect for effect in effects if effect not in self.static_effects)
         self._columns = (*self.static_effects, *variants_of(self.static_effects))
-        self._period_min = float(np.median(np.diff(run.time_min)))
         self._beta = np.diff(run.time_min[1:])
         t = run.time_min
         self._constant, self._step, self._ramp, self._decay = Constant(t), Step(t), Ramp(t), Decay(t)
@@ -137,10 +151,12 @@ class Screen:
 
         To first order a signature at constants between the start values is a sum of those at the start values.
         """
-        ones, w, result = np.ones((self._run.time_min.size - 2, 1)), dynamics.w.ravel(), []
-        for base in dict.fromkeys(item.effect for item in effects if isinstance(item, ConstantVariant)):
+        w, result = dynamics.w.ravel(), []
+        bases = dict.fromkeys(item.effect for item in effects if isinstance(item, ConstantVariant))
+        constant = signatures.constant_signatures(dynamics, len(effects)) if bases else np.empty((w.size, 0))
+        for base in bases:
             own = [index for index, item in enumerate(effects) if _base(item) is base]
-            g = np.column_stack([signatures.forward_signatures(dynamics, index, ones, ones).ravel() for index in own])
+            g = np.ascontiguousarray(constant[:, own])
             of_base = [item for item in candidates if _base(item.effect) is base and item.profile is self._constant]
             if of_base and np.all(np.isfinite(g)):
                 by = np.linalg.lstsq(g, w, rcond=1e-9)[0]
@@ -171,9 +187,8 @@ class Screen:
         ekf = hypothesis.filter
         if index == ekf.delay_index or ekf.effects[index].is_discontinuous or ekf.shifts_time(index):
             return huber_clip(hypothesis.innovations_without(self._run, fit, index)[2:]) - huber_clip(fit.w[2:])
-        signals = hypothesis.signals(fit)
-        dynamics = ekf.error_dynamics(self._run, signals, fit.innovations)
-        interval_mean, sample_value = signals[index][:2]
+        dynamics = hypothesis.error_dynamics(self._run, fit)
+        interval_mean, sample_value = hypothesis.signals(fit)[index][:2]
         return signatures.forward_signatures(
             dynamics, hypothesis.input_index(index), interval_mean[1:-1, None], sample_value[2:, None]
         )[:, :, 0]
@@ -222,24 +237,20 @@ class Screen:
         """Constants, steps, ramps and decays."""
         times, candidates = self._run.time_min[1:-1], []
         constants = self._run.span_min * np.array(DECAYS)
-        result = signatures.onset_scan(dynamics, *self._onset_laws(constants))
+        sums_a, sums_b = signatures.onset_scan(dynamics, *self._onset_laws(constants))
+        left_of_span = (self._step.end_min - times)[:, None]  # converts the slope of a ramp to its final size
+        sums_a[1], sums_b[1] = sums_a[1] / left_of_span, sums_b[1] / left_of_span**2
+        kinds: list[tuple[FittedProfile, int, tuple[float, ...]]]
+        kinds = [(self._step, EDGE_ROWS, ()), (self._ramp, EDGE_ROWS, ())]
+        kinds += [(self._decay, 0, (constant,)) for constant in constants.tolist()]
         for cause, effect in enumerate(effects):
-            size, gain = _best(result.step_a[:, cause], result.step_b[:, cause], effect)
+            size, gain = _best(sums_a[0, :, cause], sums_b[0, :, cause], effect)
             candidates.append(Candidate(effect, self._constant, size[:1], float(gain[0])))
-            index = EDGE_ROWS + int(np.argmax(gain[_INNER]))
-            candidates.append(Candidate(effect, self._step, np.array([size[index], times[index]]), float(gain[index])))
-            left_of_span = self._step.end_min - times  # converts the slope of a ramp to its final size
-            ends = result.other_a[0, :, cause] / left_of_span
-            size, gain = _best(ends, result.other_b[0, :, cause] / left_of_span**2, effect)
-            index = EDGE_ROWS + int(np.argmax(gain[_INNER]))
-            candidates.append(Candidate(effect, self._ramp, np.array([size[index], times[index]]), float(gain[index])))
-            for number, constant in enumerate(constants.tolist(), start=1):
-                size, gain = _best(result.other_a[number, :, cause], result.other_b[number, :, cause], effect)
-                index = int(np.argmax(gain[:-EDGE_ROWS]))
-                parameters = np.array([size[index], times[index], constant])
-                candidates.append(
-                    Candidate(effect, self._decay, self._decay.clip(parameters, -np.inf, np.inf), float(gain[index]))
-                )
+            for (profile, first, shape), a, b in zip(kinds, sums_a, sums_b, strict=True):
+                size, gain = _best(a[:, cause], b[:, cause], effect)
+                index = first + int(np.argmax(gain[first:-EDGE_ROWS]))
+                parameters = profile.clip(np.array([size[index], times[index], *shape]), -np.inf, np.inf)
+                candidates.append(Candidate(effect, profile, parameters, float(gain[index])))
         return candidates
 
     def _onset_laws(self, constants: Array) -> tuple[Array, Array, Array]:
@@ -253,11 +264,13 @@ class Screen:
     def sine_candidates(self, dynamics: ErrorDynamics, effects: Sequence[Effect]) -> list[Candidate]:
         """Best sine of each cause."""
         interval_mean, sample_value = signatures.adjoint(dynamics)
-        rows = round(self._run.span_min / self._period_min) + 1
-        index = np.round((self._run.time_min[1:] - self._sine.start_min) / self._period_min).astype(int)
+        rows = round(self._run.span_min / self._run.period_min) + 1
+        index = np.round((self._run.time_min[1:] - self._sine.start_min) / self._run.period_min).astype(int)
         count = 2 * rows
-        frequency = np.fft.rfftfreq(count, self._period_min)
-        inner = (frequency > 0.75 / self._run.span_min) & (frequency < 1.0 / (SHORTEST_PERIOD_ROWS * self._period_min))
+        frequency = np.fft.rfftfreq(count, self._run.period_min)
+        inner = (frequency > 0.75 / self._run.span_min) & (
+            frequency < 1.0 / (SHORTEST_PERIOD_ROWS * self._run.period_min)
+        )
         angle = 2.0 * np.pi * frequency[inner]
         candidates = []
         periods = np.geomspace(1.0 / frequency[inner][-1], 1.0 / frequency[inner][0], KNOWN_PERIODS)
@@ -274,7 +287,7 @@ class Screen:
             np.add.at(sums[1], index[1:], sample_value[:, cause])
             interval_sum, sample_sum = np.fft.rfft(sums, axis=1)[:, inner]
             # The mean of the sine over each interval acts on the states.
-            turn = np.exp(-0.5j * angle * self._period_min) * np.sinc(frequency[inner] * self._period_min)
+            turn = np.exp(-0.5j * angle * self._run.period_min) * np.sinc(frequency[inner] * self._run.period_min)
             total = interval_sum * turn + sample_sum
             squares = np.diag(signatures.gram(dynamics, cause, both[0][1:-1], both[1][2:])[1])
             b = 0.5 * squares.reshape(KNOWN_PERIODS, 2).sum(axis=1)
@@ -310,6 +323,14 @@ class Screen:
                 gain = float(gains[0])
             candidates.append(Candidate(effect, profile, np.append(by, shape), gain))
         return candidates
+
+
+def first_of_each(items: Iterable[Item], kind: Callable[[Item], str]) -> list[Item]:
+    """First item of each kind."""
+    result: dict[str, Item] = {}
+    for item in items:
+        result.setdefault(kind(item), item)
+    return list(result.values())
 
 
 def _base(effect: Effect) -> Effect:

@@ -20,13 +20,13 @@ from reactorwatch.diagnosis.fitting import grid_search, onset_refinement
 from reactorwatch.diagnosis.fitting.colored_noise import Noise, detect_colored_noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvaluation
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Fit, Hypothesis
-from reactorwatch.diagnosis.fitting.knot_selection import fine_grid, select_knots
+from reactorwatch.diagnosis.fitting.knot_selection import GRID, select_knots
 from reactorwatch.diagnosis.fitting.outliers import find_gross_outliers, find_outliers, remove_outliers
 from reactorwatch.diagnosis.fitting.profiles import LateSine, PiecewiseLinear, Signal, Sine
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.cause_prior import CausePrior
+from reactorwatch.diagnosis.search.cause_prior import prior_cost
 from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
-from reactorwatch.diagnosis.search.screen import Candidate, Screen
+from reactorwatch.diagnosis.search.screen import Candidate, Part, Screen, first_of_each
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
@@ -89,10 +89,15 @@ class FittedHypothesis:
     bic: float
 
     @property
+    def parts(self) -> list[Part]:
+        """Each effect with its profile and parameters."""
+        parts = zip(self.hypothesis.filter.effects, self.hypothesis.profiles, self.fit.parameters, strict=True)
+        return [Part(*item) for item in parts]
+
+    @property
     def label(self) -> Label:
         """(cause, profile) of its effects, in the order of their names."""
-        profiles = (profile.name for profile in self.hypothesis.profiles)
-        return tuple(sorted(zip(self.hypothesis.causes, profiles, strict=True)))
+        return tuple(sorted(part.label for part in self.parts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +138,6 @@ class Search:
         noise: noise levels with which all hypotheses are compared.
         screen: screen of the run.
         noise_effects: effects that change the noise of a sensor, which the screen leaves out.
-        prior: prior probabilities of the hypotheses.
     """
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run, smallest_sd: Sequence[float]) -> None:
@@ -142,12 +146,11 @@ class Search:
         self._filters: dict[tuple[str, ...], FaultFilter] = {}
         self._nominal_loss: tuple[Noise, float] | None = None
         self._recent: list[Noise] = []  # the latest first
-        self._period_min = float(np.median(np.diff(run.time_min)))
         self.noise = self._initial_noise()
         self.screen = Screen(model, [effect for effect in effects if not effect.is_noise], self.run)
         self.noise_effects = tuple(effect for effect in effects if effect.is_noise)
         self.dynamic_screen = DynamicEffectsScreen(self.screen.dynamic_effects, self.run)
-        self.prior = CausePrior(len(effects))
+        self._n_causes = len(effects)
 
     def search_single_causes(self) -> SearchResult:
         """Find the best hypotheses with one effect."""
@@ -156,8 +159,12 @@ class Search:
         dynamic_candidates = self._sort(dynamic)
         candidates = self._sort(self.screen.candidates(nominal.hypothesis, nominal.fit) + dynamic_candidates)
         best, by_label = nominal, dict[Label, FittedHypothesis]()
-        worth = [candidate for candidate in candidates if candidate.score(self.run.values) > _least_score(candidate)]
-        for number, candidate in enumerate(_of_different_causes(worth)):
+        worth = [
+            item
+            for item in candidates
+            if item.score(self.run.values) > (SCAN_SCORE if item.effect.is_discontinuous else FIRST_SCORE)
+        ]
+        for number, candidate in enumerate(first_of_each(worth, lambda item: item.effect.name)):
             if number >= (MOST_CANDIDATES if best is nominal else FIRST_CANDIDATES):
                 break
             item = self.fit_candidate(candidate)
@@ -178,11 +185,7 @@ class Search:
     def _alternate(
         self, best: FittedHypothesis, by_label: dict[Label, FittedHypothesis], dynamic_candidates: Sequence[Candidate]
     ) -> dict[Label, FittedHypothesis]:
-        """Estimate noise levels and search hypotheses in turn.
-
-        Returns:
-            All that were fitted with the noise levels of the best.
-        """
+        """Estimate noise levels and search in turn; returns all that were fitted with the noise levels of the best."""
         searched: FittedHypothesis | None = None
         dropped = set[Label]()
         for _ in range(ROUNDS):
@@ -196,9 +199,9 @@ class Search:
             candidates = self.screen.candidates(best.hypothesis, best.fit, replaced=(0,))
             least = max([LEAST_SCORE, *(self._least_score_beside(item) for item in candidates[:1])])
             extended = [*self._simpler_profiles(candidates, best), *dynamic_candidates]
-            extended = [item for item in extended if _label(item) not in dropped]
+            extended = [item for item in extended if (item.label,) not in dropped]
             for candidate in [*self.select(candidates, CANDIDATES, least), *extended]:
-                label = _label(candidate)
+                label: Label = (candidate.label,)
                 if label not in by_label or (label == best.label and self._is_distant(candidate, best)):
                     item = self.fit_candidate(candidate)
                     keep_best(by_label, self.with_selected_knots(item) if item.bic < best.bic + IN_QUESTION else item)
@@ -229,16 +232,16 @@ class Search:
         ekf.noise = self._without_process_noise(noise.measurement_sd)
         residual = ekf.evaluate(self.run, signals).innovations.residual
         self._use_noise(ekf)
-        colored = detect_colored_noise(noise, self._model.output_names, residual, self._period_min)
+        colored = detect_colored_noise(noise, self._model.output_names, residual, self.run.period_min)
         if not colored:
             return False
         noise = Noise(noise.measurement_sd, noise.process_sd, colored)
-        extended = FaultFilter(self._model, ekf.effects, noise, self._period_min)
+        extended = FaultFilter(self._model, ekf.effects, noise, self.run.period_min)
         extended.noise = extended.estimate_noise(self.run, signals, self._smallest_sd)
         gain = 2.0 * (ekf.evaluate(self.run, signals).loss - extended.evaluate(self.run, signals).loss)
         if gain < LEAST_SENSOR_GAIN + 2 * len(colored) * log(self.run.values):
             return False
-        nominal = FaultFilter(self._model, (), extended.noise, self._period_min)
+        nominal = FaultFilter(self._model, (), extended.noise, self.run.period_min)
         self._filters = {(): nominal}
         self.noise = nominal.noise = nominal.estimate_noise(self.run, (), self._smallest_sd)
         return True
@@ -290,7 +293,7 @@ class Search:
 
     @cached_property
     def _grid(self) -> PiecewiseLinear:
-        return fine_grid(self.run.time_min)
+        return PiecewiseLinear(self.run.time_min, GRID)
 
     def with_selected_knots(self, item: FittedHypothesis, steps: int = MOST_STEPS) -> FittedHypothesis:
         """Refit piecewise-linear profiles with the number of knots that they need, and sines that set in later."""
@@ -314,10 +317,8 @@ class Search:
             profiles[index] = late
             hypothesis = Hypothesis(item.hypothesis.filter, profiles)
             onsets = late.start_min + self.run.span_min * np.linspace(0.0, 0.9, SINE_ONSETS + 1)[1:]
-            tried = [list(item.fit.parameters) for _ in onsets]
-            for parameters, onset in zip(tried, onsets.tolist(), strict=True):
-                parameters[index] = late.from_sine(parameters[index], onset)
-            first = min(hypothesis.evaluate_all(self.run, tried), key=lambda fit: fit.loss)
+            tried = [late.from_sine(item.fit.parameters[index], onset) for onset in onsets.tolist()]
+            first = min(hypothesis.evaluate_values(self.run, item.fit, index, tried), key=lambda fit: fit.loss)
             if first.loss < item.fit.loss:
                 item = min(item, self.fit(hypothesis, first.parameters, steps, scan=False), key=lambda each: each.bic)
         return item
@@ -385,7 +386,7 @@ class Search:
         """Filter of the model with these effects, created once."""
         names = tuple(effect.name for effect in effects)
         if names not in self._filters:
-            self._filters[names] = FaultFilter(self._model, effects, self.noise, self._period_min)
+            self._filters[names] = FaultFilter(self._model, effects, self.noise, self.run.period_min)
         self._use_noise(self._filters[names])
         return self._filters[names]
 
@@ -396,7 +397,7 @@ class Search:
         """BIC of an existing fit."""
         charged = hypothesis.n_parameters - len(hypothesis.constant_indices)
         bic = 2.0 * fit.loss + charged * log(self.run.values) + hypothesis.constants_evidence(self.run, fit)
-        return FittedHypothesis(hypothesis, fit, bic + self.prior.cost(hypothesis))
+        return FittedHypothesis(hypothesis, fit, bic + prior_cost(hypothesis, self._n_causes))
 
 
 def keep_best(by_label: dict[Label, FittedHypothesis], item: FittedHypothesis) -> None:
@@ -407,22 +408,6 @@ def keep_best(by_label: dict[Label, FittedHypothesis], item: FittedHypothesis) -
 
 def _in_order(by_label: dict[Label, FittedHypothesis]) -> list[FittedHypothesis]:
     return sorted(by_label.values(), key=lambda item: item.bic)
-
-
-def _of_different_causes(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """First candidate of each cause."""
-    result: dict[str, Candidate] = {}
-    for candidate in candidates:
-        result.setdefault(candidate.effect.name, candidate)
-    return list(result.values())
-
-
-def _least_score(candidate: Candidate) -> float:
-    return SCAN_SCORE if candidate.effect.is_discontinuous else FIRST_SCORE
-
-
-def _label(candidate: Candidate) -> Label:
-    return ((candidate.effect.name, candidate.profile.name),)
 
 
 def smallest_noise(model: ProcessModel) -> list[float]:

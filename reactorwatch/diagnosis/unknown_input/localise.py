@@ -1,6 +1,6 @@
 """Localise a deviation that no effect of the catalogue explains.
 
-Each location is represented by the catalogue's effects there, and a balance also by a loss from it (`unmodelled_loss`):
+Each location is represented by the catalogue's effects there, and a balance also by a loss from it (`_loss`):
 anything else at that location acts on states and outputs as these do. Each effect gets a magnitude of unknown course
 (`forcing`), and the location whose forcing explains the run best is the result. All are compared by the same
 likelihood, with the same number of hyperparameters.
@@ -22,6 +22,7 @@ from reactorwatch.diagnosis.fitting.hypothesis import Fit
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.result import UnknownInputCurve
 from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.screen import first_of_each
 from reactorwatch.diagnosis.unknown_input.forcing import (
     Forcing,
     ForcingFit,
@@ -29,10 +30,9 @@ from reactorwatch.diagnosis.unknown_input.forcing import (
     LinearisedForcing,
     ReferenceTrajectory,
 )
-from reactorwatch.diagnosis.unknown_input.unmodelled_loss import balance_losses
 from reactorwatch.kalman.ekf import LEAST_PROCESS_SD, NoiseLevels
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import ProcessModel, Variable
 
 FIRST_REDS, FIRST_LASTS_MIN = (0.001, 0.03, 0.3, 3.0), (0.4, 3.0, 20.0)
 """Initial grid: red noise in typical magnitudes of the effect, and its time constant."""
@@ -104,7 +104,8 @@ def locate(
         noise: noise levels of the filter.
     """
     own = model.state_names
-    carriers = [effect for effect in (*effects, *balance_losses(model)) if effect.extend(model).state_names == own]
+    losses = (_loss(state) for state in model.states if state.balance)
+    carriers = [effect for effect in (*effects, *losses) if effect.extend(model).state_names == own]
     if has_feedback(run, nominal):
         carriers = [effect for effect in carriers if not _has_feedthrough(effect.extend(model))]
     if not carriers:
@@ -120,6 +121,31 @@ def locate(
         return None
     bic = 2.0 * best.fitted.loss + NUMBERS * log(run.values)
     return UnknownInput(best.forcing.effect, bic, best.size, reference.used)
+
+
+def _loss(state: Variable) -> Effect:
+    """Loss from a balance: it represents any deviation of the balance, for which the catalogue has no effect.
+
+    A fraction of the content leaves, as with any outflow from a mixed vessel. Anything that enters a balance comes from
+    a location of its own.
+    """
+
+    class Loss(Effect):
+        """The share m a minute of what is there is lost; where m is negative, gained."""
+
+        name = f"loss of {state.name}"
+        label = f"unknown loss from the balance of {state.name}"
+        location = state.balance
+        unit = "1/min"
+        lower = -10.0
+        upper = 10.0
+        typical = 0.03
+
+        def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+            """See `Effect`."""
+            return model.add_rate(state.name, -size * state.symbol)
+
+    return Loss()
 
 
 def has_feedback(run: Run, nominal: Fit) -> bool:
@@ -167,10 +193,8 @@ def _try_levels(forcing: Forcing, reference: ReferenceTrajectory, run: Run, nois
 
 def _best_by_location(trials: Sequence[_Trial]) -> list[_Trial]:
     """Best trial of each location, the best first."""
-    result: dict[str, _Trial] = {}
-    for item in sorted(trials, key=lambda item: item.fitted.loss):
-        result.setdefault(item.forcing.effect.location, item)
-    return list(result.values())
+    ordered = sorted(trials, key=lambda item: item.fitted.loss)
+    return first_of_each(ordered, lambda item: item.forcing.effect.location)
 
 
 def _refine(model: ProcessModel, run: Run, trial: _Trial, step: float) -> _Trial:

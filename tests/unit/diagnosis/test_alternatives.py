@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.experiment.alternative import Prediction, decision_probability, extrapolate
+from reactorwatch.diagnosis.experiment.predictions import Prediction, decision_probability, extrapolate
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis

@@ -7,10 +7,10 @@ import pytest
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.diagnosis.experiment.alternatives import Predictions
 from reactorwatch.diagnosis.experiment.constraints import check_limits, limits_of
 from reactorwatch.diagnosis.experiment.design import FEWEST, PATTERN_ROWS, propose_experiment
 from reactorwatch.diagnosis.experiment.input_sequence import HOLDS_ROWS, QUIET_ROWS, InputRange, initial_sequences
+from reactorwatch.diagnosis.experiment.predictions import Predictions
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
@@ -97,7 +97,7 @@ def test_the_proposed_input_tells_more_than_the_same_time_of_random_steps_within
         levels = np.repeat(np.random.default_rng(seed).uniform(97.0, 110.0, 120), 10)
         runs = alternatives.runs(levels)
         if runs is not None:
-            found.append(alternatives.noncentrality((0, 1), runs))
+            found.append(alternatives.members[1].noncentrality(runs[0]))
     assert len(found) >= 6
     assert experiment.expected_delta_bic * 120.0 / experiment.span_min > 1.5 * max(found)
 

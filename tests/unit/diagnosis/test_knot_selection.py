@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
-from reactorwatch.diagnosis.fitting.knot_selection import fine_grid, select_knots
+from reactorwatch.diagnosis.fitting.knot_selection import GRID, select_knots
 from reactorwatch.diagnosis.fitting.profiles import PiecewiseLinear
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search
 from reactorwatch.process.library.cstr.effects import EFFECTS
@@ -35,7 +35,8 @@ def test_it_has_the_knots_of_the_truth(shares: list[float], begun: int) -> None:
     fitted = curve(search, "coolant_flow", begun)
     search.update_noise(fitted)
     fitted = search.refit(fitted)
-    profile, parameters = select_knots(fine_grid(search.run.time_min), search.run, fitted.hypothesis, fitted.fit, 0)
+    grid = PiecewiseLinear(search.run.time_min, GRID)
+    profile, parameters = select_knots(grid, search.run, fitted.hypothesis, fitted.fit, 0)
     assert profile.n_linear == len(shares)
     np.testing.assert_allclose(parameters, -0.06 * np.array(shares), atol=0.003)
 

@@ -73,15 +73,15 @@ def test_backwards_sums_are_those_of_the_signatures(name: str, run: Run) -> None
     constant = 12.0
     gamma = np.exp(-step / constant)
     beta, mean = np.stack([step, 1 - gamma]), np.stack([0.5 * step, 1 - (1 - gamma) * constant / step])
-    set_in = signatures.onset_scan(ways, beta, np.stack([np.ones_like(step), gamma]), mean)
+    wg, gg = signatures.onset_scan(ways, beta, np.stack([np.ones_like(step), gamma]), mean)
     interval_mean, sample_value = signatures.adjoint(ways)
     end_min = float(run.time_min[-1])
     for row in (0, 100, 400):
         onset_min = float(run.time_min[row + 1])
         for profile, shape, a, b in (
-            (Step(run.time_min), [onset_min + 1e-9], set_in.step_a, set_in.step_b),
-            (Ramp(run.time_min), [onset_min], set_in.other_a[0], set_in.other_b[0]),
-            (Decay(run.time_min), [onset_min, constant], set_in.other_a[1], set_in.other_b[1]),
+            (Step(run.time_min), [onset_min + 1e-9], wg[0], gg[0]),
+            (Ramp(run.time_min), [onset_min], wg[1], gg[1]),
+            (Decay(run.time_min), [onset_min, constant], wg[2], gg[2]),
         ):
             size = end_min - onset_min if isinstance(profile, Ramp) else 1.0  # the sums are those of a slope of 1
             felt, seen = profile.basis_signals(np.array(shape))[:2]

@@ -1,4 +1,4 @@
-"""Predictions of an alternative explanation for a new input, and how well another alternative could imitate them.
+"""Predictions of alternative explanations for a new input, and how well each could imitate those of another.
 
 The causes stay in the plant: each keeps its magnitude at the end of the record, and a sine continues. So each
 alternative predicts the outputs for an input that has not been tried.
@@ -18,18 +18,25 @@ record: the record of the experiment has to decide by itself, also if the cause 
 together with the present record it says no less.
 """
 
+from collections.abc import Mapping, Sequence
+from itertools import combinations
 from math import sqrt
 
 import numpy as np
 from scipy import special
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.experiment.constraints import Limits, keeps_limits, limits_of
+from reactorwatch.diagnosis.experiment.input_sequence import InputRange
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.grid_search import fit_hypothesis
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, LateSine, Sine
 from reactorwatch.diagnosis.result import LISTED
 from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.search import FittedHypothesis
 from reactorwatch.process.integrate import SimulationError
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator, Trajectory
 
 REFINED_STEPS = 1
@@ -37,6 +44,11 @@ REFINED_STEPS = 1
 
 LARGEST_SHARE = 0.5
 """Fraction of the pattern's time: a sine with a longer period is taken as constant."""
+
+MARGIN_SD = 3.0
+"""Margin of an output to its limits, in standard deviations of its noise, so that the measurements keep them."""
+
+REST_ROWS = 300
 
 
 class Prediction:
@@ -67,8 +79,7 @@ class Prediction:
         )
         self._hypothesis, self._fit, self._pattern_min = hypothesis, fit, pattern_min
         self._simulator = Simulator(hypothesis.filter.full_model.model)
-        period_min = float(np.median(np.diff(run.time_min)))
-        time_min: Array = float(run.time_min[-1]) + period_min * np.arange(rest_rows + 1, dtype=np.float64)
+        time_min: Array = float(run.time_min[-1]) + run.period_min * np.arange(rest_rows + 1, dtype=np.float64)
         self.start_min = float(time_min[-1])
         self.n_parameters = self._extrapolate(time_min)[0].n_parameters
         finite = np.flatnonzero(np.all(np.isfinite(fit.innovations.x), axis=1))
@@ -121,6 +132,80 @@ class Prediction:
             return self._simulator.run(time_min, hypothesis.filter.full_model.inputs(time_min, inputs, signals), start)
         except SimulationError:
             return None
+
+
+class Predictions:
+    """Explanations of one record, extrapolated with other levels of the first input.
+
+    Args:
+        hypotheses: hypotheses fitted to the record.
+        run: the record.
+        model: process model without their causes.
+        noise: noise levels of the plant and its sensors.
+        given: limits by signal; for the others see `limits_of`.
+        pattern_rows: rows of the pattern, see `Prediction`.
+
+    Attributes:
+        pairs: indices of every two of them.
+        limits: limits of every signal.
+        rest: level of the first input at which the plant settles before, its median in the record.
+        period_min: sampling period.
+    """
+
+    def __init__(
+        self,
+        hypotheses: Sequence[FittedHypothesis],
+        run: Run,
+        model: ProcessModel,
+        noise: Noise,
+        given: Mapping[str, tuple[float, float]],
+        pattern_rows: int,
+    ) -> None:
+        self._outputs = model.output_names
+        self._margin = MARGIN_SD * noise.sensor_sd(model.output_names)
+        self.limits: Limits = limits_of(run, model, given)
+        self.period_min = run.period_min
+        low, high = self.limits[model.input_names[0]]
+        self._resting = np.median(run.inputs, axis=0)
+        rest = min(max(float(self._resting[0]), low), high)
+        self._resting[0] = self.rest = float(InputRange(low, high, rest).levels(np.zeros(1))[0])
+        for item in hypotheses:
+            item.hypothesis.filter.noise = noise
+        pattern_min = pattern_rows * self.period_min
+        self.members = tuple(
+            Prediction(item.hypothesis, item.fit, run, self._resting, REST_ROWS, pattern_min) for item in hypotheses
+        )
+        self.pairs = list(combinations(range(len(self.members)), 2))
+
+    def runs(self, levels: Array) -> list[Run] | None:
+        """Noise-free records that each predicts; None if an output of any leaves its limits.
+
+        Args:
+            levels: levels of the first input, shape (rows,).
+        """
+        time_min = self.members[0].start_min + self.period_min * np.arange(levels.size, dtype=np.float64)
+        inputs = np.tile(self._resting, (levels.size, 1))
+        inputs[:, 0] = levels
+        result = []
+        for alternative in self.members:
+            outputs = alternative.predict_outputs(time_min, inputs)
+            if outputs is None or not keeps_limits(outputs, self.limits, self._outputs, self._margin):
+                return None
+            result.append(Run(time_min, inputs, outputs))
+        return result
+
+    def noncentralities(self, runs: Sequence[Run]) -> dict[tuple[int, int], float]:
+        """Twice the log likelihood ratio of each, if true, over each other, without noise.
+
+        Unlike `Prediction.noncentrality` it comes from fits, so it contains the nonlinearity of the equations.
+        """
+        result = {}
+        for true, run in enumerate(runs):
+            own = self.members[true].own_loss(run)
+            for other, alternative in enumerate(self.members):
+                if other != true:
+                    result[true, other] = max(2.0 * (alternative.loss(run) - own), 0.0)
+        return result
 
 
 def extrapolate(
