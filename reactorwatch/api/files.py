@@ -71,15 +71,24 @@ def described_process(path: Path, plant: str | None = None, choice: ProcessChoic
     return recorded_process(path, plant) or choice.load()
 
 
-def process_on_clock(choice: ProcessChoice, described: "Process", zero_ns: int) -> "Process":
-    """A described process on the clock of a record.
+def record_of_process(
+    path: Path, plant: str | None, columns: dict[str, str], choice: ProcessChoice, stated: FileFormat
+) -> tuple[Record, "Process"]:
+    """Read a file as a record of its process, and load the process on the clock of the record.
 
     Args:
-        choice: the choice by which it was described.
-        described: see `described_process`.
-        zero_ns: zero of the record's minutes, from which those of a chosen extended model are counted.
+        path: see `record`.
+        plant: see `record`.
+        columns: see `record`.
+        choice: see `described_process`; the minutes of an extended model are counted from the record's zero.
+        stated: see `record`.
+
+    Raises:
+        InputError: as `record` and `described_process`.
     """
-    return described if choice.is_default else choice.load(zero_ns)
+    described = described_process(path, plant, choice)
+    measured = record(path, plant, columns, described, stated)
+    return measured, described if choice.is_default else choice.load(measured.zero_ns)
 
 
 class MessageSource(NamedTuple):
@@ -162,15 +171,6 @@ def open_messages(
     given_ns = zero_from(metadata, 0) if ZERO_NS in metadata else None
     process = recorded_process(path, plant) if choice.is_default else choice.load()
     return MessageSource(read, given_ns, has_clock(metadata), process=process)
-
-
-def messages(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Iterator[Encoded]:
-    """Read the messages of a file in the order of receipt; those of a table are its samples.
-
-    Raises:
-        InputError: as `record`.
-    """
-    return open_messages(path, plant, columns).messages
 
 
 def expand_folder(folder: Path) -> list[Path]:

@@ -1,50 +1,37 @@
 """`alarm`: an operator's commands for alarms of the running monitor, and of the recorder for its own."""
 
 import time
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
-from reactorwatch.cli.command_client import TIMEOUT_S, LateReplyError, NoReplyError, send_command
-from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Settings, check_encodable
-from reactorwatch.cli.printing import print_lines
+from reactorwatch.cli.command_client import MONITOR, LateReplyError, NoReplyError, send_command
+from reactorwatch.cli.option_groups import new_group
+from reactorwatch.cli.options import ClientOptions, Json, check_encodable
+from reactorwatch.cli.printing import json_line, print_lines
 from reactorwatch.contract.keys import ACKNOWLEDGE_RECORDER, LIST_RECORDER_ALARMS, RECORDING
 from reactorwatch.errors import InputError
 
 if TYPE_CHECKING:
-    from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand
+    from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, ShelveAlarm
 
-Name = Annotated[
-    str, typer.Argument(help="As `alarm list` names it: shewhart/T.", callback=check_encodable, show_default=False)
-]
-By = Annotated[str, typer.Option("--by", help="Who you are.", callback=check_encodable, show_default=False)]
-Comment = Annotated[str, typer.Option("--comment", help="Why.", callback=check_encodable, show_default=False)]
-Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the monitor.", min=0.1, max=MAX_WAIT_S)]
+_NAME = Argument(help="As `alarm list` names it: shewhart/T.", callback=check_encodable)
+Name = Annotated[str, _NAME]
+By = Annotated[str, Option(help="Who you are.", callback=check_encodable)]
+Comment = Annotated[str, Option(help="Why.", callback=check_encodable, show_default=False)]
 
-MONITOR, RECORDER = "monitor", "recorder"
-
-alarms = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+RECORDER = "recorder"
 
 
-def register_commands(app: typer.Typer) -> None:
-    """Register the commands."""
-    app.add_typer(alarms, name="alarm", help="List, acknowledge, shelve, suppress or comment the alarms of a plant.")
-    app.command("ack", help="Acknowledge alarms: short for `alarm acknowledge`.")(acknowledge)
-
-
-@alarms.command("list")
 def list_alarms(
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
-    timeout: Timeout = TIMEOUT_S,
-    normal: Annotated[bool, typer.Option("--normal", help="Normal ones, too.")] = False,
+    *,
+    client: ClientOptions,
+    normal: Annotated[bool, Option("--normal", help="Normal ones, too.")] = False,
     json: Json = False,
 ) -> None:
     """Show the alarms that are not normal, the most urgent first; --json has all of them."""
-    alarms = _list(config, endpoint, name, timeout)
+    alarms = _list(client)
     if json:
         _show(alarms, json=True)
         return
@@ -58,27 +45,19 @@ def list_alarms(
         return
     plant_ns = max((alarm.time_ns for alarm in alarms if not _is_recorders(alarm.alarm)), default=0)
     print_rows(alarm_rows(shown, Now(plant_ns, time.time_ns())))
-    advice = advise_acknowledgement(shown, name)
+    advice = advise_acknowledgement(shown, client.name)
     if advice:
         print_headline(advice, FAINT)
 
 
-@alarms.command("acknowledge")
 def acknowledge(
+    *,
     by: By,
-    alarm: Annotated[
-        str | None,
-        typer.Argument(help="As `alarm list` names it: shewhart/T.", callback=check_encodable, show_default=False),
-    ] = None,
-    incident: Annotated[
-        int | None, typer.Option("--incident", help="All alarms of this incident.", min=1, max=2**63 - 1)
-    ] = None,
-    every: Annotated[bool, typer.Option("--all", help="All alarms, of every incident.")] = False,
+    alarm: Annotated[str | None, _NAME] = None,
+    incident: Annotated[int | None, Option(help="All alarms of this incident.", min=1, max=2**63 - 1)] = None,
+    every: Annotated[bool, Option("--all", help="All alarms, of every incident.")] = False,
     comment: Comment = "",
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
-    timeout: Timeout = TIMEOUT_S,
+    client: ClientOptions,
     json: Json = False,
 ) -> None:
     """Acknowledge an alarm, those of an incident, or all."""
@@ -86,30 +65,21 @@ def acknowledge(
 
     if (alarm is not None) + (incident is not None) + every != 1:
         raise InputError("name one of: an alarm such as shewhart/T, --incident N, or --all")
-    if alarm is not None:
-        chosen = [AlarmCommand(alarm=alarm)]
-    elif incident is not None:
-        chosen = [AlarmCommand(incident=incident)]
-    else:
-        chosen = _acknowledge_all(_list(config, endpoint, name, timeout))
+    chosen = _acknowledge_all(_list(client)) if every else [AlarmCommand(alarm=alarm, incident=incident)]
     changed: list[Alarm] = []
     for command in chosen:
         command.by, command.comment = by, comment
-        node, command_name = _route(command.alarm, "acknowledge")
-        changed += send_command(node, config, endpoint, name, timeout, command_name, command).alarms
+        changed += _send("acknowledge", command, client)
     _show(changed, json=json)
 
 
-alarms.command("ack", help="Short for acknowledge.")(acknowledge)
-
-
-def _list(config: Path | None, endpoint: str | None, name: str | None, timeout: float) -> "list[Alarm]":
+def _list(client: ClientOptions) -> "list[Alarm]":
     """Alarms of the monitor and of the recorder."""
     from reactorwatch.contract.messages_pb2 import ListAlarms
 
-    listed = list(send_command(MONITOR, config, endpoint, name, timeout, "list_alarms", ListAlarms()).alarms)
+    listed = list(send_command(MONITOR, client, "list_alarms", ListAlarms()).alarms)
     try:
-        listed += send_command(RECORDER, config, endpoint, name, timeout, LIST_RECORDER_ALARMS, ListAlarms()).alarms
+        listed += send_command(RECORDER, client, LIST_RECORDER_ALARMS, ListAlarms()).alarms
     except LateReplyError as late:
         print_lines(f"the alarms of the recorder are missing: {late}", err=True)
     except NoReplyError:
@@ -134,70 +104,60 @@ def _acknowledge_all(alarms: "list[Alarm]") -> "list[AlarmCommand]":
     return [*(AlarmCommand(incident=number) for number in incidents), *single]
 
 
-@alarms.command("shelve")
 def shelve(
+    *,
     alarm: Name,
     by: By,
-    minutes: Annotated[float, typer.Option("--minutes", help="How long, in minutes of plant time.")],
+    minutes: Annotated[float, Option(help="How long, in minutes of plant time.")],
     comment: Comment = "",
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
-    timeout: Timeout = TIMEOUT_S,
+    client: ClientOptions,
     json: Json = False,
 ) -> None:
     """Hide an alarm for a time."""
     from reactorwatch.contract.messages_pb2 import ShelveAlarm
 
-    node, command_name = _route(alarm, "shelve")
-    command = ShelveAlarm(alarm=alarm, by=by, comment=comment, minutes=minutes)
-    _show(send_command(node, config, endpoint, name, timeout, command_name, command).alarms, json=json)
+    _show(_send("shelve", ShelveAlarm(alarm=alarm, by=by, comment=comment, minutes=minutes), client), json=json)
 
 
-def _register(word: str, command: str, description: str) -> None:
-    """Register a subcommand with an alarm and an operator's name as arguments."""
+def _operation(command: str) -> Callable[..., None]:
+    """A subcommand with an alarm and an operator's name as arguments."""
 
-    def act(
-        alarm: Name,
-        by: By,
-        comment: Comment = "",
-        config: Settings = None,
-        endpoint: Endpoint = None,
-        name: Plant = None,
-        timeout: Timeout = TIMEOUT_S,
-        json: Json = False,
-    ) -> None:
+    def act(*, alarm: Name, by: By, comment: Comment = "", client: ClientOptions, json: Json = False) -> None:
         from reactorwatch.contract.messages_pb2 import AlarmCommand
 
-        node, command_name = _route(alarm, command)
-        message = AlarmCommand(alarm=alarm, by=by, comment=comment)
-        _show(send_command(node, config, endpoint, name, timeout, command_name, message).alarms, json=json)
+        _show(_send(command, AlarmCommand(alarm=alarm, by=by, comment=comment), client), json=json)
 
-    alarms.command(word, help=description)(act)
+    return act
 
 
-for _word, _command, _description in (
-    ("unshelve", "unshelve", "Show a shelved alarm again before its time is over."),
-    ("suppress", "suppress", "Hide an alarm while it has no meaning, as in a start-up."),
-    ("unsuppress", "unsuppress", "Show a suppressed alarm again."),
-    ("out-of-service", "take_out_of_service", "Take an alarm out of service, for maintenance."),
-    ("in-service", "return_to_service", "Return an alarm to service."),
-    ("comment", "comment", "Comment on an alarm, with --comment."),
-):
-    _register(_word, _command, _description)
+alarms = new_group(
+    {
+        "list": list_alarms,
+        "acknowledge": acknowledge,
+        "ack": (acknowledge, "Short for acknowledge."),
+        "shelve": shelve,
+        "unshelve": (_operation("unshelve"), "Show a shelved alarm again before its time is over."),
+        "suppress": (_operation("suppress"), "Hide an alarm while it has no meaning, as in a start-up."),
+        "unsuppress": (_operation("unsuppress"), "Show a suppressed alarm again."),
+        "out-of-service": (_operation("take_out_of_service"), "Take an alarm out of service, for maintenance."),
+        "in-service": (_operation("return_to_service"), "Return an alarm to service."),
+        "comment": (_operation("comment"), "Comment on an alarm, with --comment."),
+    }
+)
 
 
-def _route(alarm: str, command: str) -> tuple[str, str]:
-    """Node that raises an alarm, and its name of the command.
+def _send(command: str, message: "AlarmCommand | ShelveAlarm", client: ClientOptions) -> "Iterable[Alarm]":
+    """Send a command to the node that raises the alarm; returns the alarms that it changed.
 
     Raises:
         InputError: the recorder's own alarm, and a command other than to acknowledge.
     """
-    if not _is_recorders(alarm):
-        return MONITOR, command
-    if command != "acknowledge":
-        raise InputError(f"alarm {alarm} is the recorder's own, and can be acknowledged and nothing else")
-    return RECORDER, ACKNOWLEDGE_RECORDER
+    node = MONITOR
+    if _is_recorders(message.alarm):
+        if command != "acknowledge":
+            raise InputError(f"alarm {message.alarm} is the recorder's own, and can be acknowledged and nothing else")
+        node, command = RECORDER, ACKNOWLEDGE_RECORDER
+    return send_command(node, client, command, message).alarms
 
 
 def _is_recorders(alarm: str) -> bool:
@@ -206,10 +166,8 @@ def _is_recorders(alarm: str) -> bool:
 
 def _show(alarms: "Iterable[Alarm]", *, json: bool) -> None:
     """Print alarms, one JSON object or text a line."""
-    import msgspec
-
     for alarm in alarms:
-        print_lines(msgspec.json.encode(_object(alarm)).decode() if json else _line(alarm))
+        print_lines(json_line(_object(alarm)) if json else _line(alarm))
 
 
 def _object(alarm: "Alarm") -> dict[str, object]:

@@ -2,7 +2,7 @@
 
 import csv
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,17 +18,17 @@ from monitor_node.replay.row_log import LoggedRow, RowLog, rows_of_file
 from monitor_node.watched_process import WatchedProcess, limit_training, load_process, watch_process
 from reactorwatch.api.backtest_report import backtest_object, backtest_text
 from reactorwatch.api.files import MessageSource, open_messages, record, resolve_plant
-from reactorwatch.cli.batch import JobKind, JobResult, Row, as_table
+from reactorwatch.cli.batch import FileOptions, Job, JobKind, JobResult, Row, as_table
 from reactorwatch.cli.options import check_recording
+from reactorwatch.cli.printing import json_line
 from reactorwatch.cli.unit_remarks import FirstSamples
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import DEFAULT_PROCESS
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.record import to_minutes, to_time_ns
 
 ROWS_FOR_TRAINING = 3 * DEFAULT_TRAINING_ROWS
@@ -39,56 +39,27 @@ SCHEMES = MONITOR_SCHEME, REPORT_SCHEME = ("monitor", "report")
 LOG_COLUMNS = ("file", "row", "time_min", "in_alarm", "raised")
 
 
-@dataclass(frozen=True)
-class BacktestOptions:
-    """Options of a back-test, the same for all files.
+@dataclass(frozen=True, kw_only=True)
+class BacktestOptions(FileOptions):
+    """Options of a back-test.
 
     Attributes:
         settings: settings of the monitor, except the plant, which the file may name.
-        plant: plant in the file; None: the only one.
-        columns: names of columns by signal.
-        process: process of the plant; the default: as the settings say, or as recorded.
-        stated: statements about the form of a table.
-        as_json: format the result as JSON.
         log_rows: return the rows with their alarms.
         scheme: `monitor`, or `report` for the scheme of the original report.
+        is_one_of_many: name the file in the result, because there are others.
+        trained: result of a training on another file; None: each file begins with a training.
     """
 
     settings: MonitorConfig
-    plant: str | None = None
-    columns: dict[str, str] | None = None
-    process: ProcessChoice = DEFAULT_CHOICE
-    stated: FileFormat = GUESS
-    as_json: bool = False
     log_rows: bool = False
     scheme: str = MONITOR_SCHEME
+    is_one_of_many: bool = False
+    trained: TrainedPlant | None = None
 
     def __post_init__(self) -> None:
         if self.scheme not in SCHEMES:
             raise InputError(f"--scheme: {describe_unknown('scheme', self.scheme, SCHEMES)}")
-
-    def absolute(self) -> "BacktestOptions":
-        """Copy with the absolute path of the process, for workers with another working folder."""
-        return replace(self, process=self.process.absolute())
-
-
-@dataclass(frozen=True)
-class Job:
-    """A file to be monitored.
-
-    Attributes:
-        file: the file as named.
-        at: path of the file for the worker.
-        asked: options of the back-test.
-        among: name the file in the result, because there are others.
-        trained: result of a training on another file; None: the file begins with a training.
-    """
-
-    file: Path
-    at: Path
-    asked: BacktestOptions
-    among: bool
-    trained: TrainedPlant | None = None
 
 
 class RowsOfFile(NamedTuple):
@@ -134,21 +105,6 @@ def choose_settings(settings: MonitorConfig, choice: ProcessChoice) -> ProcessCh
     return ProcessChoice(None, settings.inputs, settings.outputs)
 
 
-def make_jobs(
-    files: Sequence[Path], asked: BacktestOptions, trained: TrainedPlant | None, *, elsewhere: bool
-) -> list[Job]:
-    """Make a job for each file.
-
-    Args:
-        files: tables, .mcap, or folders of recordings.
-        asked: options of the back-test.
-        trained: result of a training on another file, or None.
-        elsewhere: use absolute paths, for workers with another working folder.
-    """
-    asked = asked.absolute() if elsewhere else asked
-    return [Job(file, file.absolute() if elsewhere else file, asked, len(files) > 1, trained) for file in files]
-
-
 def train_on(file: Path, asked: BacktestOptions) -> TrainedPlant:
     """Train on the whole of a file.
 
@@ -163,28 +119,29 @@ def train_on(file: Path, asked: BacktestOptions) -> TrainedPlant:
         raise InputError(f"--train {file}: {error}") from error
 
 
-def run_job(job: Job) -> JobResult:
+def run_job(job: Job[BacktestOptions]) -> JobResult:
     """Run the monitor over a file.
 
     Raises:
         InputError: the file cannot be read or has no value of any output, or settings do not fit together.
     """
-    opened = _open(job.at, job.asked, learns=job.trained is None)
+    asked = job.asked
+    opened = _open(job.at, asked, learns=asked.trained is None)
     source, (config, model) = opened.source, opened.watched
-    first, log = FirstSamples(config.plant), RowLog() if job.asked.log_rows else None
-    if job.asked.scheme == REPORT_SCHEME:
+    first, log = FirstSamples(config.plant), RowLog() if asked.log_rows else None
+    if asked.scheme == REPORT_SCHEME:
         result = _watch_by_report(job, opened, log)
     else:
-        result = run(first.collect_samples(source.messages), config, source.zero_ns or 0, model, job.trained, log)
+        result = run(first.collect_samples(source.messages), config, source.zero_ns or 0, model, asked.trained, log)
     result.left_out = opened.still | result.left_out
     _check_watched(job.at, result)
     zero_ns = result.first_ns if source.zero_ns is None else source.zero_ns
     zero = source.zero(result.first_ns)
-    found = backtest_object(result, zero_ns, zero, is_trained=job.trained is not None)
-    if job.asked.as_json:
-        text = msgspec.json.encode({"file": str(job.file), **found} if job.among else found).decode()
+    found = backtest_object(result, zero_ns, zero, is_trained=asked.trained is not None)
+    if asked.as_json:
+        text = json_line({"file": str(job.file), **found} if asked.is_one_of_many else found)
     else:
-        text = backtest_text(result, zero_ns, job.file, zero_ns if zero else None, is_trained=job.trained is not None)
+        text = backtest_text(result, zero_ns, job.file, zero_ns if zero else None, is_trained=asked.trained is not None)
     remarks = [f"read as: {source.read_as}"] if source.read_as else []
     if opened.process is None or model is not None:
         remarks += filter(None, [first.unit_remark(model or DEFAULT.require_model())])
@@ -192,7 +149,7 @@ def run_job(job: Job) -> JobResult:
     return JobResult(text, _row(job.file, found), remark="; ".join(remarks), extra=logged)
 
 
-def _watch_by_report(job: Job, opened: _Opened, log: RowLog | None) -> Backtest:
+def _watch_by_report(job: Job[BacktestOptions], opened: _Opened, log: RowLog | None) -> Backtest:
     """Watch a file by the scheme of the original report."""
     config = opened.watched[0]
     measured = record(job.at, job.asked.plant, job.asked.columns, opened.process, job.asked.stated)

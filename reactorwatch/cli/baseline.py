@@ -1,109 +1,78 @@
 """`baseline`: what a running monitor judges its plant by: accept, relearn, restore, list."""
 
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
-from reactorwatch.cli.alarm import MONITOR, Timeout
-from reactorwatch.cli.command_client import TIMEOUT_S, send_command
-from reactorwatch.cli.options import Endpoint, Json, Plant, Settings, check_encodable
-from reactorwatch.cli.printing import print_lines
+from reactorwatch.cli.command_client import MONITOR, send_command
+from reactorwatch.cli.option_groups import new_group
+from reactorwatch.cli.options import ClientOptions, Json, check_encodable
+from reactorwatch.cli.printing import json_line, print_lines
 
 if TYPE_CHECKING:
-    from reactorwatch.contract.messages_pb2 import Baseline, CommandReply
+    from reactorwatch.contract.messages_pb2 import Baseline
 
-By = Annotated[str, typer.Option("--by", help="Your name.", callback=check_encodable, show_default=False)]
-Why = Annotated[str, typer.Option("--why", help="Reason, for the record.", callback=check_encodable)]
+By = Annotated[str, Option(help="Your name.", callback=check_encodable, show_default=False)]
+Why = Annotated[str, Option(help="Reason, for the record.", callback=check_encodable)]
 
 COMMAND = "baseline"
 
-baselines = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+
+def _without_number(what: str) -> Callable[..., None]:
+    def act(*, by: By, why: Why, client: ClientOptions, json: Json = False) -> None:
+        _send(what, by, why, client, json=json)
+
+    return act
 
 
-def register_commands(app: typer.Typer) -> None:
-    """Register the commands."""
-    app.add_typer(baselines, name=COMMAND, help="Accept, relearn or restore the baseline of a plant.")
-
-
-def _register(what: str, description: str) -> None:
-    """Register a subcommand without a number."""
-
-    def act(
-        by: By,
-        why: Why,
-        config: Settings = None,
-        endpoint: Endpoint = None,
-        name: Plant = None,
-        timeout: Timeout = TIMEOUT_S,
-        json: Json = False,
-    ) -> None:
-        _send(what, by, why, None, (config, endpoint, name, timeout), json=json)
-
-    baselines.command(what, help=description)(act)
-
-
-_register("accept", "Take the plant as it is now as sound: learn from the rows since the active alarm on.")
-_register("relearn", "Learn the plant again, from the next row on.")
-
-
-@baselines.command("restore")
 def restore(
+    *,
     by: By,
     why: Why,
     number: Annotated[
-        int | None, typer.Option("--id", help="As `baseline list` has it; the one before.", min=0, max=2**63 - 1)
+        int | None, Option("--id", help="As `baseline list` has it; the one before.", min=0, max=2**63 - 1)
     ] = None,
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
-    timeout: Timeout = TIMEOUT_S,
+    client: ClientOptions,
     json: Json = False,
 ) -> None:
     """Judge the plant by what was learned before."""
-    _send("restore", by, why, number, (config, endpoint, name, timeout), json=json)
+    _send("restore", by, why, client, number, json=json)
 
 
-@baselines.command("list")
 def list_baselines(
-    by: Annotated[str, typer.Option("--by", help="Your name.", callback=check_encodable, show_default=False)] = "",
-    why: Annotated[str, typer.Option("--why", help="Not needed.", callback=check_encodable, show_default=False)] = "",
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
-    timeout: Timeout = TIMEOUT_S,
+    *,
+    by: By = "",
+    why: Annotated[str, Option(help="Not needed.", callback=check_encodable, show_default=False)] = "",
+    client: ClientOptions,
     json: Json = False,
 ) -> None:
     """List the baselines that can be restored, and the one in force."""
-    _send("list", by, why, None, (config, endpoint, name, timeout), json=json)
+    _send("list", by, why, client, json=json)
 
 
-def _send(
-    what: str,
-    by: str,
-    why: str,
-    number: int | None,
-    options: tuple[Path | None, str | None, str | None, float],
-    *,
-    json: bool,
-) -> None:
+baselines = new_group(
+    {
+        "accept": (
+            _without_number("accept"),
+            "Take the plant as it is now as sound: learn from the rows since the active alarm on.",
+        ),
+        "relearn": (_without_number("relearn"), "Learn the plant again, from the next row on."),
+        "restore": restore,
+        "list": list_baselines,
+    }
+)
+
+
+def _send(what: str, by: str, why: str, client: ClientOptions, number: int | None = None, *, json: bool) -> None:
     """Send a command and print the answer."""
     from reactorwatch.contract.messages_pb2 import BaselineCommand
 
-    command = BaselineCommand(what=what, by=by, why=why)
-    if number is not None:
-        command.id = number
-    config, endpoint, name, timeout = options
-    reply = send_command(MONITOR, config, endpoint, name, timeout, COMMAND, command)
-    print_lines(*_lines(reply, json=json))
-
-
-def _lines(reply: "CommandReply", *, json: bool) -> list[str]:
-    import msgspec
-
+    reply = send_command(MONITOR, client, COMMAND, BaselineCommand(what=what, by=by, why=why, id=number))
     if json:
-        return [msgspec.json.encode(_object(item)).decode() for item in reply.baselines]
-    return [_line(item) for item in reply.baselines] or [reply.text]
+        print_lines(*(json_line(_object(item)) for item in reply.baselines))
+    else:
+        print_lines(*([_line(item) for item in reply.baselines] or [reply.text]))
 
 
 def _object(item: "Baseline") -> dict[str, object]:

@@ -9,30 +9,67 @@ import glob
 import io
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import msgspec
 import typer
 
 from reactorwatch.api.files import expand_folder
-from reactorwatch.cli.display import print_report
+from reactorwatch.cli.display import format_rows, print_report
 from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.progress import bar, task
+from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.folder import fill_folder
 from reactorwatch.records.input_file import list_files
 from reactorwatch.runtime.parallel.jobs import Failed, choose_executor, in_job_order
-from reactorwatch.terminal import printable
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
 
-Job = TypeVar("Job")
+Item = TypeVar("Item")
 Result = TypeVar("Result")
+Options = TypeVar("Options", bound="FileOptions")
 Row = dict[str, Any]
 """Row of a summary; the rows of all files have the same names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileOptions:
+    """Options of a command, the same for all files.
+
+    Attributes:
+        plant: plant in recordings; None: the only one.
+        columns: names of columns by signal.
+        process: the process; the default: as recorded, or as the settings of the command say.
+        stated: statements about the form of a table.
+        as_json: format the results as JSON.
+    """
+
+    plant: str | None = None
+    columns: dict[str, str] = field(default_factory=dict)
+    process: ProcessChoice = DEFAULT_CHOICE
+    stated: FileFormat = GUESS
+    as_json: bool = False
+
+
+class Job(NamedTuple, Generic[Options]):
+    """A file and what is done with it.
+
+    Attributes:
+        file: the file as named.
+        at: path of the file for the worker.
+        asked: options of the command.
+        folder: folder for what is written about the file; None: nothing is.
+    """
+
+    file: Path
+    at: Path
+    asked: Options
+    folder: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -55,7 +92,7 @@ class JobResult:
 
 
 @dataclass(frozen=True)
-class JobKind(Generic[Job]):
+class JobKind(Generic[Options]):
     """A kind of job.
 
     Attributes:
@@ -66,7 +103,7 @@ class JobKind(Generic[Job]):
     """
 
     doing: str
-    work: Callable[[Job], JobResult]
+    work: Callable[[Job[Options]], JobResult]
     columns: tuple[str, ...]
     summary: Callable[[Sequence[Row]], str]
 
@@ -99,38 +136,56 @@ def _expand_match(folder: Path) -> list[Path]:
     return expand_folder(folder) if list_files(folder, ".csv") or list_files(folder, ".mcap") else []
 
 
+def make_jobs(
+    files: Sequence[Path], asked: Options, folders: Sequence[Path | None] | None = None, *, elsewhere: bool
+) -> list[Job[Options]]:
+    """Make a job for each file.
+
+    Args:
+        files: the files.
+        asked: options of the command.
+        folders: a folder for each file; None: there are none.
+        elsewhere: use absolute paths, for workers with another working folder.
+    """
+    folders = [None] * len(files) if folders is None else folders
+    if not elsewhere:
+        return [Job(file, file, asked, folder) for file, folder in zip(files, folders, strict=True)]
+    asked = replace(asked, process=asked.process.absolute())
+    return [
+        Job(file, file.absolute(), asked, folder and folder.absolute())
+        for file, folder in zip(files, folders, strict=True)
+    ]
+
+
 def run_jobs(
-    kind: JobKind[Job],
-    jobs: Sequence[Job],
-    files: Sequence[Path],
+    kind: JobKind[Options],
+    jobs: Sequence[Job[Options]],
     out: Path | None,
     *,
     processes: int | None,
     scheduler: str | None,
-    as_json: bool,
     on_end: Callable[[list[Any]], None] | None = None,
 ) -> None:
     """Run the jobs and print the result of each file in their order, and a summary of several.
 
     Args:
         kind: kind of the jobs.
-        jobs: one for each file.
-        files: the files.
+        jobs: one for each file; as JSON, each result is an object on a line, and there is no summary.
         out: folder for the summary of several files; None: no folder.
         processes: number of processes; None: one a core.
         scheduler: address of a cluster, or None.
-        as_json: print one JSON object a line, without a summary.
         on_end: called with the `extra` of the files that could be used, in their order; None: not called.
 
     Raises:
         InputError: the single file cannot be used, or there are no such workers.
         typer.Exit: with 2, some of several files could not be used; each has its line.
     """
+    file, as_json = jobs[0].file, jobs[0].asked.as_json
     if len(jobs) == 1 and scheduler is None:
-        with task(f"{kind.doing} {files[0].name}"):
+        with task(f"{kind.doing} {file.name}"):
             result = kind.work(jobs[0])
         print_report(result.text, as_json=as_json)
-        write_remark(files[0], result.remark)
+        write_remark(file, result.remark)
         if result.not_written:
             raise InputError(result.not_written)
         if on_end is not None:
@@ -139,7 +194,7 @@ def run_jobs(
     rows: list[Row] = []
     extras: list[Any] = []
     with results_in_order(kind.work, jobs, kind.doing, processes, scheduler) as outcomes:
-        for file, outcome in zip(files, outcomes, strict=True):
+        for (file, *_), outcome in zip(jobs, outcomes, strict=True):
             if isinstance(outcome, Failed):
                 reason = _strip_name(outcome.reason, file)
                 print_lines(f"reactorwatch: {file}: {reason}", err=True)
@@ -164,7 +219,7 @@ def run_jobs(
 
 @contextmanager
 def results_in_order(
-    work: Callable[[Job], Result], jobs: Sequence[Job], doing: str, processes: int | None, scheduler: str | None
+    work: Callable[[Item], Result], jobs: Sequence[Item], doing: str, processes: int | None, scheduler: str | None
 ) -> Generator[Iterator[Result | Failed]]:
     """Run jobs, with a bar that counts the finished ones; leaving the context ends the work.
 
@@ -231,8 +286,5 @@ def write_summary(folder: Path, rows: Sequence[Row]) -> None:
 
 def as_table(rows: Sequence[dict[str, str]]) -> str:
     """Format rows as a table; empty columns are left out."""
-    rows = [{name: printable(cell) for name, cell in row.items()} for row in rows]
     names = [name for name in rows[0] if any(row[name] for row in rows)]
-    widths = {name: max(len(name), *(len(row[name]) for row in rows)) for name in names}
-    lines = [dict(zip(names, names, strict=True)), *rows]
-    return "\n".join("  ".join(line[name].ljust(widths[name]) for name in names).rstrip() for line in lines)
+    return format_rows([names, *([row[name] for name in names] for row in rows)])

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from reactorwatch.cli.options import check_input
-from reactorwatch.cli.processes import write_settings
+from reactorwatch.cli.processes import settings_text, write_settings
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import ZenohBus, log_refusals, router, router_from_file
@@ -92,19 +92,23 @@ def restrict_to_plant(recorder: RecorderConfig, site: Path | None) -> RecorderCo
 
 
 def write_node_settings(
-    path: Path, tables: dict[str, msgspec.Struct], join: BusSettings, nodes: Sequence[str]
+    path: Path, recorder: RecorderConfig, tables: dict[str, msgspec.Struct], join: BusSettings, nodes: Sequence[str]
 ) -> dict[str, Path]:
     """Write the settings files of a run.
 
     Args:
         path: path of the observer's file, which all nodes with the same bus settings share.
-        tables: all tables but the bus.
+        recorder: settings of the recorder, whose recording gets the others as metadata.
+        tables: the others, without those of the bus.
         join: bus settings by node.
         nodes: names of the nodes.
 
     Returns:
         The file of each node.
     """
+    about = dict(recorder.about)
+    about.setdefault("settings", settings_text({"bus": join[VIEWER], **tables}))
+    tables = {**tables, "recorder": msgspec.structs.replace(recorder, about=about)}
     write_settings(path, {"bus": join[VIEWER], **tables})
     files = {}
     for node in nodes:

@@ -3,35 +3,26 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
+from reactorwatch.cli.option_groups import TableOptions
 from reactorwatch.cli.options import Columns, Json, Plant, Process, check_recording, parse_columns
 from reactorwatch.cli.printing import print_text
-from reactorwatch.cli.table_options import take_table_options
-from reactorwatch.records.file_format import GUESS, FileFormat
-
-
-def register_commands(app: typer.Typer) -> None:
-    """Register the command."""
-    app.command("causes")(take_table_options(causes))
 
 
 def causes(
+    *,
     process: Process = None,
     record: Annotated[
-        Path | None,
-        typer.Option(
-            "--record", help="A record whose inputs, times and noise count [a usual excitation].", show_default=False
-        ),
+        Path | None, Option(help="A record whose inputs, times and noise count [a usual excitation].")
     ] = None,
     plant: Plant = None,
     column: Columns = None,
     as_json: Json = False,
-    stated: FileFormat = GUESS,
+    table: TableOptions,
 ) -> None:
     """Show which causes the sensors distinguish, and from which size on each is seen."""
-    from reactorwatch.api.files import described_process, process_on_clock
-    from reactorwatch.api.files import record as read_record
+    from reactorwatch.api.files import record_of_process
     from reactorwatch.cli.causes_report import as_json_text, as_matrix
     from reactorwatch.cli.progress import task
     from reactorwatch.description.choice import ProcessChoice
@@ -45,10 +36,8 @@ def causes(
         model = described.require_model()
         measured = excite(model)
     else:
-        path = check_recording(record)
-        described = described_process(path, plant, choice)
-        measured = read_record(path, plant, parse_columns(column), described, stated=stated)
-        described = process_on_clock(choice, described, measured.zero_ns)
+        path, columns = check_recording(record), parse_columns(column)
+        measured, described = record_of_process(path, plant, columns, choice, table.stated)
         model = described.require_model()
     run = make_run(measured, model)
     with task(f"comparing the causes of {described.name}"):

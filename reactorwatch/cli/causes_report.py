@@ -1,8 +1,7 @@
 """Report of the causes that sensors distinguish: JSON for programs, a matrix for people."""
 
-import msgspec
-
 from reactorwatch.cli.batch import as_table
+from reactorwatch.cli.printing import json_line
 from reactorwatch.diagnosis.identifiability import TIMES, Identifiability
 
 ALIKE, APART = "=", "."
@@ -20,7 +19,7 @@ def as_json_text(found: Identifiability, process: str, rows: int) -> str:
         "alike": [list(group) for group in found.alike],
         "invisible": [item.effect.name for item in found.causes if not item.is_visible],
     }
-    return msgspec.json.encode(report).decode()
+    return json_line(report)
 
 
 def as_matrix(found: Identifiability, process: str, rows: int) -> str:

@@ -2,35 +2,24 @@
 
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
+from reactorwatch.cli.option_groups import new_group
 from reactorwatch.cli.options import Json
-from reactorwatch.cli.printing import print_lines, print_text
+from reactorwatch.cli.printing import json_line, print_lines, print_text
 from reactorwatch.errors import InputError
 
-Shift = Annotated[float, typer.Option(help="Of the mean, in standard deviations; 0: the false alarms.")]
-SteadyState = Annotated[bool, typer.Option("--steady-state", help="The chart has long run when the shift comes.")]
-Rules = Annotated[str, typer.Option(help="Run rules, some of 1,2,3,4.")]
-Dimension = Annotated[int, typer.Option(help="Number of signals.")]
-Weight = Annotated[float, typer.Option("--lambda", help="Weight of the newest sample.", show_default=False)]
-
-
-def register_commands(app: typer.Typer) -> None:
-    """Register the commands."""
-    charts = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
-    arl = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
-    for command in (shewhart, cusum, ewma, mewma, t2):
-        arl.command(command.__name__)(command)
-    charts.add_typer(arl, name="arl", help="The average run length of a chart, in samples.")
-    charts.command("design")(design)
-    charts.command("list")(list_charts)
-    app.add_typer(charts, name="charts", help="Control charts: how long they run, and which is fastest.")
+Shift = Annotated[float, Option(help="Of the mean, in standard deviations; 0: the false alarms.")]
+SteadyState = Annotated[bool, Option("--steady-state", help="The chart has long run when the shift comes.")]
+Rules = Annotated[str, Option(help="Run rules, some of 1,2,3,4.")]
+Dimension = Annotated[int, Option(help="Number of signals.")]
+Weight = Annotated[float, Option("--lambda", help="Weight of the newest sample.")]
 
 
 def shewhart(
     shift: Shift = 0.0,
     rules: Rules = "1",
-    limit: Annotated[float, typer.Option(help="Width L of the outer lines, in standard deviations.")] = 3.0,
+    limit: Annotated[float, Option(help="Width L of the outer lines, in standard deviations.")] = 3.0,
     steady_state: SteadyState = False,
     as_json: Json = False,
 ) -> None:
@@ -42,11 +31,11 @@ def shewhart(
 
 
 def cusum(
-    k: Annotated[float, typer.Option(help="Allowance, in standard deviations.", show_default=False)],
-    h: Annotated[float, typer.Option(help="Limit, in standard deviations.", show_default=False)],
+    k: Annotated[float, Option(help="Allowance, in standard deviations.")],
+    h: Annotated[float, Option(help="Limit, in standard deviations.")],
     shift: Shift = 0.0,
-    headstart: Annotated[float, typer.Option(help="Where the sums start, in standard deviations.")] = 0.0,
-    one_sided: Annotated[bool, typer.Option("--one-sided", help="The high sum only.")] = False,
+    headstart: Annotated[float, Option(help="Where the sums start, in standard deviations.")] = 0.0,
+    one_sided: Annotated[bool, Option("--one-sided", help="The high sum only.")] = False,
     steady_state: SteadyState = False,
     as_json: Json = False,
 ) -> None:
@@ -59,9 +48,9 @@ def cusum(
 
 def ewma(
     weight: Weight,
-    limit: Annotated[float, typer.Option(help="L, in standard deviations of the average.", show_default=False)],
+    limit: Annotated[float, Option(help="L, in standard deviations of the average.")],
     shift: Shift = 0.0,
-    exact_limits: Annotated[bool, typer.Option("--exact-limits", help="Limits that widen from the start.")] = False,
+    exact_limits: Annotated[bool, Option("--exact-limits", help="Limits that widen from the start.")] = False,
     steady_state: SteadyState = False,
     as_json: Json = False,
 ) -> None:
@@ -73,9 +62,9 @@ def ewma(
 
 
 def mewma(
-    dimension: Annotated[int, typer.Option(help="Number of signals.", show_default=False)],
+    dimension: Annotated[int, Option(help="Number of signals.")],
     weight: Weight,
-    limit: Annotated[float, typer.Option(help="H, of the statistic.", show_default=False)],
+    limit: Annotated[float, Option(help="H, of the statistic.")],
     shift: Shift = 0.0,
     steady_state: SteadyState = False,
     as_json: Json = False,
@@ -88,8 +77,8 @@ def mewma(
 
 
 def t2(
-    dimension: Annotated[int, typer.Option(help="Number of signals.", show_default=False)],
-    limit: Annotated[float, typer.Option(help="Of T2.", show_default=False)],
+    dimension: Annotated[int, Option(help="Number of signals.")],
+    limit: Annotated[float, Option(help="Of T2.")],
     shift: Shift = 0.0,
     steady_state: SteadyState = False,
     as_json: Json = False,
@@ -117,9 +106,9 @@ def list_charts() -> None:
 
 
 def design(
-    chart: Annotated[str, typer.Argument(help="shewhart, cusum, ewma, mewma or t2.", show_default=False)],
-    arl0: Annotated[float, typer.Option(help="Samples to a false alarm, on average.", show_default=False)],
-    shift: Annotated[float, typer.Option(help="To be detected, in standard deviations.", show_default=False)],
+    chart: Annotated[str, Argument(help="shewhart, cusum, ewma, mewma or t2.")],
+    arl0: Annotated[float, Option(help="Samples to a false alarm, on average.")],
+    shift: Annotated[float, Option(help="To be detected, in standard deviations.")],
     dimension: Dimension = 2,
     rules: Rules = "1",
     as_json: Json = False,
@@ -129,9 +118,7 @@ def design(
 
     found = fastest(chart, arl0, shift, dimension=dimension, rules=_rules(rules))
     if as_json:
-        import msgspec
-
-        print_lines(msgspec.json.encode(found).decode())
+        print_lines(json_line(found))
         return
     print_lines(chart)
     for name, value in found.parameters.items():
@@ -152,6 +139,12 @@ def _print_length(length: float, as_json: bool, **chart: object) -> None:
     if not as_json:
         print_lines(f"{length:.8g}")
         return
-    import msgspec
+    print_lines(json_line({**chart, "arl": length}))
 
-    print_lines(msgspec.json.encode({**chart, "arl": length}).decode())
+
+charts = new_group({"design": design, "list": list_charts})
+charts.add_typer(
+    new_group({"shewhart": shewhart, "cusum": cusum, "ewma": ewma, "mewma": mewma, "t2": t2}),
+    name="arl",
+    help="The average run length of a chart, in samples.",
+)

@@ -1,8 +1,8 @@
 """Client for commands to a running node."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from reactorwatch.cli.options import ClientOptions
 from reactorwatch.errors import InputError
 
 if TYPE_CHECKING:
@@ -10,8 +10,7 @@ if TYPE_CHECKING:
 
     from reactorwatch.contract.messages_pb2 import CommandReply
 
-TIMEOUT_S = 5.0
-"""Default timeout."""
+MONITOR = "monitor"
 
 
 class NoReplyError(InputError):
@@ -22,23 +21,12 @@ class LateReplyError(NoReplyError):
     """Such a node runs, and did not reply in time."""
 
 
-def send_command(
-    node: str,
-    config: Path | None,
-    endpoint: str | None,
-    plant: str | None,
-    timeout_s: float,
-    name: str,
-    message: "Message",
-) -> "CommandReply":
+def send_command(node: str, client: ClientOptions, name: str, message: "Message") -> "CommandReply":
     """Send a command to a node and return its reply.
 
     Args:
         node: `monitor`, `recorder` or `replay`: the node named in errors, whose settings name the plant.
-        config: settings file, or None.
-        endpoint: the router's address, or None.
-        plant: name of the plant; None: that of the settings, else `cstr`.
-        timeout_s: seconds to wait for the router, and for the reply.
+        client: where it is sent; without a plant, to that of the settings, else `cstr`.
         name: name of the command.
         message: message of the command.
 
@@ -57,9 +45,10 @@ def send_command(
     from reactorwatch.runtime.bus_zenoh import connect
     from reactorwatch.runtime.event_loop import StopSignal
 
-    tables, bus_config = load_settings(config, endpoint)
+    tables, bus_config = load_settings(client)
+    timeout_s = client.timeout
     try:
-        plant = keys.check_plant(plant or str(tables.get(node, {}).get("plant") or keys.DEFAULT_PLANT))
+        plant = keys.check_plant(client.name or str(tables.get(node, {}).get("plant") or keys.DEFAULT_PLANT))
     except ValueError as error:
         raise InputError(str(error)) from error
     stop = StopSignal()

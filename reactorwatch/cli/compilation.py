@@ -5,18 +5,11 @@ Kernels are compiled at their first call and cached on disk (`reactorwatch.codeg
 So all kernels run here once, over a short simulated record: by `make setup`, by the images, or by hand.
 """
 
-import typer
-
 ROWS = 600
 """Rows of the record: enough for a diagnosis, and for a fault after the monitor's training."""
 
 FAULT = "coolant_flow:step:-0.1@30min"
 TRAINING_MIN = 15.0
-
-
-def register_commands(app: typer.Typer) -> None:
-    """Register the command."""
-    app.command("compile")(compile_kernels)
 
 
 def compile_kernels() -> None:

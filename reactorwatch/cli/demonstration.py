@@ -8,16 +8,15 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
-from reactorwatch.api.files import messages, open_messages
+from reactorwatch.api.files import open_messages
 from reactorwatch.cli.bus_settings import (
-    VIEWER,
     load_bus_settings,
     open_router,
     restrict_to_plant,
@@ -26,7 +25,7 @@ from reactorwatch.cli.bus_settings import (
 from reactorwatch.cli.display import format_age, print_report
 from reactorwatch.cli.plant_settings import WAIT_FOR, complete_plant_settings
 from reactorwatch.cli.printing import print_lines
-from reactorwatch.cli.processes import Processes, settings_text
+from reactorwatch.cli.processes import Processes
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.run_progress import POLL_S, RunProgress
 from reactorwatch.contract import keys
@@ -62,45 +61,31 @@ DIAGNOSIS_FOLDER = "diagnosis"
 DRAIN_TIMEOUT_S = 1.0  # for the recorder, which is stopped last
 
 
-@dataclass(frozen=True)
-class Demonstration:
-    """Process, fault and pace of a demonstration.
+def choose_fault(text: str | None, process: Process) -> FaultSpecification:
+    """Fault to inject.
 
-    Attributes:
-        process: name or file of the process; None: the reactor.
-        duration_min: minutes of plant time.
-        speed: plant time over wall time.
-        fault: specification of the fault; None: that of the process, from `ONSET_MIN` on.
-        seed: seed of inputs and noise.
+    Args:
+        text: specification of the fault; None: that of the process, from `ONSET_MIN` on.
+        process: the process.
+
+    Raises:
+        InputError: it is invalid, or the process has no equations.
     """
-
-    process: str | None
-    duration_min: float
-    speed: float
-    fault: str | None
-    seed: int
-
-    def find_fault(self, process: Process) -> FaultSpecification:
-        """Fault to inject.
-
-        Raises:
-            InputError: it is invalid, or the process has no equations.
-        """
-        text = self.fault
-        if text is None and process.operation.fault:
-            text = f"{process.operation.fault}@{ONSET_MIN:g}min"
-        elif text is None:
-            process.require_model()
-            effect = process.faults[0]
-            text = f"{effect.name}:step:{effect.typical!r}@{ONSET_MIN:g}min"
-        return parse_fault(text, process.faults)
+    if text is None and process.operation.fault:
+        text = f"{process.operation.fault}@{ONSET_MIN:g}min"
+    elif text is None:
+        process.require_model()
+        effect = process.faults[0]
+        text = f"{effect.name}:step:{effect.typical!r}@{ONSET_MIN:g}min"
+    return parse_fault(text, process.faults)
 
 
-def run(demonstration: Demonstration, out: Path | None, site: Path | None = None) -> int:
+def run(flags: dict[str, Any], fault: str | None, out: Path | None, site: Path | None = None) -> int:
     """Run the demonstration.
 
     Args:
-        demonstration: the process, its fault and the pace.
+        flags: settings of the plant: `process`, `speed`, `duration_min` and `seed`.
+        fault: see `choose_fault`.
         out: folder to make; None: one named after the time.
         site: folder of a site, for its router and the nodes' certificates; None: without TLS.
 
@@ -112,41 +97,32 @@ def run(demonstration: Demonstration, out: Path | None, site: Path | None = None
         InputError: invalid arguments, or a node that failed.
     """
     configure()
-    process = find_process(demonstration.process or DEFAULT_PROCESS)
-    fault = str(demonstration.find_fault(process))
+    process = find_process(flags["process"] or DEFAULT_PROCESS)
+    injected = str(choose_fault(fault, process))
     join = load_bus_settings(site, PLANT, {}, free_endpoint() if site is None else None)
     folder = _free_folder(out)
     recording = folder / f"{PLANT}.mcap"
-    of_plant = {
-        "name": PLANT,
-        "process": demonstration.process,
-        "speed": demonstration.speed,
-        "duration_min": demonstration.duration_min,
-        "seed": demonstration.seed,
-        "faults": (fault,),
-        "wait_for": WAIT_FOR,
-    }
+    of_plant = {**flags, "name": PLANT, "faults": (injected,), "wait_for": WAIT_FOR}
     plant = complete_plant_settings(section(PlantConfig, "plant", {}, of_plant))
-    monitor = section(MonitorConfig, "monitor", {}, {"plant": PLANT, "process": demonstration.process})
-    nodes = {"plant": plant, "monitor": monitor}
+    monitor = section(MonitorConfig, "monitor", {}, {"plant": PLANT, "process": flags["process"]})
     recorder = RecorderConfig(
         plant=PLANT,
         out=str(recording),
         linger_s=DRAIN_TIMEOUT_S,
         black_box_min=0.0,
-        processes={PLANT: demonstration.process or DEFAULT_PROCESS},
-        about={"seed": str(plant.seed), "settings": settings_text({"bus": join[VIEWER], **nodes})},
+        processes={PLANT: flags["process"] or DEFAULT_PROCESS},
+        about={"seed": str(plant.seed)},
     )
     with open_router(site, join) as bus:
         make_folder(folder, "--out")
-        tables = {**nodes, "recorder": restrict_to_plant(recorder, site)}
-        settings = write_node_settings(folder / SETTINGS_FILE, tables, join, NODES)
+        tables = {"plant": plant, "monitor": monitor}
+        settings = write_node_settings(folder / SETTINGS_FILE, restrict_to_plant(recorder, site), tables, join, NODES)
         print_lines(f"to see it as it runs: reactorwatch view --web --config {folder / SETTINGS_FILE}", err=True)
         with stop_on_signals() as stop:
             if not _run_nodes(bus, stop, settings, folder, plant, process.name):
                 print_lines(f"stopped; what was recorded until then is in {folder}", err=True)
                 return 130
-    return _conclude(folder, recording, monitor, fault)
+    return _conclude(folder, recording, monitor, injected)
 
 
 def _free_folder(out: Path | None) -> Path:
@@ -210,15 +186,8 @@ def _describe_end(node: str, code: int, folder: Path) -> str:
 
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
     """Diagnose and draw the recording, and write the summary; returns the exit code."""
-    from reactorwatch.cli.diagnosis import (
-        DRAWING,
-        MODEL,
-        PAGE,
-        DiagnosisOptions,
-        load_case,
-        run_diagnosis,
-        write_report,
-    )
+    from reactorwatch.api.diagnosis import diagnose_case
+    from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, DiagnosisOptions, load_case, write_report
     from reactorwatch.diagnosis.report.words import describe_verdict
     from recorder.columns.run_reader import read_segments
     from recorder.dashboard.file import write_rrd
@@ -226,11 +195,11 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     drawing = recording.with_suffix(".rrd")
     with task("checking"):
         first_ns, faults, alarms = _events(recording)
-        again = backtest.run(messages(recording, PLANT), monitor)
+        again = backtest.run(open_messages(recording, PLANT).messages, monitor)
     with task("diagnosing"):
-        case = load_case(recording, folder / DIAGNOSIS_FOLDER, DiagnosisOptions(plant=PLANT))
-        diagnosis, seconds = run_diagnosis(case)
-        write_report(diagnosis, case, seconds)
+        asked = DiagnosisOptions(plant=PLANT)
+        diagnosis = diagnose_case(load_case(recording, asked), asked.tolerance, asked.limits)
+        write_report(diagnosis, recording, folder / DIAGNOSIS_FOLDER, asked)
     with task("drawing"):
         source = open_messages(recording, PLANT)
         run_columns = read_segments(source.messages, process=source.process)
@@ -251,7 +220,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     lines = [
         "# What happened",
         "",
-        headline(delay_s, diagnosis, case.effects),
+        headline(delay_s, diagnosis, diagnosis.effects),
         "",
         f"- Fault injected: `{fault}`, onset at {minutes(onset_ns)}."
         if onset_ns is not None
@@ -326,7 +295,7 @@ def _events(recording: Path) -> tuple[int, list[Fault], list[Alarm]]:
     first_ns: int | None = None
     faults: list[Fault] = []
     alarms: list[Alarm] = []
-    for message in messages(recording, PLANT):
+    for message in open_messages(recording, PLANT).messages:
         body = decode(message.payload, message.encoding)
         if isinstance(body, Sample):
             first_ns = body.time_ns if first_ns is None else min(first_ns, body.time_ns)

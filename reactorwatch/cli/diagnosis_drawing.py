@@ -1,16 +1,18 @@
 """A diagnosis as views of a dashboard: measurements and both simulations on one timeline."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.report.pictures import interval
 from reactorwatch.diagnosis.result import SD_95, Curves, Diagnosis
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record, to_time_ns
 from recorder.dashboard.file import DIAGNOSIS, write_views
-from recorder.panels.base import ALARM, INPUT, LIMIT, MEASURED, PREDICTED, Series, TimePlot
+from recorder.panels.base import ALARM, INPUT, LIMIT, MEASURED, PREDICTED, Colour, Series, TimePlot
 
 
 def write_drawing(diagnosis: Diagnosis, model: ProcessModel, measured: Record, path: Path) -> None:
@@ -28,63 +30,37 @@ def write_drawing(diagnosis: Diagnosis, model: ProcessModel, measured: Record, p
     curves = diagnosis.curves
     assert curves is not None
     time_ns = np.array([to_time_ns(minutes, measured.zero_ns) for minutes in curves.time_min.tolist()], dtype=np.int64)
-    views = [
-        *_outputs(curves, model, time_ns),
-        *_residuals(curves, model, time_ns),
-        *_causes(diagnosis, curves, time_ns),
-    ]
-    views += [
-        TimePlot(
-            f"{item.meaning} {item.name}",
-            item.unit,
-            (Series(item.name, time_ns, curves.inputs[item.name], INPUT, held=True),),
-        )
-        for item in model.inputs
-    ]
-    write_views({DIAGNOSIS: views}, path, int(time_ns[0]))
+    write_views({DIAGNOSIS: [*_plots(diagnosis, curves, model, time_ns)]}, path, int(time_ns[0]))
 
 
-def _outputs(curves: Curves, model: ProcessModel, time_ns: NDArray[np.int64]) -> list[TimePlot]:
-    return [
-        TimePlot(
-            item.name,
-            item.unit,
-            (
-                Series("measured", time_ns, curves.measured[item.name], MEASURED, width=2.5),
-                Series("simulation as it was", time_ns, curves.simulated_before[item.name], ALARM, width=1.0),
-                Series("simulation extended", time_ns, curves.simulated_after[item.name], PREDICTED, width=1.0),
-            ),
-        )
-        for item in model.outputs
-    ]
+def _plots(diagnosis: Diagnosis, curves: Curves, model: ProcessModel, time_ns: NDArray[np.int64]) -> Iterator[TimePlot]:
+    """Outputs, their residuals, sizes of the causes, and inputs."""
 
+    def line(label: str, values: Array, colour: Colour, legend: str = "", width: float = 1.0) -> Series:
+        return Series(label, time_ns, values, colour, width=width, legend=legend)
 
-def _residuals(curves: Curves, model: ProcessModel, time_ns: NDArray[np.int64]) -> list[TimePlot]:
+    for item in model.outputs:
+        measured = line("measured", curves.measured[item.name], MEASURED, width=2.5)
+        before = line("simulation as it was", curves.simulated_before[item.name], ALARM)
+        after = line("simulation extended", curves.simulated_after[item.name], PREDICTED)
+        yield TimePlot(item.name, item.unit, (measured, before, after))
     ends = np.full(time_ns.size, SD_95)
-    return [
-        TimePlot(
-            f"Residual of {item.name}",
-            "standard deviations",
-            (
-                Series("upper limit", time_ns, ends, LIMIT, width=1.0, legend="95 % of noise"),
-                Series("lower limit", time_ns, -ends, LIMIT, width=1.0, legend="95 % of noise"),
-                Series("as it was", time_ns, curves.residual_before[item.name], ALARM, width=1.0),
-                Series("extended", time_ns, curves.residual_after[item.name], PREDICTED, width=1.0),
-            ),
+    for item in model.outputs:
+        limits = (
+            line(f"{end} limit", sign * ends, LIMIT, "95 % of noise") for end, sign in (("upper", 1), ("lower", -1))
         )
-        for item in model.outputs
-    ]
-
-
-def _causes(diagnosis: Diagnosis, curves: Curves, time_ns: NDArray[np.int64]) -> list[TimePlot]:
-    found = []
+        before = line("as it was", curves.residual_before[item.name], ALARM)
+        after = line("extended", curves.residual_after[item.name], PREDICTED)
+        yield TimePlot(f"Residual of {item.name}", "standard deviations", (*limits, before, after))
     for cause in diagnosis.causes:
         lower, upper = interval(cause, curves)
         series = (
-            Series("upper end", time_ns, upper, LIMIT, width=1.0, legend="95 % interval"),
-            Series("lower end", time_ns, lower, LIMIT, width=1.0, legend="95 % interval"),
+            line("upper end", upper, LIMIT, "95 % interval"),
+            line("lower end", lower, LIMIT, "95 % interval"),
             Series("most likely", time_ns, curves.deviation[cause.cause], PREDICTED),
         )
         unit = cause.parameters["size"].unit
-        found.append(TimePlot(f"Size of: {cause.label}", unit if unit != "1" else "", series))
-    return found
+        yield TimePlot(f"Size of: {cause.label}", unit if unit != "1" else "", series)
+    for given in model.inputs:
+        held = Series(given.name, time_ns, curves.inputs[given.name], INPUT, held=True)
+        yield TimePlot(f"{given.meaning} {given.name}", given.unit, (held,))

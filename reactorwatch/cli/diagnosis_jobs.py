@@ -4,63 +4,34 @@ Errors in the options, not in a file, are raised before the first job.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-import msgspec
-
-from reactorwatch.cli.batch import SUMMARY, JobKind, JobResult, Row, as_table
-from reactorwatch.cli.diagnosis import (
-    EXPERIMENT,
-    PAGE,
-    REPORT,
-    Case,
-    DiagnosisOptions,
-    load_case,
-    run_diagnosis,
-    write_report,
-)
+from reactorwatch.api.diagnosis import DiagnosisResult, diagnose_case
+from reactorwatch.cli.batch import SUMMARY, Job, JobKind, JobResult, Row, as_table, make_jobs
+from reactorwatch.cli.diagnosis import EXPERIMENT, PAGE, REPORT, DiagnosisOptions, load_case, write_report
+from reactorwatch.cli.printing import json_line
 from reactorwatch.diagnosis.experiment.constraints import check_limits
 from reactorwatch.diagnosis.parameter_priors import parse_priors
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.diagnosis.report.machine import as_object
 from reactorwatch.diagnosis.report.plain import as_text
-from reactorwatch.diagnosis.result import Cause, Diagnosis
+from reactorwatch.diagnosis.result import Cause
 from reactorwatch.errors import InputError
 from reactorwatch.records.output import check_output_folder
 from reactorwatch.records.source_text import is_table
 
 
-@dataclass(frozen=True)
-class Job:
-    """A file to be diagnosed.
-
-    Attributes:
-        file: the file as named.
-        at: path of the file for the worker.
-        folder: folder for the report; None: no report.
-        asked: options of the diagnosis.
-        as_json: format the result as JSON.
-    """
-
-    file: Path
-    at: Path
-    folder: Path | None
-    asked: DiagnosisOptions
-    as_json: bool
-
-
-def make_jobs(
-    files: Sequence[Path], out: Path | None, asked: DiagnosisOptions, *, as_json: bool, elsewhere: bool
-) -> list[Job]:
+def diagnosis_jobs(
+    files: Sequence[Path], out: Path | None, asked: DiagnosisOptions, *, elsewhere: bool
+) -> list[Job[DiagnosisOptions]]:
     """Make a job for each file.
 
     Args:
         files: .csv, .mcap, or folders of recordings.
         out: folder for the report; each of several files gets a folder in it.
         asked: options of the diagnosis.
-        as_json: format the results as JSON.
-        elsewhere: use absolute paths, for workers with another working folder.
+        elsewhere: see `make_jobs`.
 
     Raises:
         InputError: invalid options.
@@ -68,12 +39,7 @@ def make_jobs(
     describes_itself = asked.process.is_default and not all(map(is_table, files))
     if not describes_itself and (len(files) > 1 or elsewhere):
         _check(asked)
-    paths = list(files)
-    if elsewhere:
-        paths, out = [file.absolute() for file in files], out and out.absolute()
-        asked = replace(asked, process=asked.process.absolute())
-    folders = _folders(files, out)
-    return [Job(*item, asked, as_json) for item in zip(files, paths, folders, strict=True)]
+    return make_jobs(files, asked, _folders(files, out), elsewhere=elsewhere)
 
 
 def check_out(files: Sequence[Path], out: Path | None, model: Path | None, *, force: bool) -> None:
@@ -81,7 +47,7 @@ def check_out(files: Sequence[Path], out: Path | None, model: Path | None, *, fo
 
     Args:
         files: files to be diagnosed.
-        out: see `make_jobs`.
+        out: see `diagnosis_jobs`.
         model: file that describes the process, or None.
         force: see `check_output_file`.
 
@@ -97,22 +63,21 @@ def check_out(files: Sequence[Path], out: Path | None, model: Path | None, *, fo
         check_output_folder(folder, REPORT, sources, force=force)
 
 
-def run_job(job: Job) -> JobResult:
+def run_job(job: Job[DiagnosisOptions]) -> JobResult:
     """Diagnose a file, and write its report if there is a folder for it.
 
     Raises:
         InputError: the file cannot be read or diagnosed, or the options are invalid.
     """
-    case = load_case(job.file, job.folder, job.asked, job.at)
-    diagnosis, seconds = run_diagnosis(case, job.asked.tolerance, job.asked.limits)
-    not_written = ""
-    if case.folder is not None:
+    found = diagnose_case(load_case(job.at, job.asked), job.asked.tolerance, job.asked.limits)
+    not_written, report = "", as_object(found, str(job.file), found.seconds, found.zero)
+    if job.folder is not None:
         try:
-            write_report(diagnosis, case, seconds)
+            write_report(found, job.file, job.folder, job.asked)
         except InputError as error:
-            case, not_written = replace(case, folder=None), str(error)
-    text = _text(case, diagnosis, seconds, as_json=job.as_json)
-    return JobResult(text, _row(job.file, diagnosis, seconds) | {"error": not_written or None}, not_written=not_written)
+            not_written = str(error)
+    text = json_line(report) if job.asked.as_json else _text(job, found, has_report=not not_written)
+    return JobResult(text, _row(report, found) | {"error": not_written or None}, not_written=not_written)
 
 
 def _check(asked: DiagnosisOptions) -> None:
@@ -125,24 +90,21 @@ def _check(asked: DiagnosisOptions) -> None:
     check_tolerance(model, asked.tolerance)
 
 
-def _text(case: Case, diagnosis: Diagnosis, seconds: float, *, as_json: bool) -> str:
-    if as_json:
-        return msgspec.json.encode(as_object(diagnosis, str(case.file), seconds, case.measured.zero)).decode()
-    text = as_text(diagnosis, str(case.file), case.effects)
-    if case.folder is None:
+def _text(job: Job[DiagnosisOptions], found: DiagnosisResult, *, has_report: bool) -> str:
+    text = as_text(found, str(job.file), found.effects)
+    if job.folder is None or not has_report:
         return text
-    if diagnosis.experiment is not None:
-        text += f"\n  input       {case.folder / EXPERIMENT}"
-    return f"{text}\n  report      {case.folder / PAGE}"
+    if found.experiment is not None:
+        text += f"\n  input       {job.folder / EXPERIMENT}"
+    return f"{text}\n  report      {job.folder / PAGE}"
 
 
 _COLUMNS = ("samples", "span_min", "seconds", "verdict", "causes", "location", "significant", "practical", "delta_bic")
 
 
-def _row(file: Path, diagnosis: Diagnosis, seconds: float) -> Row:
-    report = as_object(diagnosis, str(file), seconds)
-    report |= {"causes": " + ".join(map(_fault_text, diagnosis.causes)), "delta_bic": report["gain"]["delta_bic"]}
-    return {"file": str(file), **{name: report[name] for name in _COLUMNS}, "error": None}
+def _row(report: dict[str, Any], found: DiagnosisResult) -> Row:
+    row = report | {"causes": " + ".join(map(_fault_text, found.causes)), "delta_bic": report["gain"]["delta_bic"]}
+    return {name: row[name] for name in ("file", *_COLUMNS)}
 
 
 def _fault_text(cause: Cause) -> str:

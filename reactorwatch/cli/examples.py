@@ -3,32 +3,23 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from reactorwatch.cli.options import Force, check_output
 from reactorwatch.cli.printing import print_lines
 from reactorwatch.records.output import check_output_file
 
 
-def register_commands(app: typer.Typer) -> None:
-    """Register the command."""
-    app.command("example")(example)
-
-
 def example(
     name: Annotated[
         str,
-        typer.Argument(
+        Argument(
             help="Of cstr: sound, leak, fouling, analyser_drift, two_causes or unknown (a law in no catalogue); "
             "three_tanks or cascaded_tanks.",
-            show_default=False,
         ),
     ],
-    out: Annotated[
-        Path,
-        typer.Option("--out", "-o", help="The file to write; the truth is written beside it.", show_default=False),
-    ],
-    seed: Annotated[int, typer.Option(help="Of the input and the noise.", min=0, max=2**63 - 1)] = 3,
+    out: Annotated[Path, Option("--out", "-o", help="The file to write; the truth is written beside it.")],
+    seed: Annotated[int, Option(help="Of the input and the noise.", min=0, max=2**63 - 1)] = 3,
     force: Force = False,
 ) -> None:
     """Write a simulated sample record (.csv, .csv.gz, .xlsx or .parquet), its truth in FILE.truth.json."""

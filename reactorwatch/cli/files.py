@@ -4,59 +4,43 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
+from reactorwatch.cli.option_groups import TableOptions
 from reactorwatch.cli.options import (
     Columns,
     Force,
-    Inputs,
-    Outputs,
     Plant,
-    Process,
+    ProcessOptions,
+    Recording,
     check_input,
     check_output,
     check_recording,
-    choose_process,
     parse_columns,
 )
 from reactorwatch.cli.printing import print_lines, print_text
-from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
-from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.output import check_output_folder
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record
     from recorder.columns.run import RunColumns
 
-Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.", show_default=False)]
-
-
-def register_commands(app: typer.Typer) -> None:
-    """Register the commands."""
-    app.command("dashboard")(take_table_options(dashboard))
-    app.command("import")(take_table_options(import_csv))
-    app.command("export")(take_table_options(export_csv))
+Out = Annotated[Path, Option("--out", "-o", help="The file to write.")]
 
 
 def dashboard(
-    file: Annotated[
-        Path, typer.Argument(help="A recording (.mcap), a folder of them, or a record (.csv).", show_default=False)
-    ],
+    *,
+    file: Recording,
     out: Out,
     plant: Plant = None,
-    process: Process = None,
-    inputs: Inputs = None,
-    outputs: Outputs = None,
+    chosen: ProcessOptions,
     diagnosis: Annotated[
-        Path | None,
-        typer.Option(help="The report of a diagnosis of it (a folder), drawn into a tab.", show_default=False),
+        Path | None, Option(help="The report of a diagnosis of it (a folder), drawn into a tab.")
     ] = None,
-    png: Annotated[
-        Path | None, typer.Option(help="A folder for a picture of each tab, without a screen.", show_default=False)
-    ] = None,
+    png: Annotated[Path | None, Option(help="A folder for a picture of each tab, without a screen.")] = None,
     force: Force = False,
-    stated: FileFormat = GUESS,
+    table: TableOptions,
 ) -> None:
     """Draw a recording into a Rerun file, without a screen."""
     from reactorwatch.api.files import open_messages
@@ -66,7 +50,7 @@ def dashboard(
     from recorder.dashboard.file import write_rrd
     from recorder.dashboard.picture import picture_names, render_tabs
 
-    choice = choose_process(process, inputs, outputs)
+    choice = chosen.choose()
     drawn = diagnosis / DRAWING if diagnosis is not None else None
     out = check_output(out, ".rrd", (file, drawn, choice.file), force=force)
     if drawn is not None and not drawn.is_file():
@@ -74,7 +58,7 @@ def dashboard(
     if png is not None:
         check_output_folder(png, picture_names(), (file, choice.file), option="--png", force=force)
     with task(f"drawing {file.name}"):
-        recording = open_messages(check_recording(file), plant, stated=stated, choice=choice)
+        recording = open_messages(check_recording(file), plant, stated=table.stated, choice=choice)
         run = read_segments(recording.messages, given_zero_ns=recording.zero_ns, process=recording.process)
         write_rrd(_check_samples(run, file), out, diagnosis=drawn)
     print_lines(f"wrote {out}", *([f"note: read as: {recording.read_as}"] if recording.read_as else []))
@@ -102,53 +86,46 @@ def _check_samples(runs: "Iterable[RunColumns]", file: Path) -> "Iterator[RunCol
 
 
 def import_csv(
-    files: Annotated[
-        list[Path],
-        typer.Argument(help="A record (.csv or another table), or several in a row.", show_default=False),
-    ],
+    *,
+    files: Annotated[list[Path], Argument(help="A record (.csv or another table), or several in a row.")],
     out: Out,
     plant: Plant = None,
-    process: Process = None,
-    inputs: Inputs = None,
-    outputs: Outputs = None,
+    chosen: ProcessOptions,
     column: Columns = None,
     force: Force = False,
-    stated: FileFormat = GUESS,
+    table: TableOptions,
 ) -> None:
     """Turn a record (.csv or another table), or several in a row, into a recording (.mcap)."""
     from reactorwatch.cli.progress import task
     from recorder.tools.convert import import_csv as convert
 
-    choice = choose_process(process, inputs, outputs)
+    choice = chosen.choose()
     out = check_output(out, ".mcap", (*files, choice.file), force=force)
     with task(f"importing {files[0].name}"):
         sources = list(map(check_input, files))
-        record = convert(sources, out, plant, parse_columns(column), stated=stated, choice=choice)
+        record = convert(sources, out, plant, parse_columns(column), stated=table.stated, choice=choice)
     print_text(_report_text(out, record))
 
 
 def export_csv(
-    file: Annotated[
-        Path, typer.Argument(help="A recording (.mcap), a folder of them, or a record (.csv).", show_default=False)
-    ],
+    *,
+    file: Recording,
     out: Out,
     plant: Plant = None,
-    process: Process = None,
-    inputs: Inputs = None,
-    outputs: Outputs = None,
-    clock: Annotated[bool, typer.Option("--clock", help="Add a column with the clock time, ISO 8601 in UTC.")] = False,
+    chosen: ProcessOptions,
+    clock: Annotated[bool, Option("--clock", help="Add a column with the clock time, ISO 8601 in UTC.")] = False,
     force: Force = False,
-    stated: FileFormat = GUESS,
+    table: TableOptions,
 ) -> None:
     """Turn a recording (.mcap) into a record (.csv, .csv.gz, .xlsx or .parquet), with all its signals."""
     from reactorwatch.cli.progress import task
     from reactorwatch.records.write_table import WRITTEN_SUFFIXES
     from recorder.tools.convert import export_csv as convert
 
-    choice = choose_process(process, inputs, outputs)
+    choice = chosen.choose()
     out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
     with task(f"exporting {file.name}"):
-        record = convert(check_recording(file), out, plant, clock=clock, stated=stated, choice=choice)
+        record = convert(check_recording(file), out, plant, clock=clock, stated=table.stated, choice=choice)
     print_text(_report_text(out, record))
 
 

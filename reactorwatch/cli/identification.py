@@ -1,10 +1,10 @@
 """`identify`: fit models of the outputs of a record and format the results."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import msgspec
 
+from reactorwatch.cli.printing import json_line
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
@@ -23,19 +23,6 @@ NAMES = {
     "narx": "polynomial NARX",
     "noe": "polynomial output-error",
 }
-
-
-@dataclass(frozen=True)
-class Validation:
-    """Rows that a model is validated on.
-
-    Attributes:
-        record: the record; None: the second half of the one that is fitted.
-        settle: number of first rows that may set the state.
-    """
-
-    record: Record | None = None
-    settle: int = 0
 
 
 def choose_outputs(
@@ -67,22 +54,32 @@ def fit(
     inputs: Sequence[str],
     outputs: Sequence[str],
     form: ModelForm,
-    validation: Validation,
+    held_out: Record | None = None,
+    settle: int = 0,
     *,
     as_json: bool,
 ) -> str:
     """Fit one model of each output and format them, as JSON one object a line.
+
+    Args:
+        measured: the record that is fitted.
+        inputs: names of the inputs.
+        outputs: names of the outputs.
+        form: form of the models.
+        held_out: record to validate on; None: the second half of `measured`.
+        settle: number of first held-out rows that may set the state.
+        as_json: format as JSON.
 
     Raises:
         InputError: the record or the options are unsuitable.
     """
     found = []
     for output in outputs:
-        held_out = None if validation.record is None else Dataset.of_record(validation.record, inputs, output)
-        found.append(identify(Dataset.of_record(measured, inputs, output), form, held_out, validation.settle))
+        validated = None if held_out is None else Dataset.of_record(held_out, inputs, output)
+        found.append(identify(Dataset.of_record(measured, inputs, output), form, validated, settle))
     if as_json:
-        return "\n".join(msgspec.json.encode(item).decode() for item in found)
-    other = None if validation.record is None else validation.record.name
+        return "\n".join(json_line(item) for item in found)
+    other = None if held_out is None else held_out.name
     return "\n\n".join(_text(item, inputs, measured, other) for item in found) + _remarks_text(measured)
 
 
@@ -128,7 +125,7 @@ def _selection_json(selection: Selection, output: str) -> str:
         "chosen": {"family": selection.chosen.family, "order": selection.chosen.order} if selection.fits else None,
         "reason": selection.reason,
     }
-    return msgspec.json.encode(report).decode()
+    return json_line(report)
 
 
 def _text(found: Identification, inputs: Sequence[str], measured: Record, other: str | None) -> str:

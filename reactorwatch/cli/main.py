@@ -31,6 +31,7 @@ from reactorwatch.cli import (
     view,
 )
 from reactorwatch.cli.interrupt import clear_interrupt, raise_until_handled
+from reactorwatch.cli.option_groups import Command, add_commands
 from reactorwatch.cli.printing import print_lines
 from reactorwatch.runtime.crash import INTERRUPTED, UNUSABLE, guard, print_error
 
@@ -49,25 +50,45 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-GROUPS = (
-    runs,
-    nodes,
-    examples,
-    view,
-    site,
-    playback,
-    alarm,
-    baseline,
-    files,
-    recordings,
-    studies,
-    causes,
-    models,
-    charts,
-    compilation,
-)
-for group in GROUPS:
-    group.register_commands(app)
+COMMANDS: dict[str, Command] = {
+    "up": runs.up,
+    "demo": runs.demo,
+    "plant": nodes.plant,
+    "monitor": nodes.monitor,
+    "record": nodes.record,
+    "replay": nodes.replay,
+    "alive": nodes.alive,
+    "example": examples.example,
+    "view": view.view,
+    "certify": site.certify,
+    "router": site.router,
+    "doctor": site.doctor,
+    "status": site.status,
+    "ack": (alarm.acknowledge, "Acknowledge alarms: short for `alarm acknowledge`."),
+    "dashboard": files.dashboard,
+    "import": files.import_csv,
+    "export": files.export_csv,
+    "recover": recordings.recover,
+    "info": recordings.info,
+    "cut": recordings.cut,
+    "merge": recordings.merge,
+    "simulate": studies.simulate,
+    "backtest": studies.backtest,
+    "diagnose": studies.diagnose,
+    "causes": causes.causes,
+    "identify": models.identify,
+    "linearise": models.linearise,
+    "reproduce": models.reproduce,
+    "compile": compilation.compile_kernels,
+}
+add_commands(app, COMMANDS)
+for name, group, text in (
+    ("playback", playback.playback, "Pause a running replay, step it, or change its rate."),
+    ("alarm", alarm.alarms, "List, acknowledge, shelve, suppress or comment the alarms of a plant."),
+    ("baseline", baseline.baselines, "Accept, relearn or restore the baseline of a plant."),
+    ("charts", charts.charts, "Control charts: how long they run, and which is fastest."),
+):
+    app.add_typer(group, name=name, help=text)
 
 
 def _print_version(wanted: bool) -> None:

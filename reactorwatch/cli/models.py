@@ -3,89 +3,73 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from reactorwatch.cli.display import print_report
+from reactorwatch.cli.option_groups import TableOptions
 from reactorwatch.cli.options import (
     Columns,
     Force,
     Inputs,
+    Jobs,
     Json,
     Plant,
     Process,
-    Processes,
+    RecordFile,
     Scheduler,
     check_recording,
     parse_columns,
     split_names,
 )
 from reactorwatch.cli.printing import print_text
-from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
-from reactorwatch.records.file_format import GUESS, FileFormat
-
-
-def register_commands(app: typer.Typer) -> None:
-    """Register the commands."""
-    app.command("identify")(take_table_options(identify))
-    app.command("linearise")(linearise)
-    app.command("reproduce")(reproduce)
 
 
 def identify(
-    file: Annotated[Path, typer.Argument(help="A record (.csv) or recording (.mcap).", show_default=False)],
+    *,
+    file: RecordFile,
     process: Annotated[
-        str | None,
-        typer.Option(
-            help="A process: a name in the catalogue, or a .toml, .py or extended.json file [cstr].", show_default=False
-        ),
+        str | None, Option(help="A process: a name in the catalogue, or a .toml, .py or extended.json file [cstr].")
     ] = None,
     inputs: Inputs = None,
     output: Annotated[
         list[str] | None,
-        typer.Option(
-            "--output",
-            help="An output to identify, each by a model of its own (repeatable) [T of cstr, else all].",
-            show_default=False,
-        ),
+        Option(help="An output to identify, each by a model of its own (repeatable) [T of cstr, else all]."),
     ] = None,
-    model: Annotated[str, typer.Option(help="arx, oe, armax, bj (Box-Jenkins), narx or noe (polynomials).")] = "arx",
-    order: Annotated[int, typer.Option(help="Lags of the output, each input and the disturbance.")] = 3,
-    delay: Annotated[int, typer.Option(help="Samples from a move of an input to its first effect.")] = 1,
+    model: Annotated[str, Option(help="arx, oe, armax, bj (Box-Jenkins), narx or noe (polynomials).")] = "arx",
+    order: Annotated[int, Option(help="Lags of the output, each input and the disturbance.")] = 3,
+    delay: Annotated[int, Option(help="Samples from a move of an input to its first effect.")] = 1,
     validate: Annotated[
-        Path | None,
-        typer.Option(help="A record to validate on; all of FILE is then fitted [the second half].", show_default=False),
+        Path | None, Option(help="A record to validate on; all of FILE is then fitted [the second half].")
     ] = None,
     settle: Annotated[
-        int, typer.Option(help="Held-out rows that may set the state of the free run, and are left out of fits.")
+        int, Option(help="Held-out rows that may set the state of the free run, and are left out of fits.")
     ] = 0,
-    recursive: Annotated[bool, typer.Option("--recursive", help="Learn row by row, as the monitor does.")] = False,
+    recursive: Annotated[bool, Option("--recursive", help="Learn row by row, as the monitor does.")] = False,
     forgetting: Annotated[
-        float, typer.Option(help="With --recursive: weight of a row relative to its successor, in (0, 1].")
+        float, Option(help="With --recursive: weight of a row relative to its successor, in (0, 1].")
     ] = 1.0,
     adaptation: Annotated[
         str,
-        typer.Option(
+        Option(
             help="With --recursive: forgetting (least squares), kalman, gradient (LMS) or normalized-gradient (NLMS); "
             "the last three of arx."
         ),
     ] = "forgetting",
-    gain: Annotated[
-        float | None, typer.Option(help="Of an adaptation other than forgetting.", show_default=False)
-    ] = None,
+    gain: Annotated[float | None, Option(help="Of an adaptation other than forgetting.")] = None,
     scheme: Annotated[
-        str, typer.Option(help="least-squares, or report: as the original report fits (arx and oe).")
+        str, Option(help="least-squares, or report: as the original report fits (arx and oe).")
     ] = "least-squares",
     compare: Annotated[
-        bool, typer.Option("--compare", help="Compare ARX and OE of orders 1 to --order, and choose.")
+        bool, Option("--compare", help="Compare ARX and OE of orders 1 to --order, and choose.")
     ] = False,
     neural: Annotated[
-        bool, typer.Option("--neural", help="With --compare: a neural network too (reactorwatch[neural]).")
+        bool, Option("--neural", help="With --compare: a neural network too (reactorwatch[neural]).")
     ] = False,
     plant: Plant = None,
     column: Columns = None,
     as_json: Json = False,
-    stated: FileFormat = GUESS,
+    table: TableOptions,
 ) -> None:
     """Fit models of the outputs to one half, validate them on the other."""
     from reactorwatch.api.files import record
@@ -110,7 +94,7 @@ def identify(
     if compare and (validate is not None or settle):
         raise InputError("--compare chooses by the second half of FILE: leave --validate and --settle out")
     measured, held_out = (
-        None if path is None else record(check_recording(path), plant, parse_columns(column), described, stated)
+        None if path is None else record(check_recording(path), plant, parse_columns(column), described, table.stated)
         for path in (file, validate)
     )
     assert measured is not None
@@ -120,23 +104,17 @@ def identify(
         if compare:
             text = identification.compare(measured, described.inputs, outputs, form, neural=neural, as_json=as_json)
         else:
-            validation = identification.Validation(held_out, settle)
-            text = identification.fit(measured, described.inputs, outputs, form, validation, as_json=as_json)
+            text = identification.fit(measured, described.inputs, outputs, form, held_out, settle, as_json=as_json)
     print_report(text, as_json=as_json)
     write_remark(file, remark)
 
 
 def linearise(
-    levels: Annotated[
-        list[float], typer.Argument(help="Level of each input, in its order and unit (qc of cstr).", show_default=False)
-    ],
+    levels: Annotated[list[float], Argument(help="Level of each input, in its order and unit (qc of cstr).")],
     process: Process = None,
     step: Annotated[
         float | None,
-        typer.Option(
-            help="Of each input, by which linear model and plant are compared [a tenth of its scale; qc: 1 l/min].",
-            show_default=False,
-        ),
+        Option(help="Of each input, by which linear model and plant are compared [a tenth of its scale; qc: 1 l/min]."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -148,20 +126,16 @@ def linearise(
 
 
 def reproduce(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for study.md and its pictures.", show_default=False)],
-    seed: Annotated[int, typer.Option(help="Of every simulated record.", min=0)] = 1,
-    only: Annotated[str | None, typer.Option(help="Figures by number, such as 7,12 [all].", show_default=False)] = None,
-    file: Annotated[
-        Path | None,
-        typer.Option("--record", help="A record that figures 5, 6, 11 to 16 learn from.", show_default=False),
-    ] = None,
+    out: Annotated[Path, Option("--out", "-o", help="Folder for study.md and its pictures.")],
+    seed: Annotated[int, Option(help="Of every simulated record.", min=0)] = 1,
+    only: Annotated[str | None, Option(help="Figures by number, such as 7,12 [all].")] = None,
+    file: Annotated[Path | None, Option("--record", help="A record that figures 5, 6, 11 to 16 learn from.")] = None,
     data: Annotated[
-        Path | None,
-        typer.Option(help="A folder of records of others, for an entry on measured records.", show_default=False),
+        Path | None, Option(help="A folder of records of others, for an entry on measured records.")
     ] = None,
     plant: Plant = None,
     column: Columns = None,
-    jobs: Processes = None,
+    jobs: Jobs = None,
     scheduler: Scheduler = None,
     force: Force = False,
 ) -> None:

@@ -1,56 +1,47 @@
 """Commands that run one node until it is finished or stopped: `plant`, `monitor`, `record`, `replay`."""
 
 import logging
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
+from reactorwatch.cli.option_groups import TableOptions, stated_settings
 from reactorwatch.cli.options import (
     MAX_WAIT_S,
+    TIMEOUT_S,
+    Begin,
+    BusOptions,
     Columns,
     Diagnose,
-    Endpoint,
-    Inputs,
+    End,
     Json,
-    Outputs,
-    Plant,
+    PlantOptions,
     Process,
+    ProcessOptions,
+    Recording,
     Reference,
-    Settings,
-    TrainingMin,
-    TrainingRows,
+    Seed,
+    Speed,
+    TrainingOptions,
     check_recording,
-    choose_process,
     parse_columns,
     parse_pace,
     parse_span_ns,
-    training_flags,
 )
 from reactorwatch.cli.printing import print_lines
-from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
-from reactorwatch.records.file_format import GUESS, FileFormat
 
 
-def register_commands(app: typer.Typer) -> None:
-    """Register the commands."""
-    app.command("plant")(plant)
-    app.command("monitor")(monitor)
-    app.command("record")(record)
-    app.command("replay")(take_table_options(replay))
-    app.command("alive")(alive)
-
-
-def _settings(path: Path | None, endpoint: str | None, *, quiet: bool = False) -> tuple[dict[str, dict[str, Any]], Any]:
+def _settings(target: BusOptions, *, quiet: bool = False) -> tuple[dict[str, dict[str, Any]], Any]:
     from reactorwatch.runtime.config import BusConfig, LogConfig, read_settings, section
     from reactorwatch.runtime.logs import configure
 
-    tables = read_settings(path)
+    tables = read_settings(target.config)
     log = section(LogConfig, "log", tables, {})
     configure(logging.WARNING if quiet else logging.INFO, as_json=log.format == "json")
-    return tables, section(BusConfig, "bus", tables, {"endpoint": endpoint})
+    return tables, section(BusConfig, "bus", tables, {"endpoint": target.endpoint})
 
 
 def _metrics(tables: dict[str, dict[str, Any]]) -> Any:
@@ -60,30 +51,20 @@ def _metrics(tables: dict[str, dict[str, Any]]) -> Any:
 
 
 def plant(
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
+    *,
+    target: PlantOptions,
     preset: Annotated[
-        str | None,
-        typer.Option(help="Settings of a named run: fault-free, input-leakage, heat-transfer or reaction-rate."),
+        str | None, Option(help="Settings of a named run: fault-free, input-leakage, heat-transfer or reaction-rate.")
     ] = None,
-    speed: Annotated[
-        str | None, typer.Option(help="Plant time over wall time: a number, or 'max' [1].", show_default=False)
-    ] = None,
-    duration: Annotated[
-        float | None, typer.Option("--duration", help="Minutes of plant time, then it ends [endless].", min=0)
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of the input and the noise.", show_default=False)] = None,
+    speed: Speed = None,
+    duration: Annotated[float | None, Option(help="Minutes of plant time, then it ends [endless].", min=0)] = None,
+    seed: Seed = None,
     scenario: Annotated[
-        str | None,
-        typer.Option(
-            help="The inputs: random-steps, sines, square, constant or a record [random-steps].",
-            show_default=False,
-        ),
+        str | None, Option(help="The inputs: random-steps, sines, square, constant or a record [random-steps].")
     ] = None,
     fault: Annotated[
         list[str] | None,
-        typer.Option(help="A fault, as cause:profile:size@onset: coolant_flow:step:-0.05@30min. Repeatable."),
+        Option(help="A fault, as cause:profile:size@onset: coolant_flow:step:-0.05@30min. Repeatable."),
     ] = None,
     process: Process = None,
 ) -> None:
@@ -91,9 +72,9 @@ def plant(
     from plant_node.__main__ import run
     from reactorwatch.cli.plant_settings import load_plant_settings
 
-    tables, bus = _settings(config, endpoint)
+    tables, bus = _settings(target)
     flags = {
-        "name": name,
+        "name": target.name,
         "preset": preset,
         "speed": parse_pace(speed, "--speed"),
         "duration_min": duration,
@@ -106,34 +87,18 @@ def plant(
 
 
 def monitor(
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
-    training: TrainingMin = None,
-    training_rows: TrainingRows = None,
-    process: Process = None,
-    inputs: Inputs = None,
-    outputs: Outputs = None,
+    *,
+    target: PlantOptions,
+    training: TrainingOptions,
+    chosen: ProcessOptions,
     reference: Reference = None,
     diagnose: Diagnose = None,
     state: Annotated[
         Path | None,
-        typer.Option(
-            "--state",
-            help="Folder of the monitor's state, from which it resumes after a restart; made if it does not exist.",
-            show_default=False,
-        ),
+        Option(help="Folder of the monitor's state, from which it resumes after a restart; made if it does not exist."),
     ] = None,
-    plants: Annotated[
-        str | None,
-        typer.Option("--plants", help="Watch all of these plants: 'reactor/*', 'reactor/north_*'.", show_default=False),
-    ] = None,
-    shard: Annotated[
-        str | None,
-        typer.Option(
-            "--shard", help="With --plants: this monitor's part of them, such as 2/5 [1/1].", show_default=False
-        ),
-    ] = None,
+    plants: Annotated[str | None, Option(help="Watch all of these plants: 'reactor/*', 'reactor/north_*'.")] = None,
+    shard: Annotated[str | None, Option(help="With --plants: this monitor's part of them, such as 2/5 [1/1].")] = None,
 ) -> None:
     """Watch a plant, or a fleet of them: predict signals, raise alarms."""
     from contextlib import nullcontext
@@ -146,12 +111,12 @@ def monitor(
     from reactorwatch.records.folder import make_folder
     from reactorwatch.runtime.config import LogConfig, section
 
-    tables, bus = _settings(config, endpoint)
-    choice = choose_process(process, inputs, outputs)
-    flags: dict[str, Any] = {"plant": name, "process": choice.process, "reference": reference}
+    tables, bus = _settings(target)
+    choice = chosen.choose()
+    flags: dict[str, Any] = {"plant": target.name, "process": choice.process, "reference": reference}
     if choice.outputs:
         flags |= {"inputs": list(choice.inputs), "outputs": list(choice.outputs)}
-    flags |= training_flags(tables, training, training_rows)
+    flags |= training.flags(tables)
     of_fleet = {"plants": plants, "shard": shard, "state": str(state) if state is not None else None}
     fleet = section(FleetConfig, "fleet", tables, of_fleet)
     if state is not None and fleet.plants is None:
@@ -159,7 +124,7 @@ def monitor(
     config_of_monitor = section(MonitorConfig, "monitor", tables, flags)
     if fleet.plants is not None:
         state = Path(fleet.state) if fleet.state is not None else None
-        for option, given in (("--plant", name), ("--diagnose", diagnose)):
+        for option, given in (("--plant", target.name), ("--diagnose", diagnose)):
             if given is not None:
                 raise InputError(f"{option} is for the monitor of one plant; leave it out with --plants")
     if shard is not None and fleet.plants is None:
@@ -175,14 +140,10 @@ def monitor(
 
 
 def record(
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
+    *,
+    target: PlantOptions,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", help="File or folder to write to, made if it does not exist [.].", show_default=False
-        ),
+        Path | None, Option("--out", "-o", help="File or folder to write to, made if it does not exist [.].")
     ] = None,
 ) -> None:
     """Record everything on the bus into an MCAP file."""
@@ -193,80 +154,59 @@ def record(
 
     if out is not None and out.suffix != ".mcap":
         check_folder_name(out, "--out")
-    tables, bus = _settings(config, endpoint)
-    flags = {"plant": name, "out": str(out) if out is not None else None}
+    tables, bus = _settings(target)
+    flags = {"plant": target.name, "out": str(out) if out is not None else None}
     run(section(RecorderConfig, "recorder", tables, flags), bus, _metrics(tables))
 
 
 def replay(
-    file: Annotated[
-        Path, typer.Argument(help="A recording (.mcap), a folder of them, or a record (.csv).", show_default=False)
-    ],
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Annotated[
-        str | None, typer.Option("--plant", help="Publish it as this plant [as recorded].", show_default=False)
-    ] = None,
-    rate: Annotated[
-        str | None, typer.Option(help="Times real time: a number, or 'max' [1].", show_default=False)
-    ] = None,
-    begin: Annotated[
-        str | None, typer.Option("--from", help="Since the start, such as 10min [the start].", show_default=False)
-    ] = None,
-    end: Annotated[
-        str | None, typer.Option("--to", help="Since the start, such as 20min [the end].", show_default=False)
-    ] = None,
-    loop: Annotated[bool | None, typer.Option("--loop", help="Restart at the end.", show_default=False)] = None,
-    process: Process = None,
-    inputs: Inputs = None,
-    outputs: Outputs = None,
+    *,
+    file: Recording,
+    target: BusOptions,
+    name: Annotated[str | None, Option("--plant", help="Publish it as this plant [as recorded].")] = None,
+    rate: Annotated[str | None, Option(help="Times real time: a number, or 'max' [1].")] = None,
+    begin: Begin = None,
+    end: End = None,
+    loop: Annotated[bool | None, Option("--loop", help="Restart at the end.")] = None,
+    chosen: ProcessOptions,
     column: Columns = None,
     verify: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--verify",
             help="Publish nothing; run it through the monitor's core and compare the output with the recorded "
             "messages. Ends with 0 if all are equal, 1 if not.",
         ),
     ] = False,
     up: Annotated[
-        bool, typer.Option("--up", help="Bring a router, a monitor and a recorder, as `up --record` does.")
+        bool, Option("--up", help="Bring a router, a monitor and a recorder, as `up --record` does.")
     ] = False,
     as_json: Json = False,
-    stated: FileFormat = GUESS,
+    table: TableOptions,
 ) -> None:
     """Publish a recording or a record as the plant did, or verify a recording.
 
     While it runs, `playback` pauses, resumes or steps it, or changes its rate; in a terminal, so do the keys space,
     right, up and down.
     """
+    part = {"--from": begin, "--to": end, "--loop": loop, "--column": column}
     if verify:
         from reactorwatch.cli.verification import run
 
-        given = {"--rate": rate, "--from": begin, "--to": end, "--loop": loop, "--column": column, "--process": process}
-        given["--up"] = up
-        for option, value in given.items():
-            if value:
-                raise InputError(f"--verify publishes nothing and takes the whole recording; leave out {option}")
-        raise typer.Exit(run(check_recording(file), config, name, as_json=as_json))
+        given = {"--rate": rate, **part, "--process": chosen.process, "--up": up}
+        _refuse(given, "--verify publishes nothing and takes the whole recording")
+        raise typer.Exit(run(check_recording(file), target.config, name, as_json=as_json))
     if up:
         from reactorwatch.cli.plant_settings import PlayedRecord
         from reactorwatch.cli.supervise import run_until_stopped
 
-        part = {
-            "--from": begin,
-            "--to": end,
-            "--loop": loop,
-            "--column": column,
-            "--input": inputs,
-            "--output": outputs,
-        }
-        for option, value in part.items():
-            if value:
-                raise InputError(f"--up plays the whole file with its own names; leave out {option}")
-        pace = {"name": name, "speed": parse_pace(rate, "--rate"), "process": process}
-        played = PlayedRecord(check_recording(file), stated)
-        raise typer.Exit(run_until_stopped(config, endpoint, None, pace, None, None, played))
+        _refuse(
+            {**part, "--input": chosen.inputs, "--output": chosen.outputs},
+            "--up plays the whole file with its own names",
+        )
+        pace = {"name": name, "speed": parse_pace(rate, "--rate"), "process": chosen.process}
+        played = PlayedRecord(check_recording(file), table.stated)
+        raise typer.Exit(run_until_stopped(target, None, pace, None, None, played))
     from reactorwatch.records.record import MINUTE_NS
     from reactorwatch.records.source_text import is_table
     from reactorwatch.runtime.config import section
@@ -274,8 +214,8 @@ def replay(
 
     if column and not is_table(file):
         raise InputError(f"--column is for the columns of a .csv file or another table, got {file}")
-    choice = choose_process(process, inputs, outputs)
-    tables, bus = _settings(config, endpoint)
+    choice = chosen.choose()
+    tables, bus = _settings(target)
     flags = {
         "file": str(check_recording(file)),
         "plant": name,
@@ -287,23 +227,29 @@ def replay(
         "inputs": choice.inputs or None,
         "outputs": choice.outputs or None,
         "columns": parse_columns(column) or None,
-        "table": {name: value for name, value in asdict(stated).items() if value not in (None, ())} or None,
+        "table": stated_settings(table.stated),
     }
     run_replay(section(ReplayConfig, "replay", tables, flags), bus)
 
 
+def _refuse(given: dict[str, Any], why: str) -> None:
+    """Refuse options that are given beside one which excludes them."""
+    for option, value in given.items():
+        if value:
+            raise InputError(f"{why}; leave out {option}")
+
+
 def alive(
-    node: Annotated[str, typer.Argument(help="plant, monitor or recorder.", show_default=False)],
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
-    timeout: Annotated[float, typer.Option(help="Seconds to wait for it.", min=0.1, max=MAX_WAIT_S)] = 5.0,
+    *,
+    node: Annotated[str, Argument(help="plant, monitor or recorder.")],
+    target: PlantOptions,
+    timeout: Annotated[float, Option(help="Seconds to wait for it.", min=0.1, max=MAX_WAIT_S)] = TIMEOUT_S,
 ) -> None:
     """Check that a node is alive: ends with 0 or 1."""
     from reactorwatch.cli.liveliness import wait_for_node
     from reactorwatch.contract.keys import DEFAULT_PLANT
 
-    _, bus = _settings(config, endpoint, quiet=True)
-    there = wait_for_node(bus, name or DEFAULT_PLANT, node, timeout)
+    _, bus = _settings(target, quiet=True)
+    there = wait_for_node(bus, target.name or DEFAULT_PLANT, node, timeout)
     print_lines(f"{node} is {'alive' if there else f'not there within {timeout:g} s'}")
     raise typer.Exit(0 if there else 1)

@@ -4,9 +4,9 @@ Its log is text for the terminal, independent of the nodes' log settings.
 """
 
 import logging
-from pathlib import Path
 from typing import Any
 
+from reactorwatch.cli.options import BusOptions, PlantOptions
 from reactorwatch.description.find import find_process
 from reactorwatch.description.plants import PlantProcesses
 from reactorwatch.description.process import Process
@@ -15,40 +15,33 @@ from reactorwatch.runtime.logs import configure
 from recorder.config import RecorderConfig
 
 
-def load_settings(
-    config: Path | None, endpoint: str | None, level: int = logging.WARNING
-) -> tuple[dict[str, dict[str, Any]], BusConfig]:
+def load_settings(target: BusOptions, level: int = logging.WARNING) -> tuple[dict[str, dict[str, Any]], BusConfig]:
     """Configure the log; returns the tables of the settings, and the bus settings.
 
     Args:
-        config: settings file, or None.
-        endpoint: the router's address, or None.
+        target: options of the command.
         level: the least severe level that is logged.
 
     Raises:
         InputError: invalid settings.
     """
     configure(level)
-    tables = read_settings(config)
-    return tables, section(BusConfig, "bus", tables, {"endpoint": endpoint})
+    tables = read_settings(target.config)
+    return tables, section(BusConfig, "bus", tables, {"endpoint": target.endpoint})
 
 
-def load_recorder_settings(
-    config: Path | None, endpoint: str | None, plant: str | None, level: int = logging.WARNING
-) -> tuple[BusConfig, RecorderConfig]:
+def load_recorder_settings(target: PlantOptions, level: int = logging.WARNING) -> tuple[BusConfig, RecorderConfig]:
     """Configure the log; returns the settings of the bus, and of the recorder, which name the plant.
 
     Args:
-        config: see `load_settings`.
-        endpoint: see `load_settings`.
-        plant: name of the plant; None: that of the settings.
+        target: options of the command; without a plant, that of the settings.
         level: see `load_settings`.
 
     Raises:
         InputError: invalid settings.
     """
-    tables, bus = load_settings(config, endpoint, level)
-    return bus, section(RecorderConfig, "recorder", tables, {"plant": plant})
+    tables, bus = load_settings(target, level)
+    return bus, section(RecorderConfig, "recorder", tables, {"plant": target.name})
 
 
 def observed_process(process: str | None, recorder: RecorderConfig) -> Process | None:

@@ -1,12 +1,17 @@
-"""Options that several commands share, and parsers of their values."""
+"""Options that several commands share, alone or as groups that travel together, and parsers of their values.
+
+A group is a dataclass whose fields are the options; `reactorwatch.cli.option_groups` makes them options of a command.
+"""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
+from typer import Argument, Option
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.output import check_output_file
@@ -14,98 +19,125 @@ from reactorwatch.records.output import check_output_file
 if TYPE_CHECKING:
     from reactorwatch.description.choice import ProcessChoice
 
-Settings = Annotated[
-    Path | None, typer.Option("--config", help="Settings file (TOML), a table for each node.", show_default=False)
-]
-Endpoint = Annotated[str | None, typer.Option(help="Address of the router [tcp/127.0.0.1:7447].", show_default=False)]
-Plant = Annotated[str | None, typer.Option("--plant", help="Name of the plant [cstr].", show_default=False)]
-Json = Annotated[bool, typer.Option("--json", help="One JSON object, for machines.")]
+Value = TypeVar("Value")
+
 MAX_WAIT_S = 86_400.0
 """Largest timeout: the system's clocks take no infinite times."""
 
+TIMEOUT_S = 5.0
+"""Default time to wait for the reply to a command."""
+
+Settings = Annotated[Path | None, Option("--config", help="Settings file (TOML), a table for each node.")]
+Plant = Annotated[str | None, Option("--plant", help="Name of the plant [cstr].")]
+Json = Annotated[bool, Option("--json", help="One JSON object, for machines.")]
 Columns = Annotated[
-    list[str] | None,
-    typer.Option("--column", help="A column of another name, as signal=column: --column T=reactor_temp."),
+    list[str] | None, Option(help="A column of another name, as signal=column: --column T=reactor_temp.")
 ]
-
-Model = Annotated[
-    Path | None,
-    typer.Option("--model", help="An extended model, as diagnose -o writes it [the nominal].", show_default=False),
-]
-
 Process = Annotated[
     str | None,
-    typer.Option(
-        "--process",
-        "--model",
-        help="A process: a name in the catalogue, or a .toml, .py or extended.json file [cstr].",
-        show_default=False,
+    Option(
+        "--process", "--model", help="A process: a name in the catalogue, or a .toml, .py or extended.json file [cstr]."
     ),
 ]
 Inputs = Annotated[
     list[str] | None,
-    typer.Option(
-        "--input", help="A column that is an input, without a process (repeatable, or with commas).", show_default=False
-    ),
-]
-Outputs = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--output", help="A column to watch, without a process (repeatable, or with commas).", show_default=False
-    ),
-]
-Modes = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--mode",
-        help="A column that says how the plant is operated, without a process (repeatable, or with commas).",
-        show_default=False,
-    ),
-]
-TrainingMin = Annotated[
-    float | None,
-    typer.Option("--training", help="Minutes to learn from [cstr: 100; else see --training-rows].", show_default=False),
-]
-TrainingRows = Annotated[
-    int | None,
-    typer.Option(
-        "--training-rows",
-        help="Rows to learn from, instead of minutes [1000, or a third of a record if that is fewer].",
-        show_default=False,
-    ),
+    Option("--input", help="A column that is an input, without a process (repeatable, or with commas)."),
 ]
 Reference = Annotated[
-    str | None,
-    typer.Option(help="Model that predicts each row: auto, equations, black-box or arx [auto].", show_default=False),
+    str | None, Option(help="Model that predicts each row: auto, equations, black-box or arx [auto].")
 ]
 Force = Annotated[
-    bool, typer.Option("--force", help="Replace a file that is there and is of another kind than its name says.")
+    bool, Option("--force", help="Replace a file that is there and is of another kind than its name says.")
 ]
-
-Diagnose = Annotated[
-    Path | None,
-    typer.Option(
-        "--diagnose", help="After an alarm, diagnose the recent rows into a folder in this one.", show_default=False
-    ),
-]
-
+Diagnose = Annotated[Path | None, Option(help="After an alarm, diagnose the recent rows into a folder in this one.")]
 Files = Annotated[
     list[Path],
-    typer.Argument(
-        help="Records (.csv or other tables) or recordings (.mcap), folders of them, or patterns such as 'runs/*.csv'.",
-        show_default=False,
+    Argument(
+        help="Records (.csv or other tables) or recordings (.mcap), folders of them, or patterns such as 'runs/*.csv'."
     ),
 ]
-Processes = Annotated[
-    int | None,
-    typer.Option("--jobs", help="How many at a time, each in a process [one a core].", min=1, show_default=False),
-]
+Recording = Annotated[Path, Argument(help="A recording (.mcap), a folder of them, or a record (.csv).")]
+RecordFile = Annotated[Path, Argument(help="A record (.csv) or recording (.mcap).")]
+Seed = Annotated[int | None, Option(help="Of the input and the noise.")]
+Speed = Annotated[str | None, Option(help="Plant time over wall time: a number, or 'max' [1].")]
+Begin = Annotated[str | None, Option("--from", help="Since the start, such as 10min [the start].")]
+End = Annotated[str | None, Option("--to", help="Since the start, such as 20min [the end].")]
+Jobs = Annotated[int | None, Option(help="How many at a time, each in a process [one a core].", min=1)]
 Scheduler = Annotated[
-    str | None,
-    typer.Option(
-        help="Of a Dask cluster to do it, such as tcp://127.0.0.1:8786 (reactorwatch[cluster]).", show_default=False
-    ),
+    str | None, Option(help="Of a Dask cluster to do it, such as tcp://127.0.0.1:8786 (reactorwatch[cluster]).")
 ]
+
+
+@dataclass(frozen=True)
+class BusOptions:
+    """Settings file and router of a command on the bus."""
+
+    config: Settings = None
+    endpoint: Annotated[str | None, Option(help="Address of the router [tcp/127.0.0.1:7447].")] = None
+
+
+@dataclass(frozen=True)
+class PlantOptions(BusOptions):
+    """Settings file, router and plant of a command on the bus."""
+
+    name: Plant = None
+
+
+@dataclass(frozen=True)
+class ClientOptions(PlantOptions):
+    """Settings file, router, plant and timeout of a command to a node."""
+
+    timeout: Annotated[float, Option(help="Seconds to wait for the monitor.", min=0.1, max=MAX_WAIT_S)] = TIMEOUT_S
+
+
+@dataclass(frozen=True)
+class ProcessOptions:
+    """The process of a record or a plant: as a whole, or by its columns."""
+
+    process: Process = None
+    inputs: Inputs = None
+    outputs: Annotated[
+        list[str] | None, Option("--output", help="A column to watch, without a process (repeatable, or with commas).")
+    ] = None
+
+    def choose(self, modes: list[str] | None = None) -> "ProcessChoice":
+        """Choice of the process.
+
+        Args:
+            modes: columns that say how a process without a description is operated.
+
+        Raises:
+            InputError: as `ProcessChoice`.
+        """
+        from reactorwatch.description.choice import ProcessChoice
+
+        return ProcessChoice(self.process, *(tuple(_split(texts)) for texts in (self.inputs, self.outputs, modes)))
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Length of a training."""
+
+    training: Annotated[float | None, Option(help="Minutes to learn from [cstr: 100; else see --training-rows].")] = (
+        None
+    )
+    training_rows: Annotated[
+        int | None,
+        Option(help="Rows to learn from, instead of minutes [1000, or a third of a record if that is fewer]."),
+    ] = None
+
+    @property
+    def is_given(self) -> bool:
+        """True if a length is given."""
+        return self.training is not None or self.training_rows is not None
+
+    def flags(self, tables: dict[str, dict[str, Any]]) -> dict[str, float | int | None]:
+        """Settings of the monitor; a length that is given takes the place of one in the tables, which is removed."""
+        flags = {"training_min": self.training, "training_rows": self.training_rows}
+        if self.is_given:
+            for name in flags:
+                tables.get("monitor", {}).pop(name, None)
+        return flags
 
 
 def check_encodable(text: str | None) -> str | None:
@@ -119,38 +151,6 @@ def check_encodable(text: str | None) -> str | None:
     except UnicodeEncodeError as error:
         raise typer.BadParameter(f"must be UTF-8, got {text!r}") from error
     return text
-
-
-def choose_process(
-    process: str | None, inputs: list[str] | None, outputs: list[str] | None, modes: list[str] | None = None
-) -> "ProcessChoice":
-    """Choice of a process by `--process`, or by `--input`, `--output` and `--mode`.
-
-    Raises:
-        InputError: as `ProcessChoice`.
-    """
-    from reactorwatch.description.choice import ProcessChoice
-
-    given = (inputs, outputs, modes)
-    named = [tuple(name.strip() for text in texts or () for name in text.split(",")) for texts in given]
-    return ProcessChoice(process, *named)
-
-
-def training_flags(
-    tables: dict[str, dict[str, Any]], minutes: float | None, rows: int | None
-) -> dict[str, float | int | None]:
-    """Flags of the length of a training; one that is given takes the place of a length in the settings file.
-
-    Args:
-        tables: tables of the settings file, from which a length is removed.
-        minutes: duration in minutes; None: not given.
-        rows: duration in rows; None: not given.
-    """
-    flags = {"training_min": minutes, "training_rows": rows}
-    if minutes is not None or rows is not None:
-        for name in flags:
-            tables.get("monitor", {}).pop(name, None)
-    return flags
 
 
 def parse_columns(pairs: list[str] | None) -> dict[str, str]:
@@ -168,14 +168,18 @@ def parse_columns(pairs: list[str] | None) -> dict[str, str]:
     return names
 
 
+def _split(texts: Iterable[str] | None) -> list[str]:
+    """Split texts at their commas."""
+    return [name.strip() for text in texts or () for name in text.split(",")]
+
+
 def split_names(texts: list[str] | None) -> tuple[str, ...]:
     """Split values of an option that is repeatable or comma separated to names, each once.
 
     >>> split_names(["h1,h2", "h3", "h1"])
     ('h1', 'h2', 'h3')
     """
-    names = (name.strip() for text in texts or () for name in text.split(","))
-    return tuple(dict.fromkeys(filter(None, names)))
+    return tuple(dict.fromkeys(filter(None, _split(texts))))
 
 
 def parse_tolerances(text: str | None) -> dict[str, float]:
@@ -184,14 +188,7 @@ def parse_tolerances(text: str | None) -> dict[str, float]:
     Raises:
         InputError: the text has another form.
     """
-    tolerances = {}
-    for part in text.split(",") if text is not None else ():
-        output, _, value = (item.strip() for item in part.partition("="))
-        try:
-            tolerances[output] = float(value)
-        except ValueError:
-            raise InputError(f"--tolerance must be output=number, such as C=0.002,T=0.5, got {part!r}") from None
-    return tolerances
+    return _parse_values(text, float, "--tolerance must be output=number, such as C=0.002,T=0.5")
 
 
 def parse_limits(text: str | None) -> dict[str, tuple[float, float]]:
@@ -200,17 +197,24 @@ def parse_limits(text: str | None) -> dict[str, tuple[float, float]]:
     Raises:
         InputError: the text has another form.
     """
-    limits = {}
+
+    def ends(value: str) -> tuple[float, float]:
+        low, _, high = value.partition("..")
+        return float(low), float(high)
+
+    return _parse_values(text, ends, "--limits must be signal=lowest..highest, such as qc=85..115,T=425..455")
+
+
+def _parse_values(text: str | None, parse: Callable[[str], Value], rule: str) -> dict[str, Value]:
+    """Parse `name=value` with commas between; the rule is what an error says."""
+    values = {}
     for part in text.split(",") if text is not None else ():
-        signal, _, ends = (item.strip() for item in part.partition("="))
-        low, _, high = ends.partition("..")
+        name, _, value = (item.strip() for item in part.partition("="))
         try:
-            limits[signal] = (float(low), float(high))
+            values[name] = parse(value)
         except ValueError:
-            raise InputError(
-                f"--limits must be signal=lowest..highest, such as qc=85..115,T=425..455, got {part!r}"
-            ) from None
-    return limits
+            raise InputError(f"{rule}, got {part!r}") from None
+    return values
 
 
 def parse_pace(text: str | None, option: str) -> float | None:

@@ -1,13 +1,14 @@
 """Settings of the source of a run's samples: a simulated plant, or a played record."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from plant_node.config import PlantConfig
 from plant_node.process_settings import fit_settings
 from plant_node.record import load_process
 from reactorwatch.api.files import record
+from reactorwatch.cli.option_groups import stated_settings
 from reactorwatch.cli.options import check_recording
 from reactorwatch.description.catalogue import Catalogue
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
@@ -25,8 +26,7 @@ WAIT_FOR = ("monitor", "recorder")
 """Nodes that must be alive before the first sample."""
 
 
-@dataclass(frozen=True)
-class PlayedRecord:
+class PlayedRecord(NamedTuple):
     """A record that is played in place of a simulated plant.
 
     Attributes:
@@ -86,9 +86,7 @@ class Source:
             flags["process"] = self.process
         is_stated = tables.get("monitor", {}).keys() & {"training_min", "training_rows"}
         if self.rows is not None and not is_stated:
-            from monitor_node.config import (
-                DEFAULT_TRAINING_ROWS,
-            )  # only here: a plant needs no charts
+            from monitor_node.config import DEFAULT_TRAINING_ROWS  # only here: a plant needs no charts
 
             flags["training_rows"] = max(1, min(DEFAULT_TRAINING_ROWS, self.rows // 3))
         return flags
@@ -112,8 +110,8 @@ def load_source(tables: Tables, flags: dict[str, Any], played: PlayedRecord | No
             "plant", plant, plant.name, plant.process or DEFAULT_PROCESS, is_named=flags.get("process") is not None
         )
     given = flags.get("process") or tables.get("replay", {}).get("process")
-    process, name = process_of_run(given, played, flags.get("name"))
-    replay = load_replay_settings(tables, played, {**flags, "name": name, "process": process})
+    process, name = _played_process(played.path, given, flags.get("name"))
+    replay = _replay_settings(tables, played, {**flags, "name": name, "process": process})
     is_named, rows = process != DEFAULT_PROCESS, None
     if is_named:
         described = find_process(process).without_equations()
@@ -147,13 +145,8 @@ def complete_plant_settings(config: PlantConfig) -> PlantConfig:
     return fit_settings(changed, process).complete(config)
 
 
-def load_replay_settings(tables: Tables, played: PlayedRecord, flags: dict[str, Any]) -> ReplayConfig:
+def _replay_settings(tables: Tables, played: PlayedRecord, flags: dict[str, Any]) -> ReplayConfig:
     """Settings of a replay in place of a plant.
-
-    Args:
-        tables: tables of the settings file.
-        played: the record.
-        flags: flags of the plant by key; None: not given.
 
     Raises:
         InputError: invalid settings, there is no such record, or flags for a simulation.
@@ -161,41 +154,31 @@ def load_replay_settings(tables: Tables, played: PlayedRecord, flags: dict[str, 
     for name, option in (("seed", "--seed"), ("faults", "--fault")):
         if flags.get(name) is not None:
             raise InputError(f"--record {played.path}: a record is played, not simulated; leave {option} out")
-    check_recording(played.path)
-    stated = {name: value for name, value in asdict(played.stated).items() if value not in (None, ())}
     given = {
-        "file": str(played.path),
-        "plant": flags.get("name"),
+        "file": str(check_recording(played.path)),
+        "plant": flags["name"],
         "rate": flags.get("speed"),
-        "process": flags.get("process"),
-        "table": stated or None,
+        "process": flags["process"],
+        "table": stated_settings(played.stated),
     }
     waiting = {"wait_for": list(WAIT_FOR), **tables.get("replay", {})}
     return section(ReplayConfig, "replay", {"replay": waiting}, given)
 
 
-def process_of_run(process: str | None, played: PlayedRecord | None, plant: str | None) -> tuple[str, str]:
-    """Process of a run, and the name of its plant.
-
-    Args:
-        process: name or file of the process; None: the one that a played recording describes, else the default.
-        played: the played record; None: a plant is simulated.
-        plant: given name of the plant; None: that in a recording, else that of the process.
-
-    Returns:
-        The name or file of the process, and the name of the plant.
+def _played_process(path: Path, process: str | None, plant: str | None) -> tuple[str, str]:
+    """Process of a played record, by name or file, and the name of its plant.
 
     Raises:
-        InputError: there is no such process, or the recording holds several plants.
+        InputError: there is no such process, or a recording holds several plants.
     """
-    if played is not None and not is_table(played.path):
-        recorded = one_plant_in(played.path)
-        plant, described = plant or recorded, recorded_process(played.path, recorded)
+    if not is_table(path):
+        recorded = one_plant_in(path)
+        plant, described = plant or recorded, recorded_process(path, recorded)
         if process is None and described is not None:
             process = described.name
             if process not in Catalogue():
                 raise InputError(
-                    f"--record {played.path}: is of process {process!r}, which is in no catalogue here; name its file "
+                    f"--record {path}: is of process {process!r}, which is in no catalogue here; name its file "
                     "by --process"
                 )
     process = process or DEFAULT_PROCESS

@@ -18,3 +18,10 @@ def print_lines(*lines: str, err: bool = False) -> None:
 def print_text(text: str) -> None:
     """Print a text of several lines; see `printable_lines`."""
     print_lines(*text.split("\n"))
+
+
+def json_line(value: object) -> str:
+    """Format as JSON on one line."""
+    import msgspec
+
+    return msgspec.json.encode(value).decode()

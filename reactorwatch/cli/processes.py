@@ -7,6 +7,7 @@ the supervisor only. It then stops the nodes one after the other: the plant firs
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -45,17 +46,14 @@ class Processes:
     def start(self, node: str) -> subprocess.Popen[bytes]:
         """Start a node."""
         command = [sys.executable, "-m", MODULES[node], str(self._settings[node])]
-        if self._logs is None:
-            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)  # noqa: S603 (our own modules)
-        else:
-            with (self._logs / f"{node}.log").open("wb") as output:
-                process = subprocess.Popen(  # noqa: S603 (our own modules)
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=subprocess.STDOUT,
-                    start_new_session=True,
-                )
+        with nullcontext() if self._logs is None else (self._logs / f"{node}.log").open("wb") as output:
+            process = subprocess.Popen(  # noqa: S603 (our own modules)
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=None if output is None else subprocess.STDOUT,
+                start_new_session=True,
+            )
         self._running[node] = process
         return process
 

@@ -20,31 +20,23 @@ def _escape_markup(text: str) -> str:
 
 
 @contextlib.contextmanager
-def task(text: str) -> Iterator[None]:
-    """Show a spinner while the context lasts."""
-    if not sys.stderr.isatty():
-        yield
-        return
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+def bar(text: str, total: float | None) -> Iterator[Advance]:
+    """Show a bar while the context lasts; yields a function of the progress and a text.
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
-        progress.add_task(_escape_markup(text), total=None)
-        yield
-
-
-@contextlib.contextmanager
-def bar(text: str, total: float) -> Iterator[Advance]:
-    """Show a bar while the context lasts; yields a function of the progress and a text."""
+    Args:
+        text: text beside the bar at first.
+        total: progress at the end; None: a spinner is shown.
+    """
     if not sys.stderr.isatty():
         yield lambda _completed, _now: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    label = TextColumn("{task.description}")
+    columns = (
+        (SpinnerColumn(), label, TimeElapsedColumn()) if total is None else (label, BarColumn(), TimeRemainingColumn())
+    )
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
         number = progress.add_task(_escape_markup(text), total=total)
@@ -53,3 +45,8 @@ def bar(text: str, total: float) -> Iterator[Advance]:
             progress.update(number, completed=completed, description=_escape_markup(now))
 
         yield advance
+
+
+def task(text: str) -> contextlib.AbstractContextManager[Advance]:
+    """Show a spinner while the context lasts."""
+    return bar(text, None)

@@ -85,13 +85,7 @@ def info_object(seen: FileInfo, file: Path) -> dict[str, Any]:
             for gap in overview.gaps
         ],
         "lost_on_the_way": [
-            {
-                "stream": gap.stream,
-                "messages": gap.messages,
-                "first": gap.first,
-                "last": gap.last,
-                "noticed_ns": gap.noticed_ns,
-            }
+            {name: getattr(gap, name) for name in ("stream", "messages", "first", "last", "noticed_ns")}
             for gap in seen.gaps
         ],
         "alarms": [
@@ -131,11 +125,8 @@ def info_text(seen: FileInfo, file: Path) -> str:
         if len(runs) > 1:
             lines.append(f"{len(runs)} runs of {plant}: its clock steps back, or it was restarted:")
             spans = [(to_minutes(run.first_ns, seen.zero_ns), to_minutes(run.last_ns, seen.zero_ns)) for run in runs]
-            lines += [
-                f"  run {number}: {first:g} to {last:g} min"
-                for number, (first, last) in enumerate(spans[:MAX_LINES], 1)
-            ]
-            lines += [f"  and {len(runs) - MAX_LINES} more (--json names them)"] if len(runs) > MAX_LINES else []
+            named = [f"  run {number}: {first:g} to {last:g} min" for number, (first, last) in enumerate(spans, 1)]
+            lines += _first_lines(named, "more")
     facts = [
         f"{name} {seen.metadata[name]}" for name in ("plant", "version", "seed", "started") if name in seen.metadata
     ]
@@ -149,19 +140,16 @@ def info_text(seen: FileInfo, file: Path) -> str:
     ]
     if report["lost"]:
         lines.append(f"{report['lost']} samples are missing:")
-    lines += [
+    gaps = [
         f"  {gap['last'] - gap['first'] + 1:9d}  {gap['topic']}: {gap['first']} to {gap['last']}, "
         f"after {gap['after_min']:g} min"
-        for gap in report["gaps"][:MAX_LINES]
+        for gap in report["gaps"]
     ]
-    if len(report["gaps"]) > MAX_LINES:
-        lines.append(f"  and {len(report['gaps']) - MAX_LINES} more gaps (--json names them)")
-    lines += [
+    lost = [
         f"lost on the way: {gap['messages']} messages of {gap['stream']}, noticed {format_moment(gap['noticed_ns'])}"
-        for gap in report["lost_on_the_way"][:MAX_LINES]
+        for gap in report["lost_on_the_way"]
     ]
-    if len(report["lost_on_the_way"]) > MAX_LINES:
-        lines.append(f"  and {len(report['lost_on_the_way']) - MAX_LINES} times more (--json names them)")
+    lines += [*_first_lines(gaps, "more gaps"), *_first_lines(lost, "times more")]
     if report["out_of_place"]:
         lines.append(f"{report['out_of_place']} samples have a time or number that fits no other")
     if not report["lost"]:
@@ -177,6 +165,12 @@ def info_text(seen: FileInfo, file: Path) -> str:
     if seen.damages:
         lines.append(f"not whole: {'; '.join(seen.damages)}; `reactorwatch recover {file}` saves the rest")
     return printable_lines(lines)
+
+
+def _first_lines(lines: list[str], more: str) -> list[str]:
+    """The first lines, and the number of the others."""
+    others = len(lines) - MAX_LINES
+    return [*lines[:MAX_LINES], *([f"  and {others} {more} (--json names them)"] if others > 0 else [])]
 
 
 def _describe_roles(process: Process) -> Iterator[str]:

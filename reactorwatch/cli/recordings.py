@@ -4,46 +4,31 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
+from reactorwatch.cli.option_groups import TableOptions
 from reactorwatch.cli.options import (
+    Begin,
+    End,
     Force,
-    Inputs,
     Json,
-    Outputs,
-    Process,
+    ProcessOptions,
     check_input,
     check_output,
     check_recording,
-    choose_process,
     parse_span_ns,
 )
-from reactorwatch.cli.printing import print_lines, print_text
-from reactorwatch.cli.table_options import take_table_options
+from reactorwatch.cli.printing import json_line, print_lines, print_text
 from reactorwatch.errors import InputError
-from reactorwatch.records.file_format import GUESS, FileFormat
-
-
-def register_commands(app: typer.Typer) -> None:
-    """Register the commands."""
-    app.command("recover")(recover)
-    app.command("info")(take_table_options(info))
-    app.command("cut")(cut)
-    app.command("merge")(merge)
 
 
 def recover(
-    file: Annotated[Path, typer.Argument(help="A recording that is cut off or damaged.", show_default=False)],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="The file to write [beside it, X-recovered.mcap].", show_default=False),
-    ] = None,
+    file: Annotated[Path, Argument(help="A recording that is cut off or damaged.")],
+    out: Annotated[Path | None, Option("--out", "-o", help="The file to write [beside it, X-recovered.mcap].")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Recover the intact messages of a damaged recording."""
-    import msgspec
-
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.recording_reports import saved_object, saved_text
     from recorder.storage.part_file import is_locked
@@ -54,22 +39,17 @@ def recover(
     out = check_output(out, ".mcap", (file,), force=force) if out is not None else _beside(file)
     with task(f"recovering {file.name}"):
         saved = save(file, out)
-    print_text(msgspec.json.encode(saved_object(saved, out)).decode() if as_json else saved_text(saved, file, out))
+    print_text(json_line(saved_object(saved, out)) if as_json else saved_text(saved, file, out))
 
 
 def info(
-    file: Annotated[
-        Path, typer.Argument(help="A recording (.mcap), a folder of them, or a table.", show_default=False)
-    ],
-    process: Process = None,
-    inputs: Inputs = None,
-    outputs: Outputs = None,
+    *,
+    file: Annotated[Path, Argument(help="A recording (.mcap), a folder of them, or a table.")],
+    chosen: ProcessOptions,
     as_json: Json = False,
-    stated: FileFormat = GUESS,
+    table: TableOptions,
 ) -> None:
     """Show the contents of a recording, and missing messages; or how a table is read, and what is in it."""
-    import msgspec
-
     from reactorwatch.cli.display import print_report
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.recording_reports import info_object, info_text
@@ -79,28 +59,28 @@ def info(
     from reactorwatch.records.source_text import is_table
     from recorder.tools.inspect import inspect
 
-    choice = choose_process(process, inputs, outputs)
+    choice = chosen.choose()
     with task(f"reading {file.name}"):
         if is_table(check_recording(file)) and not file.is_dir():
-            record = read_table(file, None, stated) if choice.is_default else read_signals(file, choice, None, stated)
-            text = msgspec.json.encode(table_object(record, file)).decode() if as_json else table_text(record, file)
+            record = (
+                read_table(file, None, table.stated)
+                if choice.is_default
+                else read_signals(file, choice, None, table.stated)
+            )
+            text = json_line(table_object(record, file)) if as_json else table_text(record, file)
         else:
             seen = inspect(file)
             if not choice.is_default:
                 seen = replace(seen, processes=dict.fromkeys(seen.overview.runs, choice.load()))
-            text = msgspec.json.encode(info_object(seen, file)).decode() if as_json else info_text(seen, file)
+            text = json_line(info_object(seen, file)) if as_json else info_text(seen, file)
     print_report(text, as_json=as_json)
 
 
 def cut(
-    file: Annotated[Path, typer.Argument(help="A recording (.mcap), or a folder of them.", show_default=False)],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write (.mcap).", show_default=False)],
-    begin: Annotated[
-        str | None, typer.Option("--from", help="Since the start, such as 10min [the start].", show_default=False)
-    ] = None,
-    end: Annotated[
-        str | None, typer.Option("--to", help="Since the start, such as 20min [the end].", show_default=False)
-    ] = None,
+    file: Annotated[Path, Argument(help="A recording (.mcap), or a folder of them.")],
+    out: Annotated[Path, Option("--out", "-o", help="The file to write (.mcap).")],
+    begin: Begin = None,
+    end: End = None,
     force: Force = False,
 ) -> None:
     """Copy a span of plant time out of a recording."""
@@ -125,8 +105,8 @@ def cut(
 
 
 def merge(
-    files: Annotated[list[Path], typer.Argument(help="Recordings (.mcap), or folders of them.", show_default=False)],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write (.mcap).", show_default=False)],
+    files: Annotated[list[Path], Argument(help="Recordings (.mcap), or folders of them.")],
+    out: Annotated[Path, Option("--out", "-o", help="The file to write (.mcap).")],
     force: Force = False,
 ) -> None:
     """Merge several recordings into one, in order of receipt."""

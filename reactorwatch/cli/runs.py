@@ -7,68 +7,37 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Option
 
-from reactorwatch.cli.options import (
-    Diagnose,
-    Endpoint,
-    Inputs,
-    Outputs,
-    Plant,
-    Process,
-    Settings,
-    choose_process,
-    parse_pace,
-)
-from reactorwatch.cli.table_options import take_table_options
+from reactorwatch.cli.option_groups import TableOptions
+from reactorwatch.cli.options import Diagnose, PlantOptions, Process, ProcessOptions, Seed, Speed, parse_pace
 from reactorwatch.errors import InputError
-from reactorwatch.records.file_format import GUESS, FileFormat
+from reactorwatch.records.file_format import GUESS
 
 if TYPE_CHECKING:
     from reactorwatch.description.choice import ProcessChoice
 
 Site = Annotated[
-    Path | None,
-    typer.Option(
-        help="Folder that `certify` made: run its router, and each node with its certificate [none].",
-        show_default=False,
-    ),
+    Path | None, Option(help="Folder that `certify` made: run its router, and each node with its certificate [none].")
 ]
 
 
-def register_commands(app: typer.Typer) -> None:
-    """Register the commands."""
-    app.command("up")(take_table_options(up))
-    app.command("demo")(demo)
-
-
 def up(
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
+    *,
+    target: PlantOptions,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="Folder for the recording, or its file [as in the settings, or runs].",
-            show_default=False,
-        ),
+        Path | None, Option("--out", "-o", help="Folder for the recording, or its file [as in the settings, or runs].")
     ] = None,
-    speed: Annotated[
-        str | None, typer.Option(help="Plant time over wall time: a number, or 'max' [1].", show_default=False)
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of the input and the noise.", show_default=False)] = None,
-    fault: Annotated[list[str] | None, typer.Option(help="A fault, as cause:profile:size@onset. Repeatable.")] = None,
-    process: Process = None,
-    inputs: Inputs = None,
-    outputs: Outputs = None,
+    speed: Speed = None,
+    seed: Seed = None,
+    fault: Annotated[list[str] | None, Option(help="A fault, as cause:profile:size@onset. Repeatable.")] = None,
+    chosen: ProcessOptions,
     record: Annotated[
-        Path | None,
-        typer.Option(help="Play this record (a recording or a table) in place of a simulated plant."),
+        Path | None, Option(help="Play this record (a recording or a table) in place of a simulated plant.")
     ] = None,
     diagnose: Diagnose = None,
     site: Site = None,
-    stated: FileFormat = GUESS,
+    table: TableOptions,
 ) -> None:
     """Run router, plant, monitor and recorder until stopped.
 
@@ -78,18 +47,18 @@ def up(
     from reactorwatch.cli.supervise import run_until_stopped
 
     flags = {
-        "name": name,
+        "name": target.name,
         "speed": parse_pace(speed, "--speed"),
         "seed": seed,
         "faults": fault or None,
     }
-    choice = choose_process(process, inputs, outputs)
-    if record is None and (stated != GUESS or choice.outputs):
+    choice = chosen.choose()
+    if record is None and (table.stated != GUESS or choice.outputs):
         raise InputError("options about the form of a table are for the record of --record; name it, or leave them out")
-    played = None if record is None else PlayedRecord(record, stated)
+    played = None if record is None else PlayedRecord(record, table.stated)
     with describe_in_file(choice) as named:
         flags["process"] = named
-        raise typer.Exit(run_until_stopped(config, endpoint, out, flags, diagnose, site, played))
+        raise typer.Exit(run_until_stopped(target, out, flags, diagnose, site, played))
 
 
 @contextmanager
@@ -109,25 +78,19 @@ def describe_in_file(choice: "ProcessChoice") -> Iterator[str | None]:
 
 
 def demo(
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for the run [runs/demo-<time>].", show_default=False)
-    ] = None,
-    duration: Annotated[float, typer.Option(help="Minutes of plant time.", min=150)] = 240.0,
-    speed: Annotated[str, typer.Option(help="Plant time over wall time.")] = "400",
+    out: Annotated[Path | None, Option("--out", "-o", help="Folder for the run [runs/demo-<time>].")] = None,
+    duration: Annotated[float, Option(help="Minutes of plant time.", min=150)] = 240.0,
+    speed: Annotated[str, Option(help="Plant time over wall time.")] = "400",
     fault: Annotated[
         str | None,
-        typer.Option(
-            help="The fault, as cause:profile:size@onset [of the process; coolant_flow:step:-0.15@150min].",
-            show_default=False,
-        ),
+        Option(help="The fault, as cause:profile:size@onset [of the process; coolant_flow:step:-0.15@150min]."),
     ] = None,
     process: Process = None,
-    seed: Annotated[int, typer.Option(help="Of the input and the noise.")] = 1,
+    seed: Annotated[int, Option(help="Of the input and the noise.")] = 1,
     site: Site = None,
 ) -> None:
     """Simulate, watch, record, draw and diagnose a plant with a fault."""
-    from reactorwatch.cli.demonstration import Demonstration, run
+    from reactorwatch.cli.demonstration import run
 
-    speed_value = parse_pace(speed, "--speed")
-    assert speed_value is not None
-    raise typer.Exit(run(Demonstration(process, duration, speed_value, fault, seed), out, site))
+    flags = {"process": process, "duration_min": duration, "speed": parse_pace(speed, "--speed"), "seed": seed}
+    raise typer.Exit(run(flags, fault, out, site))

@@ -4,49 +4,31 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
-from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Process, Settings
-from reactorwatch.cli.printing import print_lines
-
-
-def register_commands(app: typer.Typer) -> None:
-    """Register the commands."""
-    app.command("certify")(certify)
-    app.command("router")(router)
-    app.command("doctor")(doctor)
-    app.command("status")(status)
+from reactorwatch.cli.options import MAX_WAIT_S, BusOptions, Json, PlantOptions, Process, Settings, check_input
+from reactorwatch.cli.printing import json_line, print_lines
+from reactorwatch.errors import InputError
 
 
 def certify(
-    folder: Annotated[Path, typer.Argument(help="Of the site: new, or one to add to.", show_default=False)],
-    plant: Annotated[
-        list[str] | None,
-        typer.Option("--plant", help="A plant to add [those there, or cstr]. Repeatable.", show_default=False),
-    ] = None,
+    folder: Annotated[Path, Argument(help="Of the site: new, or one to add to.")],
+    plant: Annotated[list[str] | None, Option(help="A plant to add [those there, or cstr]. Repeatable.")] = None,
     endpoint: Annotated[
-        str | None,
-        typer.Option(
-            help="Address at which nodes connect to the router [as before, or tls/127.0.0.1:7447].", show_default=False
-        ),
+        str | None, Option(help="Address at which nodes connect to the router [as before, or tls/127.0.0.1:7447].")
     ] = None,
     listen: Annotated[
-        str | None,
-        typer.Option(help="Address at which the router listens [as before, or --endpoint].", show_default=False),
+        str | None, Option(help="Address at which the router listens [as before, or --endpoint].")
     ] = None,
-    days: Annotated[float, typer.Option(help="How long certificates are valid.", min=1, max=3650)] = 365.0,
+    days: Annotated[float, Option(help="How long certificates are valid.", min=1, max=3650)] = 365.0,
     renew: Annotated[
-        float | None,
-        typer.Option(
-            "--renew", help="Renew certificates that end within this many days.", min=0, max=3650, show_default=False
-        ),
+        float | None, Option(help="Renew certificates that end within this many days.", min=0, max=3650)
     ] = None,
     revoke: Annotated[
         list[str] | None,
-        typer.Option(
-            "--revoke",
+        Option(
             help="Make the router refuse the present certificates of this plant and role, such as cstr/monitor, and "
-            "make a new one. Repeatable.",
-            show_default=False,
+            "make a new one. Repeatable."
         ),
     ] = None,
 ) -> None:
@@ -73,15 +55,13 @@ def certify(
 def router(
     file: Annotated[
         Path | None,
-        typer.Argument(
-            help="Zenoh's settings, as `certify` writes them: router.json5 [a plain router, on this machine alone].",
-            show_default=False,
+        Argument(
+            help="Zenoh's settings, as `certify` writes them: router.json5 [a plain router, on this machine alone]."
         ),
     ] = None,
     config: Settings = None,
     endpoint: Annotated[
-        str | None,
-        typer.Option(help="Address at which a plain router listens [tcp/127.0.0.1:7447].", show_default=False),
+        str | None, Option(help="Address at which a plain router listens [tcp/127.0.0.1:7447].")
     ] = None,
 ) -> None:
     """Run a router until stopped: that of a site, with certificates and access rules, or without a file a plain one.
@@ -92,8 +72,6 @@ def router(
 
     import structlog
 
-    from reactorwatch.cli.options import check_input
-    from reactorwatch.errors import InputError
     from reactorwatch.runtime.bus_zenoh import log_refusals, router_from_file
     from reactorwatch.runtime.bus_zenoh import router as plain_router
     from reactorwatch.runtime.config import BusConfig, LogConfig, read_settings, section
@@ -118,21 +96,18 @@ def router(
 
 
 def doctor(
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Plant = None,
-    timeout: Annotated[float, typer.Option(help="Seconds to listen for nodes.", min=0.1, max=MAX_WAIT_S)] = 12.0,
+    *,
+    target: PlantOptions,
+    timeout: Annotated[float, Option(help="Seconds to listen for nodes.", min=0.1, max=MAX_WAIT_S)] = 12.0,
     as_json: Json = False,
 ) -> None:
     """Check a deployment from here: one line a check, with the cure. Ends with 0 if all checks pass, 1 if not."""
     from datetime import UTC, datetime
 
-    import msgspec
-
     from reactorwatch.cli.doctor import run_checks
     from reactorwatch.cli.observer import load_recorder_settings
 
-    bus, recorder = load_recorder_settings(config, endpoint, name)
+    bus, recorder = load_recorder_settings(target)
     out = Path(recorder.out)
     folder = out.parent if out.suffix == ".mcap" else out
     is_well = True
@@ -144,28 +119,24 @@ def doctor(
             cure = f"; {finding.cure}" if finding.cure else ""
             print_lines(f"{'WRONG' if finding.cure else 'ok':5s}  {finding.check}: {finding.found}{cure}")
     if as_json:
-        print_lines(msgspec.json.encode({"ok": is_well, "checks": checks}).decode())
+        print_lines(json_line({"ok": is_well, "checks": checks}))
     raise typer.Exit(0 if is_well else 1)
 
 
 def status(
-    config: Settings = None,
-    endpoint: Endpoint = None,
-    name: Annotated[
-        str | None, typer.Option("--plant", help="Which plant [all that may be read].", show_default=False)
-    ] = None,
+    *,
+    target: BusOptions,
+    name: Annotated[str | None, Option("--plant", help="Which plant [all that may be read].")] = None,
     process: Process = None,
-    once: Annotated[bool, typer.Option("--once", help="Show it once.")] = False,
-    seconds: Annotated[
-        float, typer.Option(help="How long to listen before showing it once.", min=0.1, max=MAX_WAIT_S)
-    ] = 4.0,
+    once: Annotated[bool, Option("--once", help="Show it once.")] = False,
+    seconds: Annotated[float, Option(help="How long to listen before showing it once.", min=0.1, max=MAX_WAIT_S)] = 4.0,
     as_json: Json = False,
 ) -> None:
     """Show the current state of plants, nodes, rates and alarms, until stopped."""
     from reactorwatch.cli.observer import load_recorder_settings, observed_process
     from reactorwatch.cli.status import run
 
-    bus, recorder = load_recorder_settings(config, endpoint, name)
+    bus, recorder = load_recorder_settings(PlantOptions(target.config, target.endpoint, name))
     described = observed_process(process, recorder)
     # a certificate is for one plant, and messages of others are not received
     plant = recorder.plant if name is not None or bus.ca is not None else None

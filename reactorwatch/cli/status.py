@@ -7,10 +7,9 @@ from collections import Counter
 from math import inf, isnan
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from reactorwatch.cli.alarm_rows import ANNUNCIATED, Now, age_s, sort_alarms
 from reactorwatch.cli.display import has_colour, print_screen_text, screen_width
+from reactorwatch.cli.printing import json_line
 from reactorwatch.cli.status_view import format_plant
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import priority_word, state_word
@@ -250,7 +249,7 @@ def _text(board: StatusBoard, *, as_json: bool = False) -> str:
     now_ns = time.time_ns()
     if as_json:
         plants = [board.plant(name, now_ns) for name in board.plants]
-        return printable(msgspec.json.encode({"plants": plants}).decode())
+        return printable(json_line({"plants": plants}))
     return board.text(now_ns, screen_width(), colour=has_colour())
 
 

@@ -23,8 +23,9 @@ from reactorwatch.cli.bus_settings import (
     restrict_to_plant,
     write_node_settings,
 )
+from reactorwatch.cli.options import BusOptions
 from reactorwatch.cli.plant_settings import PlayedRecord, load_source
-from reactorwatch.cli.processes import Processes, settings_text, write_settings
+from reactorwatch.cli.processes import Processes, write_settings
 from reactorwatch.cli.run_progress import RunProgress
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
@@ -46,8 +47,7 @@ DEFAULT_OUT = "runs"
 
 
 def run_until_stopped(
-    config: Path | None,
-    endpoint: str | None,
+    target: BusOptions,
     out: Path | None,
     flags: dict[str, Any],
     diagnose: Path | None = None,
@@ -57,8 +57,7 @@ def run_until_stopped(
     """Run everything until SIGINT or SIGTERM, or until a node ends by itself.
 
     Args:
-        config: settings file, or None.
-        endpoint: the router's address, or None.
+        target: settings file and router.
         out: folder for the recording and the settings that ran, or the recording's file; a folder that does not exist
             is made. None: `out` of the recorder's settings, or the folder `runs`.
         flags: flags of the plant; None: not given.
@@ -72,7 +71,7 @@ def run_until_stopped(
     Raises:
         InputError: invalid settings.
     """
-    tables = read_settings(config)
+    tables = read_settings(target.config)
     log_config = section(LogConfig, "log", tables, {})
     configure(as_json=log_config.format == "json")
     source = load_source(tables, flags, played)
@@ -87,7 +86,7 @@ def run_until_stopped(
     of_recorder = {"recorder": {"out": DEFAULT_OUT, **of_recorder, "processes": processes}}
     recorder_flags = {"plant": source.plant, "out": str(out) if out is not None else None}
     recorder = restrict_to_plant(section(RecorderConfig, "recorder", of_recorder, recorder_flags), site)
-    join = load_bus_settings(site, source.plant, tables, endpoint)
+    join = load_bus_settings(site, source.plant, tables, target.endpoint)
     diagnosis = diagnosis_settings(tables, monitor, diagnose)
     metrics = section(MetricsConfig, "metrics", tables, {})
     if Path(recorder.out).suffix != ENDING:
@@ -123,7 +122,7 @@ def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig
         out: folder for the reports; None: as in the settings.
 
     Raises:
-        InputError: invalid settings, or a folder that is a file.
+        InputError: invalid settings, a folder that is a file, or a process without equations.
     """
     of_monitor = {"plant": monitor.plant, **({"process": monitor.process} if monitor.process else {})}
     stated = tables.get("diagnosis", {})
@@ -134,21 +133,12 @@ def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig
     if settings.out is not None:
         if Path(settings.out).exists() and not Path(settings.out).is_dir():
             raise InputError(f"--diagnose {settings.out}: is a file, the name of a folder was expected")
-        check_against_model(settings)
+        model = find_process(settings.process or DEFAULT_PROCESS).require_model()
+        try:  # now, and not after an alarm
+            check_tolerance(model, settings.tolerance)
+        except InputError as error:
+            raise InputError(f"settings [diagnosis]: {error}") from error
     return settings
-
-
-def check_against_model(config: DiagnosisConfig) -> None:
-    """Check settings against the model now, and not after an alarm.
-
-    Raises:
-        InputError: there is no such model, or a tolerance is for none of its outputs.
-    """
-    model = find_process(config.process or DEFAULT_PROCESS).require_model()
-    try:
-        check_tolerance(model, config.tolerance)
-    except InputError as error:
-        raise InputError(f"settings [diagnosis]: {error}") from error
 
 
 @contextlib.contextmanager
@@ -175,7 +165,5 @@ def _write_settings(
     recording = first_file(recorder, datetime.now(UTC))
     if recording.exists():
         raise InputError(f"--out {out}: a recording of that name exists; choose another name, or a folder")
-    settings = recording.with_suffix(".toml")
-    about = {**about, "settings": settings_text({"bus": join[VIEWER], **others}), **recorder.about}
-    recorder = msgspec.structs.replace(recorder, about=about)
-    return write_node_settings(settings, {**others, "recorder": recorder}, join, nodes)
+    recorder = msgspec.structs.replace(recorder, about={**about, **recorder.about})
+    return write_node_settings(recording.with_suffix(".toml"), recorder, others, join, nodes)

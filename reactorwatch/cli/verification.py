@@ -4,13 +4,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from monitor_node.config import MonitorConfig
 from monitor_node.replay.message_diff import Difference
 from monitor_node.replay.verification import COMPARED, Verification, verify
 from reactorwatch import __version__
-from reactorwatch.cli.printing import print_text
+from reactorwatch.cli.printing import json_line, print_text
 from reactorwatch.cli.progress import task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
@@ -71,7 +69,7 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
     report = _object(verification, file, monitor.plant, zero_ns) | {
         "zero": format_utc(zero_ns) if has_clock(metadata) else None
     }
-    print_text(msgspec.json.encode(report).decode() if as_json else _text(report))
+    print_text(json_line(report) if as_json else _text(report))
     return 0 if verification.exact else 1
 
 

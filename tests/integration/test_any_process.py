@@ -104,11 +104,11 @@ def test_it_is_drawn_by_signal_and_role_with_no_option(rig: Path, tmp_path: Path
 
 
 def test_it_is_read_for_a_diagnosis_with_no_option(rig: Path) -> None:
-    case = load_case(rig, None, DiagnosisOptions())
-    assert case.model.parameter("a2").value == 0.62
+    case = load_case(rig, DiagnosisOptions())
+    assert case.process.require_model().parameter("a2").value == 0.62
     assert case.uncertain == {"a2": 0.01}
-    assert case.measured.units == case.model.units
-    assert np.nanmax(case.measured.columns["h1"]) < 62.0  # cm
+    assert case.record.units == case.process.require_model().units
+    assert np.nanmax(case.record.columns["h1"]) < 62.0  # cm
 
 
 @pytest.mark.slow

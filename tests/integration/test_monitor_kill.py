@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from monitor_node.replay.verification import verify
-from reactorwatch.api.files import messages
+from reactorwatch.api.files import open_messages
 
 from .live_run import PLANT, LiveRun
 
@@ -41,4 +41,4 @@ def test_three_kills_change_no_alarm(tmp_path: Path) -> None:
         run.end(plant)
         assert (run.health.lost, run.health.late, run.health.incomplete_rows) == (0, 0, 0)
         assert run.recorded_alarms() == run.expected_alarms()
-        assert verify(lambda: messages(run.recording, PLANT), run.monitor).exact
+        assert verify(lambda: open_messages(run.recording, PLANT).messages, run.monitor).exact

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from reactorwatch.cli import baseline
 from reactorwatch.cli.main import app
-from reactorwatch.cli.options import choose_process
+from reactorwatch.cli.options import ClientOptions, ProcessOptions
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply
 from reactorwatch.errors import InputError
 
@@ -24,10 +24,8 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     """Commands that were sent, each with its name; the answer is the list of baselines, or a text."""
     commands: list[tuple[Any, ...]] = []
 
-    def send(
-        node: str, config: Any, endpoint: Any, plant: Any, timeout: float, name: str, command: Any
-    ) -> CommandReply:
-        commands.append((node, plant, name, command))
+    def send(node: str, client: ClientOptions, name: str, command: Any) -> CommandReply:
+        commands.append((node, client.name, name, command))
         listed = BASELINES if command.what == "list" else []
         return CommandReply(
             accepted=True, text=f"{command.what} by {command.by}, from the next row on", baselines=listed
@@ -71,9 +69,9 @@ def test_the_list_is_one_line_or_one_object_a_baseline(sent: list[tuple[Any, ...
 
 
 def test_a_mode_is_a_column_of_a_process_without_a_file() -> None:
-    process = choose_process(None, ["q"], ["th"], ["phase,auto"]).load()
+    process = ProcessOptions(None, ["q"], ["th"]).choose(["phase,auto"]).load()
     assert process.names("mode") == ("phase", "auto")
     with pytest.raises(InputError, match="--mode needs an --output, got only the mode phase"):
-        choose_process(None, None, None, ["phase"])
+        ProcessOptions().choose(["phase"])
     with pytest.raises(InputError, match="--input, --output and --mode describe a process without a file"):
-        choose_process("cstr", None, None, ["phase"])
+        ProcessOptions("cstr").choose(["phase"])

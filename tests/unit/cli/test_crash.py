@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.cli import diagnosis
+from reactorwatch.api import diagnosis
 from reactorwatch.cli.main import main
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication, encode
@@ -233,7 +233,7 @@ def test_a_recording_of_a_plant_with_an_impossible_name_is_watched_under_no_name
 def test_a_report_that_cannot_be_made_leaves_no_half_of_it(
     folder: Path, fails: str, there: bool, monkeypatch: Patch, capsys: Shown
 ) -> None:
-    monkeypatch.setattr(diagnosis, "diagnose", lambda *_: CASES["ambiguous"])
+    monkeypatch.setattr(diagnosis, "find_causes", lambda *_: CASES["ambiguous"])
     monkeypatch.setattr(fails, crashing)
     if there:
         (folder / "report").mkdir()

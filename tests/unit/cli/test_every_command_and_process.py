@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from reactorwatch.cli.diagnosis import Case
+from reactorwatch.api.diagnosis import Case
 from reactorwatch.cli.main import app
 from reactorwatch.cli.processes import Processes
 from reactorwatch.description.find import find_process
@@ -64,7 +64,7 @@ ENDLESS = (
 
 SLOW = (
     "reactorwatch.cli.backtest_jobs.run",
-    "reactorwatch.cli.diagnosis_jobs.run_diagnosis",
+    "reactorwatch.cli.diagnosis_jobs.diagnose_case",
     "reactorwatch.diagnosis.identifiability.identifiability",
 )
 """Functions that take seconds, and get a process that is already loaded."""
@@ -110,8 +110,10 @@ def processes_of(arguments: tuple[Any, ...]) -> Iterator[Process]:
                 yield from (find_process(table["process"]) for table in named)
         elif isinstance(item, Process):
             yield item
-        elif isinstance(item, ProcessModel | Case):
-            yield describe_model(item if isinstance(item, ProcessModel) else item.model)
+        elif isinstance(item, Case):
+            yield item.process
+        elif isinstance(item, ProcessModel):
+            yield describe_model(item)
         elif isinstance(getattr(item, "process", None), str):
             yield find_process(item.process)
 

@@ -27,9 +27,7 @@ def measured() -> Record:
 
 def identified(measured: Record, **options: object) -> dict[str, object]:
     form = ModelForm(**options)  # type: ignore[arg-type]
-    said: dict[str, object] = json.loads(
-        identification.fit(measured, ("qc",), ("T",), form, identification.Validation(), as_json=True)
-    )
+    said: dict[str, object] = json.loads(identification.fit(measured, ("qc",), ("T",), form, as_json=True))
     return said
 
 

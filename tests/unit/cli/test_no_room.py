@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from reactorwatch.cli import diagnosis
+from reactorwatch.api import diagnosis
 from tests.unit.cli.test_crash import files as files
 from tests.unit.cli.test_crash import run
 from tests.unit.cli.test_outputs import CASES as OUTPUTS
@@ -77,7 +77,7 @@ def no_room() -> Iterator[None]:
 def test_a_full_disk_is_one_line_leaves_nothing_and_keeps_the_answer(
     folder: Path, typed: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(diagnosis, "diagnose", lambda *_: CASES["ambiguous"])
+    monkeypatch.setattr(diagnosis, "find_causes", lambda *_: CASES["ambiguous"])
     command = typed.split()[0]
     before = state(folder)
     with no_room():
@@ -112,7 +112,7 @@ class Full(io.TextIOWrapper):
 def test_where_nothing_can_be_printed_the_exit_code_says_so(
     folder: Path, typed: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(diagnosis, "diagnose", lambda *_: CASES["ambiguous"])
+    monkeypatch.setattr(diagnosis, "find_causes", lambda *_: CASES["ambiguous"])
     monkeypatch.setattr(sys, "stdout", Full())
     assert run(shlex.split(typed), monkeypatch) == 2
     said = capsys.readouterr().err

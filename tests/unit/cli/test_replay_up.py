@@ -43,8 +43,8 @@ def test_it_runs_what_up_runs_with_the_same_record(
     replay: str, up: str, calls: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run(replay, monkeypatch) == run(up, monkeypatch) == 0
-    (config, endpoint, out, flags, *rest), (up_config, up_endpoint, up_out, up_flags, *up_rest) = calls
-    assert (config, endpoint, out, rest) == (up_config, up_endpoint, up_out, up_rest)
+    (target, out, flags, *rest), (up_target, up_out, up_flags, *up_rest) = calls
+    assert (target.config, target.endpoint, out, rest) == (up_target.config, up_target.endpoint, up_out, up_rest)
     assert flags == {name: up_flags[name] for name in flags}
     assert not any(value for name, value in up_flags.items() if name not in flags)
 

@@ -8,7 +8,7 @@ import pytest
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.cli.demonstration import Demonstration
+from reactorwatch.cli.demonstration import choose_fault
 from reactorwatch.cli.observer import observed_process
 from reactorwatch.cli.plant_settings import PlayedRecord, load_source
 from reactorwatch.description.choice import ProcessChoice
@@ -117,7 +117,7 @@ def test_the_form_of_a_played_table_may_be_stated(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [make().name for make in MODELS])
 def test_a_demonstration_has_a_fault_of_its_process_that_moves_its_outputs(name: str) -> None:
     process = find_process(name)
-    fault = str(Demonstration(name, 240.0, 400.0, None, 1).find_fault(process))
+    fault = str(choose_fault(None, process))
     assert fault.endswith("@150min")
     early = fault.replace("@150min", "@1min")
     faulty, sound = (simulate_record(PlantConfig(process=name, seed=1, faults=item), 150) for item in ((early,), ()))
@@ -129,10 +129,10 @@ def test_a_demonstration_has_a_fault_of_its_process_that_moves_its_outputs(name:
 def test_a_demonstration_of_a_process_without_faults_of_its_own_takes_one_made_from_its_equations() -> None:
     tanks = find_process("cascaded_tanks")
     own = Process("own", tanks.signals, tanks.equations)
-    assert str(Demonstration(None, 240.0, 400.0, None, 1).find_fault(own)).startswith("x2.bias:step:")
+    assert str(choose_fault(None, own)).startswith("x2.bias:step:")
     bare = Process("bare", (Signal("u", "V", "input"), Signal("y", "V")))
     with pytest.raises(InputError, match=r"^process 'bare': must have equations for this, got none; name those of"):
-        Demonstration(None, 240.0, 400.0, None, 1).find_fault(bare)
+        choose_fault(None, bare)
 
 
 def test_an_observer_takes_the_process_from_the_settings_of_the_recorder_unless_one_is_named() -> None:

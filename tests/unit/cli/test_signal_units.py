@@ -100,12 +100,12 @@ def test_units_go_into_recordings_and_drawings_and_back(rig: Path, tmp_path: Pat
 
 def test_identification_speaks_of_the_unit_that_is_known(rig: Path) -> None:
     measured = read_csv(rig, COLUMNS)
-    settings = (ModelForm(order=2), identification.Validation())
-    text = identification.fit(measured, ("qc",), ("C", "T"), *settings, as_json=False)
+    form = ModelForm(order=2)
+    text = identification.fit(measured, ("qc",), ("C", "T"), form, as_json=False)
     assert "C (degC) from" in text
     assert "T (unit not known) from" in text
     own = replace(measured, units=UNITS)
-    assert "T (K) from" in identification.fit(own, ("qc",), ("T",), *settings, as_json=False)
+    assert "T (K) from" in identification.fit(own, ("qc",), ("T",), form, as_json=False)
 
 
 @given(

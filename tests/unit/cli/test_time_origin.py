@@ -13,7 +13,8 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.api.files import open_messages, record
 from reactorwatch.api.simulation import simulate_along
-from reactorwatch.cli.backtest_jobs import BacktestOptions, make_jobs, run_job
+from reactorwatch.cli.backtest_jobs import BacktestOptions, run_job
+from reactorwatch.cli.batch import make_jobs
 from reactorwatch.cli.options import parse_span_ns
 from reactorwatch.cli.recordings import cut
 from reactorwatch.description.choice import ProcessChoice
@@ -52,7 +53,7 @@ def watched(path: Path, model: Path | None = None) -> dict[str, Any]:
     settings = MonitorConfig(
         training_min=20.0, isolation=False, diagnose_training=False, process=None if model is None else str(model)
     )
-    (job,) = make_jobs([path], BacktestOptions(settings, as_json=True), None, elsewhere=False)
+    (job,) = make_jobs([path], BacktestOptions(settings=settings, as_json=True), elsewhere=False)
     said: dict[str, Any] = msgspec.json.decode(run_job(job).text)
     return said
 

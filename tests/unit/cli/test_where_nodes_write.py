@@ -8,6 +8,7 @@ import pytest
 from monitor_node.config import MonitorConfig
 from reactorwatch.cli import supervise
 from reactorwatch.cli.main import main
+from reactorwatch.cli.options import BusOptions
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import BusConfig, section
 from reactorwatch.runtime.event_loop import StopSignal
@@ -55,7 +56,7 @@ def test_up_records_where_flag_then_settings_then_default_say(
     monkeypatch.setattr(supervise, "open_router", lambda *_: nullcontext())
     monkeypatch.setattr(supervise, "Processes", stop_here)
     with pytest.raises(KeyboardInterrupt):
-        supervise.run_until_stopped(Path("settings.toml"), None, Path(flag) if flag else None, {})
+        supervise.run_until_stopped(BusOptions(Path("settings.toml")), Path(flag) if flag else None, {})
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [expected]
     assert len(list((tmp_path / expected).glob("*.toml"))) == 1
 
@@ -64,7 +65,7 @@ def test_up_leaves_a_recording_of_that_name_as_it_is(tmp_path: Path, monkeypatch
     monkeypatch.setattr(supervise, "open_router", lambda *_: nullcontext())
     (tmp_path / "run.mcap").write_bytes(b"")
     with pytest.raises(InputError, match="a recording of that name exists"):
-        supervise.run_until_stopped(None, None, tmp_path / "run.mcap", {})
+        supervise.run_until_stopped(BusOptions(), tmp_path / "run.mcap", {})
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
 
 

@@ -67,7 +67,7 @@ def test_of_a_file_the_row_is_its_line(signal: str, rows: list[int], tmp_path: P
     write_table(path, spoiled(sound("qc"), signal, rows, -999.0))
     line = next(number for number, text in enumerate(path.read_text().split("\n"), start=1) if "-999" in text)
     with pytest.raises(InputError, match=rf"a\.csv, row {line} \(.*\), column '{signal}': .* got -999"):
-        load_case(path, None, DiagnosisOptions())
+        load_case(path, DiagnosisOptions())
     with pytest.raises(InputError, match=rf"row {line} \(.*\), column '{signal}': .* got -999"):
         simulate_along(read_csv(path), cstr(), [])
 
@@ -84,4 +84,4 @@ def test_where_lines_are_no_rows_the_time_is_told_alone(tmp_path: Path) -> None:
     lines = path.read_text().split("\n")
     path.write_text("\n".join([*lines[:2], "", *lines[2:]]))
     with pytest.raises(InputError, match=r"a\.csv, at 0\.2 min, column 'T'"):
-        load_case(path, None, DiagnosisOptions())
+        load_case(path, DiagnosisOptions())

@@ -105,9 +105,9 @@ def test_a_live_recording_is_read_and_diagnosed_with_no_option(tmp_path: Path) -
     described = recorded_process(path, None)
     assert described is not None
     assert (described.name, described.inputs) == ("three_tanks", ("Q1", "Q2"))
-    case = load_case(path, None, DiagnosisOptions())
-    assert case.model.name == "three_tanks"
-    assert set(case.measured.columns) == {"Q1", "Q2", "h1", "h2", "h3"}
+    case = load_case(path, DiagnosisOptions())
+    assert case.process.require_model().name == "three_tanks"
+    assert set(case.record.columns) == {"Q1", "Q2", "h1", "h2", "h3"}
 
 
 def test_without_equations_a_recording_is_not_diagnosed_and_the_line_says_the_cure(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_without_equations_a_recording_is_not_diagnosed_and_the_line_says_the_cu
     with open_files(RecorderConfig(plant="tanks", out=str(path), processes={"tanks": str(bare)})) as files:
         write_samples(files, "tanks", "three_tanks", 30)
     with pytest.raises(InputError, match=r"^process 'rig': must have equations for this, got none; name those of"):
-        load_case(path, None, DiagnosisOptions())
+        load_case(path, DiagnosisOptions())
 
 
 def test_a_plant_s_own_entry_goes_before_patterns() -> None:
