@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from monitor_node.config import MonitorConfig
 from reactorwatch.cli import backtest_jobs
+from reactorwatch.cli.batch import Job
 from reactorwatch.cli.main import app
 from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
@@ -50,7 +51,7 @@ def remarks_of(record: Record, folder: Path) -> dict[str, str]:
     """What each command says of the units."""
     path, found = folder / "a.csv", {}
     write_table(path, record)
-    job = backtest_jobs.Job(path, path, backtest_jobs.BacktestOptions(settings=LEARNING, as_json=True))
+    job = Job(path, path, backtest_jobs.BacktestOptions(settings=LEARNING, as_json=True))
     found["backtest"] = backtest_jobs.run_job(job).remark
     for command in (["identify"], ["simulate", "-o", str(folder / "out.csv")], ["diagnose"]):
         result = CliRunner().invoke(app, [*command, str(path)])
