@@ -13,9 +13,9 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, ChartPoint, Co
 from reactorwatch.spc.charts.base import Judgement
 
 PRIORITIES: Mapping[str, Priority] = {
-    name: Priority.Value(f"PRIORITY_{name.upper()}") for name in ("low", "medium", "high", "critical")
+    name: getattr(Priority, f"PRIORITY_{name.upper()}") for name in ("low", "medium", "high", "critical")
 }
-STATES: Mapping[State, AlarmState] = {state: AlarmState.Value(f"ALARM_STATE_{state.name}") for state in State}
+STATES: Mapping[State, AlarmState] = {state: getattr(AlarmState, f"ALARM_STATE_{state.name}") for state in State}
 
 STUCK_SENSOR = "stuck_sensor"
 """The cause named by the check for stuck values."""

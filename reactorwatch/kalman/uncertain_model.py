@@ -220,4 +220,4 @@ def _rates(model: ProcessModel, effect: Effect, slopes: ArrayFunction, p: Array,
         points.append(slopes.call(at, inputs, p, 0.0, 0.0, effect.neutral))
     of_rhs, of_y, F, H = (np.stack(items).transpose(0, 2, 1).copy() for items in zip(*points, strict=True))
     shown = np.linalg.pinv(H) @ of_y
-    return (effect.typical * (of_rhs - F @ shown)[:, :, 0] / scales).ravel()
+    return np.asarray((effect.typical * (of_rhs - F @ shown)[:, :, 0] / scales).ravel())
