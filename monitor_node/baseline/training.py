@@ -268,12 +268,12 @@ class Training(TrainingRows):
             for predictor, column in zip(self._predictors, measured.T, strict=True):
                 predictor.learn_again(time_min, given_inputs, column)
 
-        def fit_identified(rows: Array) -> Residuals:
+        def fit_models(rows: Array) -> Residuals:
             pairs = zip(self._predictors, rows.T, strict=True)
             columns = [predictor.fit_reference(time_min, given_inputs, column) for predictor, column in pairs]
             return np.column_stack(columns), minor
 
-        identified, screenings = _refit_without_outliers(fit_identified, measured)
+        identified, screenings = _refit_without_outliers(fit_models, measured)
         has_equations = self._model is not None and bool(has_values.all())
         possible = self._mask_impossible(inputs, measured) if has_equations else None
         if possible is not None:
