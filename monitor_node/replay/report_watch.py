@@ -55,8 +55,8 @@ def watch(
     ]
     if log is not None:
         out = np.array([chart.out & watched for chart in charts.values()])
-        active, raised = out.any(axis=0), (np.diff(out, axis=1, prepend=False) & out).any(axis=0)
-        log.rows.extend(map(LoggedRow, times, active.tolist(), raised.tolist()))
+        raised = np.any(np.diff(out, axis=1, prepend=False) & out, axis=0)
+        log.rows.extend(map(LoggedRow, times, np.any(out, axis=0).tolist(), raised.tolist()))
     return Backtest(
         inputs=tuple(inputs),
         outputs=tuple(outputs),
