@@ -68,11 +68,9 @@ class TimedIsolation:
     def __enter__(self) -> "TimedIsolation":
         looks, original = self.looks, self._suspects
 
-        def suspects(
-            self: Isolation, rows: Sequence[Row], since_rows: int = 0, not_before_min: float = float("-inf")
-        ) -> list[Suspect]:
+        def suspects(self: Isolation, rows: Sequence[Row], since_rows: int = 0) -> list[Suspect]:
             began = time.process_time()
-            found = original(self, rows, since_rows, not_before_min)
+            found = original(self, rows, since_rows)
             looks.append(Look(time.process_time() - began, self.budget.spent, self.stopped))
             return found
 

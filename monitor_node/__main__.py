@@ -20,6 +20,7 @@ from monitor_node.diagnosis_worker import DiagnosisWorker
 from monitor_node.health.message import NODE
 from monitor_node.health.other_monitors import OtherMonitors, log_report
 from monitor_node.isolation import stage
+from monitor_node.stages import drift
 from monitor_node.storage.alarm_file import AlarmFile
 from monitor_node.storage.state_file import StateFile
 from monitor_node.watched_process import load_process
@@ -38,7 +39,8 @@ from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sende
 log = structlog.get_logger()
 
 PREPARE_EVERY_NS = 100_000_000
-"""Interval between two steps of the preparation, some hundredths of a second each; samples are handled between them."""
+"""Interval between two steps of the preparation, some hundredths of a second each, at most a few tenths; samples are
+handled between them."""
 
 LOOK_EVERY_NS = 100_000_000
 """Interval of looks for the finding of a diagnosis."""
@@ -63,7 +65,7 @@ class MonitorNode(Monitor):
     Attributes:
         resumed: True if the monitor resumed from a stored state.
         token: unique liveliness token of this monitor.
-        preparation: steps that prepare the search for causes; None: there are none left.
+        preparation: steps that prepare the end of the training and the search for causes; None: there are none left.
     """
 
     def __init__(self, config: MonitorConfig, start_ns: int) -> None:
@@ -223,7 +225,7 @@ def run(
     """
     node = MonitorNode(config, time.time_ns())
     config = node.config
-    node.preparation = stage.preparation(config, node.equations)
+    node.preparation = chain(drift.preparation(config, node.equations), stage.preparation(config, node.equations))
     page = Metrics(NODE, {config.plant: node.alarms.all_alarms})
     with serve_metrics(metrics_config, page) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop)

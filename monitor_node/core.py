@@ -21,7 +21,7 @@ from monitor_node.baseline.training import NO_VALUE
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.health.failures import Failures
-from monitor_node.health.message import NODE, Processed, health_message
+from monitor_node.health.message import NODE, health_message
 from monitor_node.ingest.alignment import Aligner, Row
 from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, ReceiveStats
 from monitor_node.ingest.rejects import RejectCounter
@@ -554,16 +554,14 @@ class Monitor:
     def _health(self, now_ns: int, phase: str) -> Publication:
         health = health_message(
             now_ns,
-            phase,
-            Processed(
-                self._aligner.state.counts,
-                self.received,
-                self._published,
-                self.rejects.by_reason,
-                self.failures.by_stage,
-                self._heard_from_ns,
-            ),
             self.stats,
+            self._aligner.state.counts,
+            self.rejects.by_reason,
+            phase=phase,
+            received=self.received,
+            published=self._published,
+            failures=self.failures.by_stage,
+            heard_from_ns=self._heard_from_ns,
             reference=self.pipeline.reference,
             training=self.pipeline.trained_share(self.last_ns),
         )

@@ -13,20 +13,9 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, ChartPoint, Co
 from reactorwatch.spc.charts.base import Judgement
 
 PRIORITIES: Mapping[str, Priority] = {
-    "low": Priority.PRIORITY_LOW,
-    "medium": Priority.PRIORITY_MEDIUM,
-    "high": Priority.PRIORITY_HIGH,
-    "critical": Priority.PRIORITY_CRITICAL,
+    name: getattr(Priority, f"PRIORITY_{name.upper()}") for name in ("low", "medium", "high", "critical")
 }
-STATES: Mapping[State, AlarmState] = {
-    State.NORMAL: AlarmState.ALARM_STATE_NORMAL,
-    State.UNACKNOWLEDGED: AlarmState.ALARM_STATE_UNACKNOWLEDGED,
-    State.ACKNOWLEDGED: AlarmState.ALARM_STATE_ACKNOWLEDGED,
-    State.RETURNED_UNACKNOWLEDGED: AlarmState.ALARM_STATE_RETURNED_UNACKNOWLEDGED,
-    State.SHELVED: AlarmState.ALARM_STATE_SHELVED,
-    State.SUPPRESSED_BY_DESIGN: AlarmState.ALARM_STATE_SUPPRESSED_BY_DESIGN,
-    State.OUT_OF_SERVICE: AlarmState.ALARM_STATE_OUT_OF_SERVICE,
-}
+STATES: Mapping[State, AlarmState] = {state: getattr(AlarmState, f"ALARM_STATE_{state.name}") for state in State}
 
 STUCK_SENSOR = "stuck_sensor"
 """The cause named by the check for stuck values."""

@@ -21,7 +21,7 @@ from monitor_node.alarms.alarms import (
     memory_from_message,
 )
 from monitor_node.alarms.incidents import Incident, Incidents
-from monitor_node.alarms.kpis import AlarmStatus, KpiCounter, KpiState
+from monitor_node.alarms.kpis import KpiCounter, KpiState
 from monitor_node.alarms.on_off_delay import OnOffDelay
 from monitor_node.alarms.states import UNACKNOWLEDGED_STATES, Event, State, is_consistent
 from monitor_node.config import MonitorConfig, PriorityName
@@ -411,11 +411,7 @@ class Annunciator:
     def _publish_kpis(self, time_ns: int) -> Publication:
         before = self._newest_kpis
         if self._kpis_changed or before is None or before.standing or before.alarms_10min:
-            alarms = [
-                AlarmStatus(alarm.name, alarm.priority, alarm.memory.state, alarm.memory.raised_ns)
-                for alarm in self._alarms.values()
-            ]
-            kpis = self._kpis.compute(time_ns, alarms, self._incidents.state.number)
+            kpis = self._kpis.compute(time_ns, self._alarms.values(), self._incidents.state.number)
         else:  # nothing that time alone would change
             kpis = AlarmKpis()
             kpis.CopyFrom(before)

@@ -7,10 +7,12 @@ small. One that has been active for more than a day is *stale*: it calls for no 
 An alarm is counted when it becomes unacknowledged. All times are plant time.
 """
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import msgspec
 
+from monitor_node.alarms.alarms import PRIORITIES, ChartAlarm
 from monitor_node.alarms.incidents import Count
 from monitor_node.alarms.states import State
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Priority, PriorityCount
@@ -20,12 +22,6 @@ RATE_WINDOW_NS = 10 * MINUTE_NS
 FLOOD = 10  # alarms in the window; more are a flood
 CHATTER_TIMES = 3
 CHATTER_WITHIN_NS = MINUTE_NS
-PRIORITIES = (
-    Priority.PRIORITY_CRITICAL,
-    Priority.PRIORITY_HIGH,
-    Priority.PRIORITY_MEDIUM,
-    Priority.PRIORITY_LOW,
-)
 STALE_AFTER_NS = 24 * 60 * MINUTE_NS
 
 
@@ -41,15 +37,6 @@ def is_empty(kpis: AlarmKpis) -> bool:
         or kpis.incidents
         or any(count.raised for count in kpis.priorities)
     )
-
-
-class AlarmStatus(NamedTuple):
-    """Present status of an alarm, as KPIs need it."""
-
-    name: str
-    priority: Priority
-    state: State
-    raised_ns: int
 
 
 class Activation(NamedTuple):
@@ -83,7 +70,7 @@ class KpiCounter:
         self.state.recent.append(Activation(time_ns, alarm))
         self.state.raised[priority] = self.state.raised.get(priority, 0) + 1
 
-    def compute(self, time_ns: int, alarms: list[AlarmStatus], incidents: int) -> AlarmKpis:
+    def compute(self, time_ns: int, alarms: Collection[ChartAlarm], incidents: int) -> AlarmKpis:
         """Compute the KPIs.
 
         Args:
@@ -93,22 +80,22 @@ class KpiCounter:
         """
         self._evict(time_ns)
         recent = self.state.recent
-        active = [alarm for alarm in alarms if alarm.state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED)]
-        states = [alarm.state for alarm in alarms]
+        states = [alarm.memory.state for alarm in alarms]
+        active = [alarm for alarm in alarms if alarm.memory.state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED)]
         return AlarmKpis(
             time_ns=time_ns,
             alarms_10min=len(recent),
             flood=len(recent) > FLOOD,
             chattering=sorted({item.alarm for item in recent if self._chatters(item.alarm)}),
             standing=[alarm.name for alarm in active],
-            stale=[alarm.name for alarm in active if time_ns - alarm.raised_ns > STALE_AFTER_NS],
+            stale=[alarm.name for alarm in active if time_ns - alarm.memory.raised_ns > STALE_AFTER_NS],
             priorities=[
                 PriorityCount(
                     priority=priority,
                     raised=self.state.raised.get(priority, 0),
                     standing=sum(alarm.priority == priority for alarm in active),
                 )
-                for priority in PRIORITIES
+                for priority in reversed([*PRIORITIES.values()])
             ],
             unacknowledged=states.count(State.UNACKNOWLEDGED) + states.count(State.RETURNED_UNACKNOWLEDGED),
             shelved=states.count(State.SHELVED),

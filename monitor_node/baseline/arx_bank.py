@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.baseline.predictor import ArxPredictor, FittedModel
+from monitor_node.baseline.predictor import ArxPredictor
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
@@ -92,17 +92,12 @@ class ArxBank:
         self._counts = np.zeros(len(fitted), np.int64)
         self._predictions = np.empty(len(fitted))
         for index, model in enumerate(fitted):
-            self._take_history(index, model)
-
-    def _take_history(self, index: int, model: FittedModel | None) -> None:
-        """Take over the rows before of a predictor."""
-        if model is None:
-            return
-        rows = len(model.outputs)
-        self._past[:rows, self._inputs + index] = model.outputs
-        if rows and model.structure.inputs:
-            self._past[:rows, : self._inputs] = model.inputs
-        self._counts[index] = rows
+            if model is None:
+                continue
+            self._counts[index] = rows = len(model.outputs)
+            self._past[:rows, inputs + index] = model.outputs
+            if rows and model.structure.inputs:
+                self._past[:rows, :inputs] = model.inputs
 
     @property
     def state(self) -> ArxBankState:

@@ -89,11 +89,11 @@ def screen_baseline(z: Array, smallest_sd: float = 0.0) -> Screening:
         for index in _outlying_blocks(blocks, centre, sd, smallest_sd):
             disturbed[edges[index] : edges[index + 1]] = True
     disturbed_intervals = _intervals(disturbed)
-    screen_baseline = present & ~disturbed
-    centre, sd = _centre_and_sd(z[screen_baseline], smallest_sd)
+    undisturbed = present & ~disturbed
+    centre, sd = _centre_and_sd(z[undisturbed], smallest_sd)
     shifts = [float(np.nanmean(z[first : last + 1]) - centre) / max(sd, 1e-300) for first, last in disturbed_intervals]
-    single = screen_baseline & (np.abs(np.where(present, z, centre) - centre) > OUTLIER * sd) & (sd > 0)
-    usable = screen_baseline & ~single
+    single = undisturbed & (np.abs(np.where(present, z, centre) - centre) > OUTLIER * sd) & (sd > 0)
+    usable = undisturbed & ~single
     return Screening(usable, disturbed_intervals, shifts, single, present & ~usable)
 
 

@@ -61,6 +61,9 @@ GATE = 6.0
 MEMORY = 10_000
 """Rows after which an adaptive model that judges has forgotten a row."""
 
+JUDGING_FORGETTING = 1.0 - 1.0 / MEMORY
+"""Least forgetting factor of an adaptive model that judges."""
+
 COPY_ROWS = 250
 """Rows between two copies of an adaptive model that judges."""
 
@@ -259,7 +262,7 @@ class ArxPredictor:
             self._rls.set_parameters(self._reference)
             self._weight = max(MEMORY / max(rows, 1.0), 1.0)
             self._rls.raise_information(self._weight)
-            self._rls.raise_forgetting(max(1.0 - 1.0 / MEMORY, self._rls.forgetting))
+            self._rls.raise_forgetting(max(JUDGING_FORGETTING, self._rls.forgetting))
             self._copies, self._copied_rows, self._learning = [self._rls.state] * 2, 0, True
 
     @property

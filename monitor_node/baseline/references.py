@@ -7,7 +7,6 @@ serves any plant, but only within the inputs of its training; other rows are not
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from math import isfinite, nan, sqrt
 from typing import Any, NamedTuple, Protocol
 
@@ -178,12 +177,12 @@ class ProcessReference:
         measured: Array,
         smallest_sd: list[float],
     ) -> "ProcessReference":
-        """Make a reference with the noise that is fitted to a training; arguments as for `fit_training_noise`."""
-        found = fit_training_noise(model, outputs, time_min, inputs, measured, smallest_sd)
+        """Make a reference with the noise that is fitted to a training, see `fit_training_noise`."""
+        found = fit_training_noise(model, outputs, time_min, inputs, measured, smallest_sd, model.uncertain)
         learned = tuple(found.parameters[name] for name in learned_parameters(model.uncertain))
         if not any(map(is_disturbance, model.uncertain)):
             return cls(model, outputs, found.levels, learned)
-        alone = fit_training_noise(replace(model, uncertain=()), outputs, time_min, inputs, measured, smallest_sd)
+        alone = fit_training_noise(model, outputs, time_min, inputs, measured, smallest_sd, ())
         return cls(model, outputs, found.levels, learned, alone.levels)
 
     @classmethod
@@ -467,6 +466,7 @@ def fit_training_noise(
     inputs: Array,
     measured: Array,
     smallest_sd: list[float],
+    uncertain: tuple[str, ...],
 ) -> NoiseFit:
     """Fit the noise of a plant and its sensors to its training.
 
@@ -477,6 +477,7 @@ def fit_training_noise(
         inputs: input values, shape (n, inputs).
         measured: output values, shape (n, outputs); NaN if missing or left out.
         smallest_sd: least standard deviation of each sensor.
+        uncertain: what the filter estimates beside the states of the model, see `kalman.uncertain_model`.
     """
     columns = np.full((time_min.size, len(model.outputs)), np.nan)
     smallest = [1e-6] * len(model.outputs)
@@ -484,9 +485,9 @@ def fit_training_noise(
         columns[:, i], smallest[i] = column, sd
     inputs = _mask_before_missing(time_min, inputs)
     return fit_noise(
-        widen_model(model, model.uncertain),
+        widen_model(model, uncertain),
         FilterRecord(time_min, inputs, columns),
         smallest,
-        learned_parameters(model.uncertain),
-        nearby=noise_starts(model, columns, smallest),
+        learned_parameters(uncertain),
+        nearby=noise_starts(model, uncertain, columns, smallest),
     )

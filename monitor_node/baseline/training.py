@@ -267,9 +267,13 @@ class Training(TrainingRows):
         if not has_values.all():
             for predictor, column in zip(self._predictors, measured.T, strict=True):
                 predictor.learn_again(time_min, given_inputs, column)
-        identified, screenings = _refit_without_outliers(
-            lambda rows: (self._arx_residuals(time_min, given_inputs, rows), minor), measured
-        )
+
+        def fit_models(rows: Array) -> Residuals:
+            pairs = zip(self._predictors, rows.T, strict=True)
+            columns = [predictor.fit_reference(time_min, given_inputs, column) for predictor, column in pairs]
+            return np.column_stack(columns), minor
+
+        identified, screenings = _refit_without_outliers(fit_models, measured)
         has_equations = self._model is not None and bool(has_values.all())
         possible = self._mask_impossible(inputs, measured) if has_equations else None
         if possible is not None:
@@ -289,16 +293,19 @@ class Training(TrainingRows):
                 not self._weakness and _predicts_as_well(residuals, identified)
             ):
                 return black_box
-        return self._arx_reference(given_inputs), identified, screenings
+        uses_inputs = [predictor.uses_inputs for predictor in self._predictors]
+        return ArxReference.of_training(given_inputs, uses_inputs), identified, screenings
 
     def _equations(
         self, time_min: Array, inputs: Array, outputs: Array, smallest: list[float], steps: list[float]
     ) -> tuple[ProcessReference, Array, list[Screening]]:
         """Equations as reference, with its normalised residuals and their screening."""
         process: list[ProcessReference] = []
+        model = self._model
+        assert model is not None
 
         def innovations(rows: Array) -> Residuals:
-            process.append(self._process_reference(time_min, inputs, rows, smallest))
+            process.append(ProcessReference.fit(model, self._config.outputs, time_min, inputs, rows, smallest))
             z = process[-1].run(time_min, inputs, outputs)[1]
             return z, _minor(steps, process[-1].typical_sd)
 
@@ -333,21 +340,6 @@ class Training(TrainingRows):
             return None
         columns = np.where(out, np.nan, columns)
         return columns[:, : inputs.shape[1]], columns[:, inputs.shape[1] :]
-
-    def _arx_reference(self, inputs: Array) -> ArxReference:
-        return ArxReference.of_training(inputs, [predictor.uses_inputs for predictor in self._predictors])
-
-    def _arx_residuals(self, time_min: Array, inputs: Array, measured: Array) -> Array:
-        """Fit the identified models; returns their residuals, shape (n, outputs)."""
-        columns = zip(self._predictors, measured.T, strict=True)
-        return np.column_stack([predictor.fit_reference(time_min, inputs, column) for predictor, column in columns])
-
-    def _process_reference(
-        self, time_min: Array, inputs: Array, measured: Array, smallest: list[float]
-    ) -> ProcessReference:
-        outputs = self._config.outputs
-        assert self._model is not None
-        return ProcessReference.fit(self._model, outputs, time_min, inputs, measured, smallest)
 
 
 def _refit_without_outliers(residuals: Callable[[Array], Residuals], measured: Array) -> tuple[Array, list[Screening]]:

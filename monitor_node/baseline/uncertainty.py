@@ -8,7 +8,6 @@ A plant that equals the equations, and that the training has moved enough, needs
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from math import nan
 from typing import NamedTuple
 
@@ -139,8 +138,9 @@ class _Rows:
 
     def fit(self, uncertain: tuple[str, ...]) -> _Fit:
         """Fit the noise of the model with uncertain parts."""
-        model, smallest = replace(self._model, uncertain=uncertain), [SMALLEST_SD] * len(self._outputs)
-        found = fit_training_noise(model, self._outputs, self._time_min, self._inputs, self._measured, smallest)
+        model, smallest = self._model, [SMALLEST_SD] * len(self._outputs)
+        rows = (self._time_min, self._inputs, self._measured)
+        found = fit_training_noise(model, self._outputs, *rows, smallest, uncertain)
         return _Fit(uncertain, found, Filter(widen_model(model, uncertain), found.levels, found.parameters))
 
     def drop_disturbances(self, item: _Fit) -> bool:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from monitor_node.isolation.window import Window
+from monitor_node.isolation.window import BURN_IN_ROWS, Window
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.augmented_model import augment_model
@@ -90,7 +90,7 @@ class GlrScan:
             return self._scan_both(window)
 
     def _scan_both(self, window: Window) -> tuple[Scan, Scan]:
-        times, first, rows, dynamics = window.time_min, window.first_onset, window.time_min.size, self.dynamics(window)
+        times, first, rows, dynamics = window.time_min, BURN_IN_ROWS, window.time_min.size, self.dynamics(window)
         full = self._scan_rows(times, dynamics, first, rows)
         if not full.stands_out:
             return full, full

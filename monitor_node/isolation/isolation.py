@@ -22,7 +22,7 @@ Causes that imitate each other share the probability, as they should: these rows
 """
 
 from collections.abc import Callable, Sequence
-from math import inf, isfinite, log
+from math import isfinite, log
 
 from monitor_node.isolation.candidate import BEHIND, Candidate, Progress, ProgressState
 from monitor_node.isolation.causes import causes_of
@@ -35,7 +35,6 @@ from monitor_node.isolation.window import Row, Window, newest_rows, window_of
 from reactorwatch.diagnosis.fitting.profiles import Ramp, Step
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.kalman.step_budget import BudgetExceededError, StepBudget
-from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
 SHARE_OF_RAMPS = 0.3
@@ -58,8 +57,6 @@ class Isolation:
         model: process model of the plant.
         noise: noise levels of the plant and its sensors.
         usual_rows: usual number of rows of a look, which its budget depends on.
-        effects: effects of the causes; those that add states are left out. None: `causes_of` the model.
-        excluded: names of causes to leave out.
 
     Attributes:
         steps: number of filter steps that a look may take.
@@ -67,19 +64,9 @@ class Isolation:
         stopped: true if the last look stopped at its budget.
     """
 
-    def __init__(
-        self,
-        model: ProcessModel,
-        noise: NoiseLevels,
-        usual_rows: int = 600,
-        effects: Sequence[Effect] | None = None,
-        excluded: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, model: ProcessModel, noise: NoiseLevels, usual_rows: int = 600) -> None:
         self.steps = LOOK_STEPS + LOOK_STEPS_A_ROW * usual_rows
-        # An effect that adds a state has no infinitesimal deviation.
-        effects = causes_of(model) if effects is None else effects
-        linearisable = (effect for effect in effects if effect.extend(model).state_names == model.state_names)
-        self._effects = tuple(effect for effect in linearisable if effect.name not in excluded)
+        self._effects = causes_of(model)
         self._nominal = Filter(model, noise)
         self._scan = GlrScan(model, noise, self._effects)
         self._fitter = Fitter(model, noise, self._effects)
@@ -104,7 +91,7 @@ class Isolation:
         live = self.new_live_posterior()
         return [self._nominal.prepare, self._scan.prepare, *self._fitter.preparations, live.prepare]
 
-    def suspects(self, rows: Sequence[Row], since_rows: int = 0, not_before_min: float = -inf) -> list[Suspect]:
+    def suspects(self, rows: Sequence[Row], since_rows: int = 0) -> list[Suspect]:
         """Compute the plausible causes, most likely first, `UNKNOWN` among them.
 
         A look stops at a budget of filter steps. `UNKNOWN` is then the only suspect, and `stopped` is set.
@@ -113,18 +100,17 @@ class Isolation:
             rows: rows, oldest first.
             since_rows: number of rows since the first alarm. Of rows that are far apart older ones are left out, but
                 not those in which the fault may have begun.
-            not_before_min: time before which nothing was wrong.
         """
         self.budget, self.stopped, self._compared = StepBudget(self.steps), False, None
         try:
-            return self._compare(newest_rows(rows, LEAST_ROWS + 2 * since_rows), not_before_min)
+            return self._compare(newest_rows(rows, LEAST_ROWS + 2 * since_rows))
         except BudgetExceededError:  # fitted hypotheses cannot be compared with others that are not
             self.stopped = True
             return [unknown_suspect(1.0)]
 
-    def _compare(self, rows: Sequence[Row], not_before_min: float) -> list[Suspect]:
+    def _compare(self, rows: Sequence[Row]) -> list[Suspect]:
         self._nominal.budget = self.budget
-        window = window_of(rows, self._nominal, not_before_min)
+        window = window_of(rows, self._nominal)
         if window is None:
             return [unknown_suspect(1.0)]
         scans = self._scan.scan(window)
@@ -158,18 +144,9 @@ class Isolation:
         return LivePosterior(self._nominal.model, self._nominal.noise, self._effects)
 
 
-def _log_evidence(item: Candidate) -> float:
-    """Logarithm of the likelihood ratio of a cause to no fault, integrated over sizes and onsets."""
-    return (
-        item.gain
-        + item.log_volume
-        + item.end_log_volume
-        + log(1.0 - SHARE_OF_RAMPS if item.profile is Step else SHARE_OF_RAMPS)
-    )
-
-
 def _evidence(item: Candidate) -> Evidence:
+    """A cause with its likelihood ratio to no fault, integrated over sizes and onsets."""
     size, onset_min = item.parameters[:2].tolist()
-    profile = (Step if item.profile is Step else Ramp).name
-    evidence = _log_evidence(item)
-    return Evidence(item.effect, evidence, profile, size, item.size_sd, onset_min, item.onset_sd_min)
+    profile, share = (Step, 1.0 - SHARE_OF_RAMPS) if item.profile is Step else (Ramp, SHARE_OF_RAMPS)
+    log_evidence = item.gain + item.log_volume + item.end_log_volume + log(share)
+    return Evidence(item.effect, log_evidence, profile.name, size, item.size_sd, onset_min, item.onset_sd_min)

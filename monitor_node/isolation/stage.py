@@ -95,7 +95,7 @@ class SuspicionState(StoredState, frozen=True):
         since: number of rows since its first alarm; None: no active alarm has an unknown cause.
         way: `ProgressState` of a large fault; None without one. Earlier versions stored another structure, which is
             ignored: the fault is then followed from its start again.
-        output: output output of the newest reconstruction.
+        output: output of the newest reconstruction.
         cause: cause of the reconstruction.
         reconstruction: state of the reconstruction; None without one.
         live: state of the probabilities that follow the rows; None without an active alarm of unknown cause.
@@ -214,9 +214,10 @@ class Suspicion:
             self._live = None
             if self._isolation is not None:
                 self._isolation.progress = None
-        self._set_since(1 if is_new or self._since is None else self._since + 1)
-        if self._since is not None and self._is_look_due(self._since):
-            publications += self._look(time_ns, self._since)
+        since = 1 if is_new or self._since is None else self._since + 1
+        self._set_since(since)
+        if since in LOOKS and self._has_rows(since):
+            publications += self._look(time_ns, since)
         elif self._live is not None:
             publications += self._follow_causes(self._live, time_ns, inputs, measured)
         return publications
@@ -233,14 +234,6 @@ class Suspicion:
             self._isolation.progress = None
         if self._rows.maxlen != usual:
             self._rows = deque(self._rows, maxlen=usual)
-
-    def _is_look_due(self, since: int) -> bool:
-        """Return true for a row with a look."""
-        return since in LOOKS and self._has_rows(since)
-
-    def _may_look_early(self, since: int) -> bool:
-        """Return true if a look may be taken because the rows contradict what the last one named."""
-        return self._is_early_look_useful(since) and self._has_rows(since)
 
     def _is_early_look_useful(self, since: int) -> bool:
         """Return true if the last look named a cause, and enough rows have come since."""
@@ -275,12 +268,14 @@ class Suspicion:
             self._live = None
             return []
         before, since = self._published, self._since or 0
+        may_look = self._is_early_look_useful(since)
         if not live.has_moved(WORTH_PUBLISHING - LEAST):  # suspects below `LEAST` are not published
             is_unknown = max(before, key=before.__getitem__, default="") == UNKNOWN
-            if not (is_unknown and self._is_early_look_useful(since)):
+            if not (is_unknown and may_look):
                 return []
         suspects = live.suspects()
-        if suspects[0].cause == UNKNOWN and suspects[0].probability > CONVINCED and self._may_look_early(since):
+        contradicts = suspects[0].cause == UNKNOWN and suspects[0].probability > CONVINCED
+        if contradicts and may_look and self._has_rows(since):
             return self._look(time_ns, since)
         probabilities = {item.cause: item.probability for item in suspects}
         changes = (abs(probabilities.get(cause, 0.0) - before.get(cause, 0.0)) for cause in {*probabilities, *before})

@@ -12,7 +12,7 @@ Where rows are missing and the input after them differs, the time of the change 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import inf, isfinite, nan
+from math import isfinite, nan
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -58,7 +58,6 @@ class Window:
         used: mask of values that corrected the filter, shape (rows, n_y).
         x: filtered state, shape (rows, n_x).
         covariance: covariance of the filtered state, shape (rows, n_x, n_x).
-        first_onset: index of the first row at which an onset is sought; at least 1.
         missing: number of missing rows before each row whose input changed at an unknown time, else 0; None: none.
     """
 
@@ -69,7 +68,6 @@ class Window:
     used: NDArray[np.bool_]
     x: Array
     covariance: Array
-    first_onset: int
     missing: NDArray[np.intp] | None = None
 
     @cached_property
@@ -85,26 +83,24 @@ class Window:
     @property
     def earliest_min(self) -> float:
         """Earliest time of an onset."""
-        return float(self.time_min[self.first_onset])
+        return float(self.time_min[BURN_IN_ROWS])
 
     @property
     def span_min(self) -> float:
         """Length of the time in which an onset is sought."""
-        return float(self.time_min[-1] - self.time_min[self.first_onset - 1])
+        return float(self.time_min[-1] - self.time_min[BURN_IN_ROWS - 1])
 
 
-def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf) -> Window | None:
+def window_of(rows: Sequence[Row], kalman: Filter) -> Window | None:
     """Make a window of the newest rows without a gap; None if no onset can be sought in them.
 
     Args:
         rows: rows, oldest first; a missing input is taken to be the last known one.
         kalman: filter of the plant without a fault; it is restarted.
-        not_before_min: time before which nothing was wrong.
     """
     kept = _since_gap(_running_on(rows))
     times, inputs = np.array([row[0] for row in kept]), np.array([row[1] for row in kept], dtype=float)
-    first_onset = max(BURN_IN_ROWS, int(np.searchsorted(times, not_before_min)))
-    if first_onset >= times.size:
+    if times.size <= BURN_IN_ROWS:
         return None
     measured, missing = np.array([row[2] for row in kept], dtype=float), _count_missing(times, inputs)
     run = _run_filter(kalman, times, inputs, measured, missing)
@@ -112,7 +108,7 @@ def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf)
     outlier = _stands_out(run.residual, run.sd) & _stands_out(measured, run.sd)
     outlier[-1] = run.far[-1] & ~run.far[-2]
     measured, residual = np.where(outlier, np.nan, measured), np.where(outlier, np.nan, run.residual)
-    return Window(times, inputs, measured, residual, run.used, run.x, run.covariance, first_onset, missing)
+    return Window(times, inputs, measured, residual, run.used, run.x, run.covariance, missing)
 
 
 class _FilterRun(NamedTuple):

@@ -1,7 +1,5 @@
 """Checks of a record before a monitor learns from it."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from monitor_node.baseline.arx_fit import arx_structure, fewest_rows
@@ -10,13 +8,6 @@ from monitor_node.config import MonitorConfig
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
-
-
-class ConstantSignal(NamedTuple):
-    """A signal that has one value in all rows of a record."""
-
-    name: str
-    value: float
 
 
 def check_training_record(record: Record, config: MonitorConfig, model: ProcessModel | None) -> dict[str, str]:
@@ -33,10 +24,10 @@ def check_training_record(record: Record, config: MonitorConfig, model: ProcessM
     Raises:
         InputError: there are too few rows, or no output ever changes.
     """
-    constant = {name: item for name in config.signals if (item := _find_constant(record, name)) is not None}
-    still = [constant[name] for name in config.outputs if name in constant and not config.smallest_sd.get(name)]
+    constant = {name: value for name in config.signals if (value := _only_value(record, name)) is not None}
+    still = [name for name in config.outputs if name in constant and not config.smallest_sd.get(name)]
     if len(still) == len(config.outputs):
-        readings = ", ".join(f"{item.name} reads {item.value:g}" for item in still)
+        readings = ", ".join(f"{name} reads {constant[name]:g}" for name in still)
         raise InputError(
             f"{record.name}: at least one output must change, got {readings} in all {record.rows} rows; "
             "name outputs that do, or a record in which they do"
@@ -50,15 +41,14 @@ def check_training_record(record: Record, config: MonitorConfig, model: ProcessM
             "record for longer, or learn from another record (--train)"
         )
     return {
-        name: f"it never moves: it reads {constant[name].value:g} in all rows"
-        for name in config.inputs
-        if name in constant
+        name: f"it never moves: it reads {constant[name]:g} in all rows" for name in config.inputs if name in constant
     }
 
 
-def _find_constant(record: Record, name: str) -> ConstantSignal | None:
+def _only_value(record: Record, name: str) -> float | None:
+    """Value that a signal has in all rows; None if it varies."""
     values = record.columns.get(name)
     if values is None or not np.isfinite(values).any():
         return None
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    return ConstantSignal(name, low) if low == high else None
+    return low if low == high else None

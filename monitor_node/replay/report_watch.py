@@ -54,7 +54,9 @@ def watch(
         message for name, chart in charts.items() for message in _alarms(name, chart, chart.out & watched, times)
     ]
     if log is not None:
-        log.rows.extend(_log_rows(np.array([chart.out & watched for chart in charts.values()]), times))
+        out = np.array([chart.out & watched for chart in charts.values()])
+        raised = np.any(np.diff(out, axis=1, prepend=False) & out, axis=0)
+        log.rows.extend(map(LoggedRow, times, np.any(out, axis=0).tolist(), raised.tolist()))
     return Backtest(
         inputs=tuple(inputs),
         outputs=tuple(outputs),
@@ -64,7 +66,8 @@ def watch(
         span_ns=times[-1] - times[0],
         runs=1,
         watching_since_ns=times[training_rows],
-        expected_false_alarms=_expected_alarms(charts, int(watched.sum())),
+        # if residuals are independent and normal: rows that are out after one that is in
+        expected_false_alarms=len(charts) * int(watched.sum()) * OUTSIDE * (1.0 - OUTSIDE),
         alarm_messages=sorted(messages, key=lambda message: message.time_ns),
         refused={},
         notes=[_describe(name, chart) for name, chart in charts.items()],
@@ -73,11 +76,6 @@ def watch(
         reference="arx",
         training_rows=training_rows,
     )
-
-
-def _expected_alarms(charts: dict[str, ReportChart], rows: int) -> float:
-    """Alarms that chance gives if residuals are independent and normal: rows that are out after one that is in."""
-    return len(charts) * rows * OUTSIDE * (1.0 - OUTSIDE)
 
 
 def _alarms(
@@ -108,14 +106,6 @@ def _alarms(
             cleared.event = Event.CLEARED.value
             messages.append(cleared)
     return messages
-
-
-def _log_rows(out: np.ndarray[tuple[int, int], np.dtype[np.bool_]], times: list[int]) -> list[LoggedRow]:
-    rises = (out & ~np.column_stack([np.zeros(len(out), bool), out[:, :-1]])).any(axis=0)
-    return [
-        LoggedRow(time_ns, bool(active), bool(raised))
-        for time_ns, active, raised in zip(times, np.any(out, axis=0).tolist(), rises.tolist(), strict=True)
-    ]
 
 
 def _describe(name: str, chart: ReportChart) -> str:

@@ -187,16 +187,9 @@ class _Replay:
         return now_ns is not None and alarm.time_ns <= now_ns
 
     def _replay_event(self, alarm: Alarm) -> list[Publication]:
+        silence, board = self.monitor.silence, self.monitor.alarms
         if is_timeout(alarm):
-            return (
-                self.monitor.silence.declare_timeout()
-                if alarm.time_ns == self.monitor.silence.of_plant.deadline_ns()
-                else []
-            )
-        return self._act(alarm)
-
-    def _act(self, alarm: Alarm) -> list[Publication]:
-        board = self.monitor.alarms
+            return silence.declare_timeout() if alarm.time_ns == silence.of_plant.deadline_ns() else []
         try:
             if alarm.event == "comment":
                 return board.comment(alarm.alarm, alarm.by, alarm.comment)

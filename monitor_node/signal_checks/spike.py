@@ -58,7 +58,7 @@ NORMAL = 0.5
 """Share of the limit within which a value is normal."""
 
 RECENT, LEAST_RECENT = 100, 10
-"""RecentlyAdopted values with which a value is compared while an alarm is active, at most and at least."""
+"""Recent values with which a value is compared while an alarm is active, at most and at least."""
 
 ERRORS = 3.0
 """Standard errors, each about 1 / sqrt(n), by which the spread of these values is taken larger than estimated."""

@@ -197,11 +197,8 @@ class StuckState(StoredState, frozen=True):
 class Stuck:
     """Counts equal readings in a row of one signal, against a limit learned without a fault.
 
-    >>> from random import Random
-    >>> noise = Random(1)
     >>> stuck = Stuck(arl0=432_000)
-    >>> for _ in range(1000):
-    ...     stuck.learn(noise.gauss(438.5, 0.3))
+    >>> stuck.learn(np.random.default_rng(1).normal(438.5, 0.3, 1000))
     >>> [stuck.update(438.5).out for _ in range(6)]
     [False, False, False, False, True, True]
 
@@ -240,7 +237,7 @@ class Stuck:
         p = stuck.numbers[0]
         p["quietest"], p["last"] = state.quietest, nan if state.last is None else state.last
         p["repeats"], p["step_count"], p["steps"][: len(state.steps)] = state.repeats, len(state.steps), state.steps
-        stuck._resume(state.runs, learning=state.learning)
+        stuck._resume(dict(state.runs), learning=state.learning)
         return stuck
 
     @classmethod
@@ -281,15 +278,7 @@ class Stuck:
         """Most equal readings in a row without a fault; infinite if the training cannot tell."""
         return longest_normal_run(self._runs, self._arl0) if self._learning else float(self.numbers["limit"][0])
 
-    def learn(self, value: float) -> None:
-        """Learn from the next reading of the training; leave missing ones out.
-
-        Raises:
-            ValueError: the reading is not finite.
-        """
-        self.learn_all(np.array([finite(value)]))
-
-    def learn_all(self, values: NDArray[np.float64]) -> None:
+    def learn(self, values: NDArray[np.float64]) -> None:
         """Learn from the next readings of the training, all of which are finite."""
         self._learning = True
         repeats = np.empty(values.size, np.int64)
@@ -323,18 +312,15 @@ class Stuck:
         p["last"], p["repeats"], p["step_count"] = nan, 0, 0
 
     def _resume(self, runs: dict[int, int], *, learning: bool) -> None:
-        self._runs, self._learning = dict(runs), learning
+        self._runs, self._learning = runs, learning
         self.numbers["limit"] = longest_normal_run(self._runs, self._arl0)
 
     def end_learning(self) -> None:
         """End the training, if it lasts: count its last run, and compute the limit."""
         if not self._learning:
             return
-        self._count_run(int(self.numbers["repeats"][0]))
-        self._resume(self._runs, learning=False)
-
-    def _count_run(self, repeats: int) -> None:
-        self._runs[repeats] = self._runs.get(repeats, 0) + 1
+        last = int(self.numbers["repeats"][0])
+        self._resume({**self._runs, last: self._runs.get(last, 0) + 1}, learning=False)
 
 
 def longest_normal_run(runs: dict[int, int], arl0: float) -> float:
@@ -429,7 +415,7 @@ class StuckCheck(SignalCheck):
         for stuck, readings, step in zip(self._stuck, values, self._resolutions, strict=True):
             given = np.array(readings)
             given = given[np.isfinite(given)]
-            stuck.learn_all(np.array([quantise(reading, step) for reading in given.tolist()]) if step else given)
+            stuck.learn(np.array([quantise(reading, step) for reading in given.tolist()]) if step else given)
 
     def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
         """See `SignalCheck`."""

@@ -5,16 +5,21 @@ without anything being wrong. With `parameters` among the charts it raises one, 
 alarms.
 """
 
+from collections.abc import Iterator
 from itertools import compress
 
 from monitor_node.alarms.alarms import Explanation, chart_point
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.baseline.predictor import ArxPredictor
+from monitor_node.baseline.arx_fit import arx_structure
+from monitor_node.baseline.predictor import JUDGING_FORGETTING, ArxPredictor
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc.charts.parameters import ParameterT2
+from reactorwatch.spc.parameter_drift import adaptive_weight
+from reactorwatch.spc.run_length.parameters import prepare_limit
 
 ROWS = 50
 """Rows from one evaluation to the next. The models remember hundreds of rows, so nothing is missed between."""
@@ -24,6 +29,17 @@ DEAD_BAND = 0.5
 
 NAMED = 2
 """Parameters that the alarm names."""
+
+
+def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[None]:
+    """Compute what the limits take seconds for, step by step, so that no row waits for it at the end of the training.
+
+    Args:
+        config: settings of the monitor.
+        model: process model of the plant; None without one: the adaptive models then judge, with a longer memory.
+    """
+    forgetting = config.forgetting if model is not None else max(config.forgetting, JUDGING_FORGETTING)
+    return prepare_limit(arx_structure(config).parameters, adaptive_weight(forgetting))
 
 
 class DriftWatch:

@@ -49,7 +49,7 @@ def find_wrong_unit(model: ProcessModel, columns: Mapping[str, Array], time_min:
         columns: values by signal, NaN where not measured; they may differ in length.
         time_min: shape (rows,).
     """
-    own = model.without_effect_states()
+    own = model.without_effect_states
     typical = _typical_values(own, columns)
     if typical is None or time_min.size < 2:
         return None

@@ -43,7 +43,7 @@ class InitialState:
 
     def __init__(self, model: ProcessModel) -> None:
         self.searches = 0
-        core = model.without_effect_states()
+        core = model.without_effect_states
         self._model = core
         self._outputs = ArrayFunction(output_function(core))
         self._correct = ArrayFunction(correction_function(core))

@@ -23,6 +23,7 @@ import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
+from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.kalman.noise_estimation import initial_sensor_sd
@@ -80,20 +81,23 @@ def learned_parameters(added: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{name}.memory_min" for kind, name in (item.split(" ", 1) for item in added) if kind == NOISE)
 
 
-def noise_starts(model: ProcessModel, measured: Array, smallest_sd: Sequence[float]) -> list[NoiseLevels]:
+def noise_starts(
+    model: ProcessModel, added: tuple[str, ...], measured: Array, smallest_sd: Sequence[float]
+) -> list[NoiseLevels]:
     """Noise levels from which a search should start, too: all noise is coloured noise where there is such.
 
     Args:
-        model: the model, with what is `uncertain`.
+        model: the model without what is added to it.
+        added: see `widen_model`.
         measured: measurements, shape (rows, n_y); NaN where missing.
         smallest_sd: lower bounds of the sensors' noise.
     """
-    coloured = [item.split(" ", 1)[1] for item in model.uncertain if item.startswith(f"{NOISE} ")]
+    coloured = [item.split(" ", 1)[1] for item in added if item.startswith(f"{NOISE} ")]
     if not coloured:
         return []
     sds = np.maximum([initial_sensor_sd(column) for column in measured.T], smallest_sd)
     by_name = dict(zip(model.output_names, sds.tolist(), strict=True))
-    names = widen_model(model, model.uncertain).state_names
+    names = widen_model(model, added).state_names
     driving = np.array([by_name.get(name.removesuffix(".memory"), 0.0) * name.endswith(".memory") for name in names])
     sensors = tuple(_WHITE_SHARE * sd if name in coloured else sd for name, sd in by_name.items())
     return [NoiseLevels(sensors, tuple((share * driving).tolist())) for share in _DRIVING_SHARES]
@@ -160,11 +164,9 @@ def select_effects(model: ProcessModel, x: Array, u: Array) -> tuple[str, ...]:
         u: usual inputs, shape (n_u,).
     """
     candidates, rows = [], []
-    for effect in effects_of(model):
-        if effect.is_discontinuous or effect.is_source or effect.location == TIMING or effect.delays_output:
-            continue
-        rates = _rates(model, effect, x, u)
-        if rates is not None and effect.lower < effect.neutral and np.all(np.isfinite(rates)):
+    for effect, p, slopes in _slope_functions(model):
+        rates = _rates(model, effect, ArrayFunction(slopes), p, x, u)
+        if np.all(np.isfinite(rates)):
             candidates.append(effect.name)
             rows.append(rates)
     left = np.array(rows)
@@ -181,28 +183,37 @@ def select_effects(model: ProcessModel, x: Array, u: Array) -> tuple[str, ...]:
     return (*selected, *lags)
 
 
-def _rates(model: ProcessModel, effect: Effect, x: Array, u: Array) -> Array | None:
-    """Rates in scales a minute that an effect of typical size adds, shape (points * n_x,); None if it adds states."""
-    size = ca.SX.sym("m")
-    try:
-        extended = effect.apply(model, size)
-    except ValueError:
-        return None
-    if len(extended.states) != len(model.states) or effect.constants:
-        return None
-    rhs, y = ca.vertcat(*extended.rhs), ca.vertcat(*(item.expression for item in extended.outputs))
-    symbols = extended.arguments()
-    clock = [extended.clock.now, extended.clock.middle]
-    slopes = [ca.jacobian(rhs, size), ca.jacobian(y, size), ca.jacobian(rhs, symbols[0]), ca.jacobian(y, symbols[0])]
-    function = ca.Function("slopes", [*symbols, *clock, size], [ca.densify(item) for item in slopes])
-    scales = np.array([item.scale for item in model.states])
-    rng, result = np.random.default_rng(_SEED), []
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def _slope_functions(model: ProcessModel) -> tuple[tuple[Effect, Array, ca.Function], ...]:
+    """Effects that act both ways, without states of their own, each with its parameters and derivatives.
+
+    The derivatives are (x, u, p, t, t_middle, size) -> rates and outputs by the size, then by x.
+    """
+    result = []
+    for effect in effects_of(model):
+        if effect.is_discontinuous or effect.is_source or effect.location == TIMING or effect.delays_output:
+            continue
+        size = ca.SX.sym("m")
+        try:
+            extended = effect.apply(model, size)
+        except ValueError:
+            continue
+        if len(extended.states) != len(model.states) or effect.constants or effect.lower >= effect.neutral:
+            continue
+        rhs, y = ca.vertcat(*extended.rhs), ca.vertcat(*(item.expression for item in extended.outputs))
+        symbols = [*extended.arguments(), extended.clock.now, extended.clock.middle, size]
+        by = [ca.jacobian(rhs, size), ca.jacobian(y, size), ca.jacobian(rhs, symbols[0]), ca.jacobian(y, symbols[0])]
+        result.append((effect, extended.values(), ca.Function("slopes", symbols, by)))
+    return tuple(result)
+
+
+def _rates(model: ProcessModel, effect: Effect, slopes: ArrayFunction, p: Array, x: Array, u: Array) -> Array:
+    """Rates in scales a minute that an effect of typical size adds, shape (points * n_x,)."""
+    scales, reach = np.array([item.scale for item in model.states]), np.array([item.scale for item in model.inputs])
+    rng, points = np.random.default_rng(_SEED), []
     for _ in range(_POINTS):
-        at = x + scales * rng.uniform(-1.0, 1.0, x.size)
-        inputs = u + np.array([item.scale for item in model.inputs]) * rng.uniform(-1.0, 1.0, u.size)
-        of_rhs, of_y, F, H = (
-            np.array(item) for item in function(at, inputs, extended.values(), 0.0, 0.0, effect.neutral)
-        )
-        shown = np.linalg.pinv(H) @ of_y
-        result.append(effect.typical * (of_rhs - F @ shown).ravel() / scales)
-    return np.concatenate(result)
+        at, inputs = x + scales * rng.uniform(-1.0, 1.0, x.size), u + reach * rng.uniform(-1.0, 1.0, u.size)
+        points.append(slopes.call(at, inputs, p, 0.0, 0.0, effect.neutral))
+    of_rhs, of_y, F, H = (np.stack(items).transpose(0, 2, 1).copy() for items in zip(*points, strict=True))
+    shown = np.linalg.pinv(H) @ of_y
+    return np.asarray((effect.typical * (of_rhs - F @ shown)[:, :, 0] / scales).ravel())

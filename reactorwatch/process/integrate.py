@@ -12,6 +12,7 @@ A step never crosses a sample, where the input jumps, nor a breakpoint of the mo
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from math import isfinite
 
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.process.effect_states import reset_function
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 
 LONGEST_STEP_MIN = 0.05
 SHORTEST_STEP_MIN = 1e-9
@@ -64,6 +65,7 @@ def state_time_step(model: ProcessModel, u: ca.SX, p: ca.SX, t: ca.SX, middle: c
     return h - (ahead(u, p, t + h, middle) - ahead(u, p, t, middle))
 
 
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
 def symbolic_step(model: ProcessModel) -> ca.Function:
     """One step as a CasADi function (x, u, p, t, t_middle, h) -> (x at t + h, error estimate over scale).
 

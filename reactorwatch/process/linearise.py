@@ -9,10 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.model import ProcessModel
-
-MODEL_CACHE_SIZE = 64
-"""Number of models whose derivatives are cached."""
+from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from reactorwatch.process.effect import Effect
     from reactorwatch.process.law import ExtendedLaw
 
+MODEL_CACHE_SIZE = 64
+"""Number of models whose functions are cached."""
+
 
 @dataclass(frozen=True, eq=False)
 class Variable:
@@ -359,6 +362,7 @@ class ProcessModel:
             result = ca.substitute(result, symbols, rest)
         return tuple(result)
 
+    @cached_property
     def without_effect_states(self) -> "ProcessModel":
         """Model of the states that are not in `at_rest`, with all others in equilibrium."""
         if not self.at_rest:

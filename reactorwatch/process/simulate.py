@@ -13,7 +13,7 @@ state after the jump.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import inf
 
 import casadi as ca
@@ -24,7 +24,7 @@ from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.process.effect_states import reset_function, rest_function, with_derivatives
 from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, step_grid, symbolic_step
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,14 +139,6 @@ class Simulator:
 
     # --- compiled once a model -----------------------------------------------------------------------
 
-    @cached_property
-    def _code(self) -> CompiledFunction:
-        """(x, u, p, t, t_middle, h) -> (state after the step, 1 if it keeps the tolerance), step after step."""
-        step = _row_step(self.model)
-        after, error = step(*step.sx_in())
-        good = ca.logic_and(error <= TOLERANCE, ca.fabs(ca.sum1(after)) < inf)
-        return CompiledFunction(ca.Function("step", step.sx_in(), [after, good]), shared=[2], chained=1, stops=True)
-
     def _sensitivity_code(self, wanted: tuple[int, ...]) -> CompiledFunction:
         """(x, S, u, p, t, t_middle, h, dt, dh) -> (x, S) after the step, for the parameters of these indices."""
         if wanted not in self._sensitivity_codes:
@@ -167,12 +159,6 @@ class Simulator:
         )
         one = ca.Function("sensitivities", [x, S, u, p, t, middle, h, of_t, of_h], [after, S_after])
         return CompiledFunction(one, shared=[3], chained=2)
-
-    @cached_property
-    def _outputs(self) -> CompiledFunction:
-        """(x, u, p, t) -> y."""
-        x, u, p, t, y = self.model.output_expressions()
-        return CompiledFunction(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])
 
     @cached_property
     def _output_derivatives(self) -> CompiledFunction:
@@ -216,10 +202,11 @@ class Simulator:
         states, good = np.empty((steps, start.size)), np.empty(steps)
         columns = self._columns(grid, inputs)
         cuts: dict[int, Array] = {}
+        code = _compiled_steps(self.model)
         x, first, ends = start, 0, set(grid.end_of_row.tolist())
         while first < steps:
             u, *times = (column[first:] for column in columns)
-            done = self._code.fill(steps - first, [x, u, p, *times], [states[first:], good[first:]])
+            done = code.fill(steps - first, [x, u, p, *times], [states[first:], good[first:]])
             first += done
             x = states[first - 1] if first else start
             cutting = True
@@ -272,7 +259,7 @@ class Simulator:
         return of_time, of_length
 
     def _trajectory(self, time_min: Array, inputs: Array, p: Array, states: Array) -> Trajectory:
-        (y,) = self._outputs.map(states, inputs, p, time_min)
+        (y,) = _compiled_outputs(self.model).map(states, inputs, p, time_min)
         return Trajectory(time_min, states, y[:, :, 0])
 
     def _check(
@@ -300,6 +287,22 @@ class Simulator:
                     f"got {inputs[row, column]:g} at {time_min[row]:g} min"
                 )
         return inputs, start, model.values(changes)
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def _compiled_steps(model: ProcessModel) -> CompiledFunction:
+    """(x, u, p, t, t_middle, h) -> (state after the step, 1 if it keeps the tolerance), step after step."""
+    step = _row_step(model)
+    after, error = step(*step.sx_in())
+    good = ca.logic_and(error <= TOLERANCE, ca.fabs(ca.sum1(after)) < inf)
+    return CompiledFunction(ca.Function("step", step.sx_in(), [after, good]), shared=[2], chained=1, stops=True)
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def _compiled_outputs(model: ProcessModel) -> CompiledFunction:
+    """(x, u, p, t) -> y."""
+    x, u, p, t, y = model.output_expressions()
+    return CompiledFunction(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])
 
 
 def _row_step(model: ProcessModel) -> ca.Function:

@@ -75,7 +75,7 @@ class SteadyStates:
     """
 
     def __init__(self, model: ProcessModel) -> None:
-        core = model.without_effect_states()
+        core = model.without_effect_states
         self._model = model
         self._scales = np.array([state.scale for state in core.states])
         lower, upper = (np.array([getattr(state, name) for state in core.states]) for name in ("lower", "upper"))

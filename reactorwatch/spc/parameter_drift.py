@@ -56,6 +56,11 @@ VECTORS_A_DIRECTION = 2
 """Smallest number of cosines a direction for Omega."""
 
 
+def adaptive_weight(forgetting: float) -> float:
+    """Weight of the newest row in an adaptive model with this forgetting factor."""
+    return max(1.0 - forgetting, SMALLEST_WEIGHT_WITHOUT_SHIFT)
+
+
 def learn(
     regressors: ArrayLike,
     residuals: ArrayLike,
@@ -102,7 +107,7 @@ def learn(
     check_range(
         "forgetting", forgetting, max(0.9, 1.0 - 1.0 / (ROWS_A_DIRECTION * m)), 1.0 - SMALLEST_WEIGHT_WITHOUT_SHIFT
     )
-    weight = max(1.0 - forgetting, SMALLEST_WEIGHT_WITHOUT_SHIFT)
+    weight = adaptive_weight(forgetting)
 
     z = phi @ white.T
     e = (e - z @ (z.T @ e) / rows) * sqrt(rows / (rows - m))

@@ -15,7 +15,7 @@ from monitor_node.fleet.packed.conversion import Conversion
 from monitor_node.fleet.packed.ring import kept_spacings, kept_values
 from monitor_node.fleet.packed.rows import NEW_MINUTE, step_rows
 from monitor_node.fleet.packed.samples import find_deadlines, take_samples
-from monitor_node.health.message import NODE, Processed, health_message
+from monitor_node.health.message import NODE, health_message
 from monitor_node.ingest.alignment import Counts, Row
 from monitor_node.ingest.receive_stats import STALL_NS, ReceiveStats
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE, USABLE
@@ -310,16 +310,14 @@ class PackedPlants:
         p, rest, plant = self._slots.plants[slot], self._slots.rest(slot), self._slots.names[slot]
         health = health_message(
             now_ns,
-            phase,
-            Processed(
-                Counts(*p["counts"].tolist()),
-                int(p["received"]),
-                int(p["published"]),
-                rest.refused or {},
-                rest.failures or {},
-                dict(zip(self._signals, p["heard_from_ns"].tolist(), strict=True)),
-            ),
             _receive_stats(p),
+            Counts(*p["counts"].tolist()),
+            rest.refused or {},
+            phase=phase,
+            received=int(p["received"]),
+            published=int(p["published"]),
+            failures=rest.failures or {},
+            heard_from_ns=dict(zip(self._signals, p["heard_from_ns"].tolist(), strict=True)),
             reference=ProcessReference.kind,
             training=1.0,
         )

@@ -6,10 +6,12 @@ effect is also screened at the start values of its constants, and a candidate ta
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import product
 
 import casadi as ca
 
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
@@ -42,8 +44,9 @@ class ConstantVariant(Effect):
         return replace(extended, parameters=tuple(item for item in extended.parameters if item.name not in names))
 
 
-def variants_of(effects: Sequence[Effect]) -> tuple[ConstantVariant, ...]:
-    """Variants of effects, at every combination of the start values of their constants."""
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def variants_of(effects: tuple[Effect, ...]) -> tuple[ConstantVariant, ...]:
+    """Variants of effects, at every combination of the start values of their constants; made once."""
     return tuple(
         ConstantVariant(effect, values)
         for effect in effects

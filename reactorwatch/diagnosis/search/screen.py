@@ -10,6 +10,7 @@ Effects with internal states, such as a lag, have no infinitesimal deviation; se
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import inf, log
 from typing import TypeVar
 
@@ -33,6 +34,7 @@ from reactorwatch.diagnosis.fitting.profiles import (
 )
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.constant_variants import ConstantVariant, variants_of
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
@@ -88,6 +90,12 @@ class Candidate(Part):
         return self.gain - self.profile.n_parameters * log(values)
 
 
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def _static_effects(model: ProcessModel, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
+    """Effects that add no state to a model."""
+    return tuple(effect for effect in effects if effect.extend(model).state_names == model.state_names)
+
+
 class Screen:
     """Screens a run for single causes.
 
@@ -106,8 +114,7 @@ class Screen:
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run) -> None:
         self.model, self._run, self.effects = model, run, tuple(effects)
         self._errors: dict[FaultFilter, ErrorLinearization] = {}
-        names = model.state_names
-        self.static_effects = tuple(effect for effect in effects if effect.extend(model).state_names == names)
+        self.static_effects = _static_effects(model, self.effects)
         self.dynamic_effects = tuple(effect for effect in effects if effect not in self.static_effects)
         self._columns = (*self.static_effects, *variants_of(self.static_effects))
         self._beta = np.diff(run.time_min[1:])

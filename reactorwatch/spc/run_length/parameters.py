@@ -25,8 +25,10 @@ This is the rate at which the statistic leaves its usual range. With a reference
 beyond the limit, there is one lasting false alarm.
 """
 
+from collections.abc import Iterator
+from contextlib import suppress
 from functools import lru_cache
-from math import log
+from math import inf, isfinite, log
 
 import numpy as np
 from scipy import special
@@ -74,21 +76,30 @@ def parameter_limit(arl0: float, dimension: int, weight: float, freedom: float, 
     return float(np.exp(optimize.brentq(off, log(_FIRST_HEIGHT), largest, xtol=1e-6)))
 
 
+def prepare_limit(dimension: int, weight: float) -> Iterator[None]:
+    """Compute what `parameter_limit` takes seconds for, a tenth of a second for each item of the iterator.
+
+    Args:
+        dimension: see there.
+        weight: see there.
+    """
+    for _ in _known_chart(dimension, weight):
+        yield
+    with suppress(InputError):  # an argument out of its range, which `parameter_limit` reports
+        _rates(dimension, weight)
+    from scipy import optimize  # noqa: F401 # the import that `parameter_limit` needs
+
+
 class _Rates:
     """Logarithm of the rate of false alarms of a known chart as a function of the logarithm of its limit."""
 
     def __init__(self, dimension: int, weight: float) -> None:
         from scipy import interpolate  # imported here, as it takes a tenth of a start
 
-        heights, rates = [], []
-        height = _FIRST_HEIGHT
-        while height < LARGEST_LIMIT:
-            try:
-                rates.append(-log(mewma(0.0, dimension, weight, height)))
-            except InputError:  # beyond the longest run length that can be computed
-                break
-            heights.append(log(height))
-            height *= _HEIGHT_RATIO
+        known = list(_known_chart(dimension, weight))
+        if not known:
+            mewma(0.0, dimension, weight, _FIRST_HEIGHT)  # raises: an argument is out of its range
+        heights, rates = zip(*known, strict=True)
         self._last = heights[-1]
         self._inside = interpolate.CubicSpline(heights, rates)
         self._slope = float(self._inside(self._last, 1))
@@ -97,6 +108,23 @@ class _Rates:
         """Evaluate; constant below the first height, where the rate exceeds any that is asked for."""
         inside = self._inside(np.clip(log_height, log(_FIRST_HEIGHT), self._last))
         return np.asarray(inside + self._slope * np.maximum(log_height - self._last, 0.0))
+
+
+def _known_chart(dimension: int, weight: float) -> Iterator[tuple[float, float]]:
+    """Logarithms of a limit and the rate there, for growing limits up to the longest run length."""
+    height = _FIRST_HEIGHT
+    while height < LARGEST_LIMIT and isfinite(rate := _log_rate(dimension, weight, height)):
+        yield log(height), rate
+        height *= _HEIGHT_RATIO
+
+
+@lru_cache(maxsize=512)
+def _log_rate(dimension: int, weight: float, height: float) -> float:
+    """Logarithm of the rate of a known chart; -inf beyond the longest run length that can be computed."""
+    try:
+        return -log(mewma(0.0, dimension, weight, height))
+    except InputError:
+        return -inf
 
 
 @lru_cache(maxsize=16)

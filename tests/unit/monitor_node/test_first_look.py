@@ -14,6 +14,7 @@ from monitor_node.fleet.config import FleetConfig
 from monitor_node.isolation import stage
 from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
 from monitor_node.isolation.window import MOST_PIECES, Row, newest_rows
+from monitor_node.stages import drift
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.codegen.array_function import ArrayFunction
@@ -153,6 +154,7 @@ def test_a_monitor_prepares_part_by_part_once_it_listens_and_then_no_more(monkey
             assert len(prepared) == parts
         assert node.next_tick_ns() > now_ns + 10**9  # health: nothing else is due
 
+    monkeypatch.setattr(drift, "preparation", lambda *_: iter(()))
     monkeypatch.setattr(stage, "preparation", preparation)
     monkeypatch.setattr(EventLoop, "run", run)
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", lambda *_: MemoryBus(Exchange()))

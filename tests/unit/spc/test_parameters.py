@@ -8,7 +8,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Array
 from reactorwatch.spc.charts.parameters import ParameterState, ParameterT2
 from reactorwatch.spc.run_length.design import mewma_limit
-from reactorwatch.spc.run_length.parameters import parameter_limit
+from reactorwatch.spc.run_length.parameters import parameter_limit, prepare_limit
 from tests.unit.spc.members import COVARIANCE, ROOT, difference
 
 NAMES = ["a1", "b1", "c"]
@@ -169,3 +169,21 @@ def test_a_run_length_that_no_limit_gives_is_refused() -> None:
         parameter_limit(1e8, 7, 0.001, 7.0, 1.0)
     with pytest.raises(InputError, match=r"arl0 must be in \[20, 1e\+08\], got 10"):
         parameter_limit(10.0, 7, 0.001, 40.0, 3.0)
+
+
+def test_what_is_prepared_is_not_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = parameter_limit(1e5, 3, 0.02, 500.0, 0.1)
+    assert len(list(prepare_limit(3, 0.01))) > 10
+
+    def fail(*_: object) -> float:
+        raise AssertionError("computed again")
+
+    monkeypatch.setattr("reactorwatch.spc.run_length.parameters.mewma", fail)
+    assert parameter_limit(1e5, 3, 0.01, 500.0, 0.1) > 0.0
+    assert parameter_limit(1e5, 3, 0.02, 500.0, 0.1) == expected
+
+
+def test_too_many_parameters_for_a_limit_are_an_error_and_nothing_to_prepare() -> None:
+    assert list(prepare_limit(101, 0.01)) == []
+    with pytest.raises(InputError, match="dimension"):
+        parameter_limit(1e5, 101, 0.01, 500.0, 0.1)

@@ -198,7 +198,6 @@ def test_no_hypothesis_that_overflowed_is_followed() -> None:
         np.ones((30, 2), bool),
         times[:, None],
         times[:, None, None],
-        20,
     )
     assert scan_candidates(CAUSES, scan, window) == []
 

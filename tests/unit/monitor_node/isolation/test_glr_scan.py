@@ -5,7 +5,7 @@ import pytest
 
 from monitor_node.isolation.causes import causes_of
 from monitor_node.isolation.glr_scan import GlrScan, Scan
-from monitor_node.isolation.window import Window, window_of
+from monitor_node.isolation.window import BURN_IN_ROWS, Window, window_of
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
@@ -87,5 +87,5 @@ def test_a_deviation_may_set_in_after_every_row_but_the_last_from_the_first_onse
     quiet: tuple[Window, Scan],
 ) -> None:
     window, scan = quiet
-    assert scan.onset_min.tolist() == window.time_min[window.first_onset : -1].tolist()
+    assert scan.onset_min.tolist() == window.time_min[BURN_IN_ROWS:-1].tolist()
     assert scan.rows == window.time_min.size

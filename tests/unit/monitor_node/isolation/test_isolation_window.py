@@ -16,8 +16,8 @@ def rows() -> list[Row]:
     return rows_of(seed=1, after_min=0.0, begin_min=40.0)
 
 
-def settled(rows: list[Row], not_before_min: float = 0.0) -> Window:
-    window = window_of(rows, Filter(cstr(), SENSORS), not_before_min)
+def settled(rows: list[Row]) -> Window:
+    window = window_of(rows, Filter(cstr(), SENSORS))
     assert window is not None
     return window
 
@@ -39,7 +39,7 @@ def test_without_outliers_everything_counts(rows: list[Row]) -> None:
     assert missing(window) == []
     np.testing.assert_array_equal(window.measured, [row[2] for row in rows])
     np.testing.assert_array_equal(window.inputs, [row[1] for row in rows])
-    assert window.first_onset == BURN_IN_ROWS
+    assert window.earliest_min == rows[BURN_IN_ROWS][0]
     assert np.all(window.used[1:])
 
 
@@ -83,12 +83,8 @@ def test_where_the_input_is_missing_it_is_as_it_was(rows: list[Row]) -> None:
     assert window.inputs[:6, 0].tolist() == [rows[1][1][0]] * 3 + [rows[4][1][0]] * 3
 
 
-def test_nothing_sets_in_before_it_may(rows: list[Row]) -> None:
-    window = settled(rows, not_before_min=rows[77][0])
-    assert window.first_onset == 77
-    assert window.earliest_min == rows[77][0]
-    assert window.span_min == pytest.approx(rows[-1][0] - rows[76][0])
-    assert window_of(rows, Filter(cstr(), SENSORS), rows[-1][0] + 1.0) is None
+def test_nothing_sets_in_while_the_filter_settles(rows: list[Row]) -> None:
+    assert settled(rows).span_min == pytest.approx(rows[-1][0] - rows[BURN_IN_ROWS - 1][0])
     assert window_of(rows[:BURN_IN_ROWS], Filter(cstr(), SENSORS)) is None
     assert window_of([], Filter(cstr(), SENSORS)) is None
 

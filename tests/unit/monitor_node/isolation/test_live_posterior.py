@@ -1,5 +1,6 @@
 """After an alarm the probabilities of the causes follow each row, in a single monitor and in a fleet."""
 
+from dataclasses import replace
 from math import nan
 
 import numpy as np
@@ -28,7 +29,8 @@ FAULTS = {
 
 
 def after_look(rows: list[Row], excluded: tuple[str, ...] = ()) -> LivePosterior:
-    isolation = Isolation(cstr(), SENSORS, excluded=excluded)
+    chosen = tuple(effect for effect in causes_of(cstr()) if effect.name not in excluded)
+    isolation = Isolation(replace(cstr(), effects=chosen), SENSORS)
     isolation.suspects(rows[: ALARM + LOOK], LOOK)
     live = isolation.follow()
     assert live is not None

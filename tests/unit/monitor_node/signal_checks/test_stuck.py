@@ -17,8 +17,7 @@ ARL0 = 432_000.0  # 30 days of 6 s
 
 def trained(readings: Array, arl0: float = ARL0) -> Stuck:
     stuck = Stuck(arl0)
-    for value in readings.tolist():
-        stuck.learn(value)
+    stuck.learn(readings)
     return stuck
 
 
@@ -257,7 +256,7 @@ def test_it_goes_on_from_its_stored_state_as_if_it_had_never_stopped(cut: int) -
     def step(stuck: Stuck, row: int) -> Judgement | None:
         if row >= 500:
             return stuck.update(readings[row])
-        stuck.learn(readings[row])
+        stuck.learn(np.array([readings[row]]))
         return None
 
     through, stopped = Stuck(1e4), Stuck(1e4)
