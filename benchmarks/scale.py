@@ -47,7 +47,6 @@ from benchmarks.fleet.traffic import (
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.node import UNCACHED, FleetNode, watch
-from monitor_node.fleet.watched_plants import WatchedPlants
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.records.record import NEVER_NS
@@ -166,9 +165,7 @@ def report_memory(endpoint: str, plants: int) -> None:
     assert bus is not None
     node = Counting(FAST, bus, stop)
     node.learn(plants)
-    assert isinstance(node.watched, WatchedPlants)
-    quiet = node.watched._quiet
-    assert quiet is not None
+    (quiet,) = node.watched._all_packed
     due_ns = quiet._slots.health_due_ns
     due_ns[plants // 2 : plants] = NEVER_NS
     node.samples = 0

@@ -26,9 +26,9 @@ from monitor_node.core import Monitor
 from monitor_node.fleet.admission import PROVEN_MESSAGES, PROVEN_ROWS, PlantRegister
 from monitor_node.fleet.callbacks import NO_CALLBACKS, Callbacks
 from monitor_node.fleet.handed_over_alarms import HandedOverAlarms, alarm_of
+from monitor_node.fleet.plant_kinds import ANY, PlantKind
 from monitor_node.fleet.recently_adopted import RecentlyAdopted
 from monitor_node.fleet.sharding import ShardGroup
-from monitor_node.fleet.watched_kinds import ANY, PlantKind, WatchedKinds
 from monitor_node.fleet.watched_plants import State, WatchedPlants
 from monitor_node.ingest.pending import PendingPlants, PlantHistory, truncate
 from monitor_node.replay.recorded_sessions import TIMEOUT_ALARM
@@ -78,11 +78,7 @@ class FleetMonitor:
     ) -> None:
         self._shards, self._callbacks = shards, callbacks
         all_kinds = (*kinds, PlantKind(ANY, config, model))
-        self.watched: WatchedPlants | WatchedKinds = (
-            WatchedKinds(all_kinds, start_ns, points=points, diagnose=callbacks.diagnose)
-            if kinds
-            else WatchedPlants(config, start_ns, model, points=points, diagnose=callbacks.diagnose)
-        )
+        self.watched = WatchedPlants(all_kinds, start_ns, points=points, diagnose=callbacks.diagnose)
         self._pending = PendingPlants()
         self._presume_gone_ns: int | None = start_ns + PRESUME_GONE_NS
         self._register = PlantRegister()

@@ -17,8 +17,9 @@ from monitor_node.fleet.callbacks import Callbacks
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.monitor import FleetMonitor
 from monitor_node.fleet.partition import LeaseMonitor
+from monitor_node.fleet.plant_kinds import ANY, PlantKind
 from monitor_node.fleet.sharding import ShardGroup
-from monitor_node.fleet.watched_kinds import ANY, PlantKind, WatchedKinds
+from monitor_node.fleet.watched_plants import WatchedPlants
 from monitor_node.health.message import NODE
 from monitor_node.health.other_monitors import OtherMonitors, log_report
 from monitor_node.ingest.pending import PlantHistory
@@ -396,7 +397,7 @@ def run(
     # Inconsistent settings are refused here, and machine code is compiled before plants wait.
     config = fleet.share_promise(config)
     kinds = (*load_kinds(config, fleet), PlantKind(ANY, *load_process(config)))
-    WatchedKinds(kinds, 0, points=fleet.points).prepare()
+    WatchedPlants(kinds, 0, points=fleet.points).prepare()
     states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
     with serve_metrics(metrics_config, FleetMetrics(NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop, uncached=UNCACHED, many_keys=True)
