@@ -127,12 +127,6 @@ class WatchedPlants:
             self._submitted.discard(plant)
         return monitor
 
-    def copy(self, plant: str, name: str) -> None:
-        """Add a copy of a quiet plant, for trials with many plants."""
-        packed = self._quiet_with(plant)
-        assert packed is not None
-        packed.copy(plant, name)
-
     def active_monitor(self, plant: str) -> Monitor | None:
         """Monitor of a plant; None if it is quiet, or there is no such plant."""
         return self._monitors.get(plant)
