@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
 import structlog
 
 from monitor_node.alarms.kpis import is_empty
@@ -17,7 +16,7 @@ from monitor_node.fleet.callbacks import Callbacks
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.monitor import FleetMonitor
 from monitor_node.fleet.partition import LeaseMonitor
-from monitor_node.fleet.plant_kinds import ANY, PlantKind
+from monitor_node.fleet.plant_kinds import ANY, PlantKind, load_kinds
 from monitor_node.fleet.sharding import ShardGroup
 from monitor_node.fleet.watched_plants import WatchedPlants
 from monitor_node.health.message import NODE
@@ -407,23 +406,6 @@ def run(
             watch(FleetNode(config, fleet, bus, time.time_ns(), states, metrics), bus, stop)
         finally:
             bus.close()
-
-
-def load_kinds(config: MonitorConfig, fleet: FleetConfig) -> tuple[PlantKind, ...]:
-    """Plants whose process the settings of the fleet name.
-
-    Args:
-        config: settings of each plant's monitor.
-        fleet: settings of the fleet.
-
-    Raises:
-        InputError: a process cannot be loaded, or does not fit the settings of the monitor.
-    """
-    watched = {
-        name: load_process(msgspec.structs.replace(config, process=name))
-        for name in dict.fromkeys(fleet.processes.values())
-    }
-    return tuple(PlantKind(pattern, *watched[name]) for pattern, name in fleet.processes.items())
 
 
 def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:

@@ -5,7 +5,11 @@ from fnmatch import fnmatchcase
 from functools import lru_cache
 from typing import NamedTuple
 
+import msgspec
+
 from monitor_node.config import MonitorConfig
+from monitor_node.fleet.config import FleetConfig
+from monitor_node.watched_process import load_process
 from reactorwatch.process.model import ProcessModel
 
 ANY = "*"
@@ -27,6 +31,23 @@ class PlantKind(NamedTuple):
     pattern: str
     config: MonitorConfig
     model: ProcessModel | None
+
+
+def load_kinds(config: MonitorConfig, fleet: FleetConfig) -> tuple[PlantKind, ...]:
+    """Plants whose process the settings of the fleet name.
+
+    Args:
+        config: settings of each plant's monitor.
+        fleet: settings of the fleet.
+
+    Raises:
+        InputError: a process cannot be loaded, or does not fit the settings of the monitor.
+    """
+    watched = {
+        name: load_process(msgspec.structs.replace(config, process=name))
+        for name in dict.fromkeys(fleet.processes.values())
+    }
+    return tuple(PlantKind(pattern, *watched[name]) for pattern, name in fleet.processes.items())
 
 
 def kind_finder(kinds: Sequence[PlantKind]) -> Callable[[str], int]:
