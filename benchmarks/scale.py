@@ -166,7 +166,7 @@ def report_memory(endpoint: str, plants: int) -> None:
     assert bus is not None
     node = Counting(FAST, bus, stop)
     node.learn(plants)
-    (quiet,) = node.watched._all_packed
+    (quiet,) = node.watched._quiet_kinds
     due_ns = quiet._slots.health_due_ns
     due_ns[plants // 2 : plants] = NEVER_NS
     node.samples = 0

@@ -227,7 +227,7 @@ class Monitor:
         _, command = decode_command(question, COMMANDS)
         assert isinstance(command, BaselineCommand), "the catalogue says so"
         if command.what == LIST:
-            baselines = self.pipeline.baselines.listed
+            baselines = self.pipeline.baselines.all
             return CommandReply(accepted=True, text=f"{len(baselines)} baselines", baselines=baselines), []
         change = self.pipeline.baselines.schedule(command)
         text = f"{change.what} by {change.by}, from the next row on"

@@ -74,7 +74,7 @@ class WatchedPlants:
     @property
     def quiet(self) -> list[str]:
         """The packed plants."""
-        return [plant for packed in self._all_packed for plant in packed.plants]
+        return [plant for packed in self._quiet_kinds for plant in packed.plants]
 
     def prepare(self) -> None:
         """Compile the machine code of the first use.
@@ -177,7 +177,7 @@ class WatchedPlants:
         """
         publications: list[Publication] = []
         touched: set[str] = set()
-        for packed in self._all_packed:
+        for packed in self._quiet_kinds:
             published, messages, given = packed.on_messages(messages, now_ns)
             publications += published
             touched.update(given)
@@ -200,7 +200,7 @@ class WatchedPlants:
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Publish health where it is due; raise the alarms of plants without data."""
         publications: list[Publication] = []
-        for packed in self._all_packed:
+        for packed in self._quiet_kinds:
             for plant in packed.overdue(now_ns):
                 self.detach(plant)
             publications += packed.healths(now_ns)
@@ -214,12 +214,12 @@ class WatchedPlants:
 
     def next_tick_ns(self) -> int:
         """Earliest deadline of the plants."""
-        return min((self._deadlines.next_ns(), *(packed.next_due_ns() for packed in self._all_packed)))
+        return min((self._deadlines.next_ns(), *(packed.next_due_ns() for packed in self._quiet_kinds)))
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish the health of all plants' monitors for the last time."""
         publications = [item for monitor in self._monitors.values() for item in monitor.on_stop(now_ns)]
-        return publications + [item for packed in self._all_packed for item in packed.last_healths(now_ns)]
+        return publications + [item for packed in self._quiet_kinds for item in packed.last_healths(now_ns)]
 
     def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
         """Notes to log: plant and line."""
@@ -241,8 +241,8 @@ class WatchedPlants:
     # --- within ----------------------------------------------------------------------------------------------
 
     @property
-    def _all_packed(self) -> list[PackedPlants]:
-        """Kinds with packed plants."""
+    def _quiet_kinds(self) -> list[PackedPlants]:
+        """Packed plants of the kinds that have any."""
         return [packed for packed in self._packed if packed]
 
     def _quiet_with(self, plant: str) -> PackedPlants | None:
