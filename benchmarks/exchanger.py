@@ -139,7 +139,9 @@ def watch(flow: Array, measured: Array, config: MonitorConfig, sizes: Sequence[f
         if k in onsets:
             copies[k] = monitor.to_bytes()
         alarms += [f"{name}@{k}" for name in _take_row(monitor, k, values)]
-    result = Result(monitor.pipeline.reference, alarms, {}, {}, monitor.pipeline.unjudged_rows)
+    result = Result(
+        monitor.pipeline.reference, alarms, {}, {}, getattr(monitor.pipeline.evaluation.reference, "unjudged", 0)
+    )
     for size in sizes:
         delays = result.delays[size] = []
         result.missed[size] = []

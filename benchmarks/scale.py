@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from benchmarks.fleet.copies import copy_plant
 from benchmarks.fleet.traffic import (
     FLEET,
     KNOWN_ROWS,
@@ -47,7 +48,6 @@ from benchmarks.fleet.traffic import (
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.node import UNCACHED, FleetNode, watch
-from monitor_node.fleet.watched_plants import WatchedPlants
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.records.record import NEVER_NS
@@ -123,10 +123,10 @@ class Counting(FleetNode):
         assert self.quiet == ["p0"]
         few = max(plants // 100, 1)
         for number in range(1, few):
-            self.copy("p0", f"p{number}")
+            copy_plant(self, "p0", f"p{number}")
         before = memory_bytes()
         for number in range(few, plants):
-            self.copy("p0", f"p{number}")
+            copy_plant(self, "p0", f"p{number}")
         return (memory_bytes() - before) // max(plants - few, 1)
 
 
@@ -166,9 +166,7 @@ def report_memory(endpoint: str, plants: int) -> None:
     assert bus is not None
     node = Counting(FAST, bus, stop)
     node.learn(plants)
-    assert isinstance(node.watched, WatchedPlants)
-    quiet = node.watched._quiet
-    assert quiet is not None
+    (quiet,) = node.watched._quiet_kinds
     due_ns = quiet._slots.health_due_ns
     due_ns[plants // 2 : plants] = NEVER_NS
     node.samples = 0

@@ -8,6 +8,7 @@ follow from its samples and from operators' actions. So a replay reproduces them
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
 from typing import Any, cast
 
 from google.protobuf.message import Message
@@ -27,7 +28,7 @@ from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, ReceiveS
 from monitor_node.ingest.rejects import RejectCounter
 from monitor_node.ingest.replay_filter import ReplayFilter
 from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, reject_reason
-from monitor_node.ingest.sample_units import make_sample_units
+from monitor_node.ingest.sample_units import SampleUnits
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from monitor_node.pipeline.pipeline import PlantPipeline
 from monitor_node.pipeline.promise_stage import PromiseStage
@@ -69,6 +70,7 @@ class Monitor:
         pipeline: pipeline of the plant's rows.
         first_ns: time of the first row; None before it.
         last_ns: time of the last row; None before the first.
+        watching_since_ns: time of the first evaluated row; None before it.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
         received: number of messages so far.
         on_row_end: called after each row with its time and the publications because of it; None: not called.
@@ -92,7 +94,6 @@ class Monitor:
         self._points, self._model, self._diagnose = points, model, diagnose
         self._changes: deque[ScheduledChange] = deque()
         self._republishes_baseline = False
-        self._settings: dict[str, Any] | None = None
         self.rejects = RejectCounter()
         self.failures = Failures()
         self._signals = config.signals
@@ -106,7 +107,7 @@ class Monitor:
         self.alarms = Annunciator(config)
         self.pipeline = self._new_pipeline(self.alarms)
         judged_by = self.pipeline.model
-        self._sample_units = make_sample_units(config.units, {} if judged_by is None else judged_by.units)
+        self._sample_units = SampleUnits(config.units, {} if judged_by is None else judged_by.units)
         self._plain_units = self._sample_units.plain
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
@@ -114,7 +115,7 @@ class Monitor:
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.span_ns = 0
-        self._watching_since_ns: int | None = None
+        self.watching_since_ns: int | None = None
         self.received = 0
         self.stats = ReceiveStats(start_ns, start_ns)
         self.on_row_end: Callable[[int, list[Publication]], None] | None = None
@@ -226,9 +227,9 @@ class Monitor:
         _, command = decode_command(question, COMMANDS)
         assert isinstance(command, BaselineCommand), "the catalogue says so"
         if command.what == LIST:
-            baselines = self.pipeline.baselines
+            baselines = self.pipeline.baselines.all
             return CommandReply(accepted=True, text=f"{len(baselines)} baselines", baselines=baselines), []
-        change = self.pipeline.schedule_command(command)
+        change = self.pipeline.baselines.schedule(command)
         text = f"{change.what} by {change.by}, from the next row on"
         return CommandReply(accepted=True, text=text), []
 
@@ -265,7 +266,7 @@ class Monitor:
 
     def to_bytes(self) -> bytes:
         """Serialise the full state. A monitor restored from it produces bit-identical output."""
-        return seal_state(self._state(self._learning_settings()))
+        return seal_state(self.state, self._learning_settings)
 
     def from_bytes(self, data: bytes) -> None:
         """Resume from what `to_bytes` of a monitor with the same settings returned.
@@ -277,16 +278,13 @@ class Monitor:
             InputError: the bytes are no state; nothing has changed.
             OtherSettingsError: the state is of a monitor with other settings; nothing has changed.
         """
-        self.restore(open_state(data, self._learning_settings()))
+        self.restore(open_state(data, self._learning_settings))
 
     @property
     def state(self) -> MonitorState:
         """The state that `to_bytes` stores, without the settings. Parts of it are not copied."""
-        return self._state({})
-
-    def _state(self, settings: dict[str, Any]) -> MonitorState:
         return MonitorState(
-            settings,
+            {},
             self._runs,
             self._aligner.state,
             self.alarms.to_bytes(),
@@ -295,7 +293,7 @@ class Monitor:
             self._heard_from_ns,
             self.first_ns,
             self.last_ns,
-            self._watching_since_ns,
+            self.watching_since_ns,
             self._snapshot_due_ns,
             self.received,
             self._published,
@@ -327,26 +325,20 @@ class Monitor:
         self._units, self._heard_from_ns = state.units, state.heard_from_ns
         self._output_units = [self._units[output] for output in self.config.outputs]
         self.first_ns, self.last_ns = state.first_ns, state.last_ns
-        self._watching_since_ns, self._snapshot_due_ns = state.watching_since_ns, state.snapshot_due_ns
+        self.watching_since_ns, self._snapshot_due_ns = state.watching_since_ns, state.snapshot_due_ns
         self.received, self._published = state.received, state.published
         self.rejects.by_reason = state.refused
         self.failures.restore(state.failures)
         self.unconfirmed = unconfirmed
 
+    @cached_property
     def _learning_settings(self) -> dict[str, Any]:
-        if self._settings is None:
-            self._settings = learning_settings(self.config, self.pipeline.model, points=self._points)
-        return self._settings
+        return learning_settings(self.config, self.pipeline.model, points=self._points)
 
     def count_duplicate(self) -> None:
         """Count a sample that was processed before."""
         self.received += 1
         self._aligner.state.counts.duplicated += 1
-
-    @property
-    def is_replaying_history(self) -> bool:
-        """True while samples may arrive that were processed before a restart."""
-        return self._replay_filter is not None and not self._replay_filter.is_done
 
     def on_history_end(self) -> None:
         """End the history query: from now on no sample is one that was processed before a restart."""
@@ -376,14 +368,14 @@ class Monitor:
     def changes(self) -> int:
         """Count of changes that a restart must preserve: of alarms, and of the baseline when accepted and executed."""
         executed = 0 if self.baseline is None else self.baseline.id
-        return self.alarms.changes + 2 * executed + self.pipeline.pending_commands
+        return self.alarms.changes + 2 * executed + len(self.pipeline.model_update.commands)
 
     # --- diagnosis of the training ---------------------------------------------------------------------------
 
     @property
     def awaits_diagnosis(self) -> bool:
         """True while there is a `diagnosis_job`."""
-        return self.pipeline.awaits_diagnosis
+        return self.pipeline.model_update.is_pending
 
     @property
     def diagnosis_job(self) -> DiagnosisJob | None:
@@ -401,7 +393,7 @@ class Monitor:
     @property
     def baseline(self) -> Baseline | None:
         """Change of the baseline in force; None: rows are evaluated by the equations as given."""
-        return self.pipeline.baseline
+        return self.pipeline.model_update.baseline
 
     # --- status ----------------------------------------------------------------------------------------------
 
@@ -413,6 +405,13 @@ class Monitor:
         return "watching" if self.pipeline.watching or not self.pipeline.is_judged else "training"
 
     @property
+    def is_normal(self) -> bool:
+        """True if rows are evaluated and nothing happens: no command or change of a unit, no history, no event."""
+        pipeline, history = self.pipeline, self._replay_filter
+        is_quiet = not (pipeline.model_update.commands or self._sample_units.converted)
+        return is_quiet and pipeline.watching and pipeline.is_normal and (history is None or history.is_done)
+
+    @property
     def model(self) -> ProcessModel | None:
         """Process model of the plant; None if there is none."""
         return self.pipeline.model
@@ -420,7 +419,7 @@ class Monitor:
     @property
     def equations(self) -> ProcessModel | None:
         """Process model in force: `model`, or as the change of the baseline has it."""
-        return self.pipeline.equations
+        return self.pipeline.baselines.equations
 
     @property
     def rows(self) -> int:
@@ -438,19 +437,9 @@ class Monitor:
         return self._aligner.state.counts.restarts
 
     @property
-    def watching_since_ns(self) -> int | None:
-        """Time of the first evaluated row; None before it."""
-        return self._watching_since_ns
-
-    @property
     def silence(self) -> SilenceCheck:
         """Data timeouts of the plant and of its signals."""
         return self.pipeline.evaluation.signals.silence
-
-    @property
-    def converts_samples(self) -> bool:
-        """True if samples come in other units than those in which they are judged."""
-        return bool(self._sample_units.converted)
 
     @property
     def promise(self) -> Promise | None:
@@ -504,8 +493,8 @@ class Monitor:
             publications.extend(self.alarms.end_row(time_ns))
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
             self._contain("row", error)
-        if self._watching_since_ns is None and self.pipeline.watching:
-            self._watching_since_ns = time_ns
+        if self.watching_since_ns is None and self.pipeline.watching:
+            self.watching_since_ns = time_ns
         if due_ns is None or not 0 <= due_ns - time_ns <= self._snapshot_ns:
             self._snapshot_due_ns = time_ns + self._snapshot_ns
             if due_ns is not None:
@@ -548,7 +537,7 @@ class Monitor:
         notes, receipts_ns = self.pipeline.evaluation.notes, self.silence.of_plant.receipts_ns
         self.pipeline = self._new_pipeline(self.alarms)
         self.pipeline.evaluation.notes, self.silence.of_plant.receipts_ns = notes, receipts_ns
-        self._watching_since_ns = None
+        self.watching_since_ns = None
         self.resume_from_alarms(alarms)
 
     def _health(self, now_ns: int, phase: str) -> Publication:

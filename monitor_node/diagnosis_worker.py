@@ -15,13 +15,6 @@ NICENESS = 10
 Item = TypeVar("Item")
 
 
-class PlantJob(NamedTuple):
-    """A plant and the diagnosis of its training."""
-
-    plant: str
-    job: DiagnosisJob
-
-
 class PlantFinding(NamedTuple):
     """A plant and the result of its diagnosis."""
 
@@ -56,7 +49,7 @@ class DiagnosisWorker:
 
     def __init__(self, executor: Executor | None = None) -> None:
         self._executor = ProcessExecutor(1, retries=1) if executor is None else executor
-        self._jobs: SimpleQueue[PlantJob | None] = SimpleQueue()
+        self._jobs: SimpleQueue[tuple[str, DiagnosisJob] | None] = SimpleQueue()
         self._findings: SimpleQueue[PlantFinding] = SimpleQueue()
         self._thread: threading.Thread | None = None
         self._submitted: dict[str, int] = {}
@@ -67,7 +60,7 @@ class DiagnosisWorker:
         if self._submitted.get(plant) == job.first_ns:
             return
         self._submitted[plant] = job.first_ns
-        self._jobs.put(PlantJob(plant, job))
+        self._jobs.put((plant, job))
         if self._thread is None:
             self._thread = threading.Thread(target=self._work, name="diagnosis of trainings", daemon=True)
             self._thread.start()
@@ -100,19 +93,19 @@ class DiagnosisWorker:
             batch = [item for item in (first, *_drain(self._jobs)) if item is not None]
             self._run(batch)
 
-    def _run(self, batch: Sequence[PlantJob]) -> None:
+    def _run(self, batch: Sequence[tuple[str, DiagnosisJob]]) -> None:
         pending = dict(enumerate(batch))
         try:
-            for index, outcome in self._executor.map_unordered(diagnose_beside, [item.job for item in batch]):
-                self._add_finding(pending.pop(index), outcome)
+            for index, outcome in self._executor.map_unordered(diagnose_beside, [job for _, job in batch]):
+                self._add_finding(*pending.pop(index), outcome)
                 if self._is_closed:
                     return
         except OSError as error:  # no process can be started
             for item in pending.values():
-                self._add_finding(item, Failed(f"no process can be started: {one_line(error)}"))
+                self._add_finding(*item, Failed(f"no process can be started: {one_line(error)}"))
 
-    def _add_finding(self, of: PlantJob, outcome: Finding | Failed) -> None:
-        self._findings.put(PlantFinding(of.plant, _finding(of.job, outcome)))
+    def _add_finding(self, plant: str, job: DiagnosisJob, outcome: Finding | Failed) -> None:
+        self._findings.put(PlantFinding(plant, _finding(job, outcome)))
 
 
 def _drain(queue: "SimpleQueue[Item]") -> Iterator[Item]:

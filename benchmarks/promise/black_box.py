@@ -112,7 +112,13 @@ def watch(job: Job) -> Result:
         alarms += sum(isinstance(item.message, Alarm) and item.message.event == "raised" for item in publications)
     rows, promise = monitor.pipeline.evaluation.rows_watched, monitor.promise
     kept = promise is None or promise.kept
-    return Result(alarms, monitor.pipeline.expected_false_alarms, rows, rows - monitor.pipeline.unjudged_rows, kept)
+    return Result(
+        alarms,
+        monitor.pipeline.expected_false_alarms,
+        rows,
+        rows - getattr(monitor.pipeline.evaluation.reference, "unjudged", 0),
+        kept,
+    )
 
 
 def print_table(executor: Executor, jobs: Sequence[Job]) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable
 from monitor_node.alarms.states import Event
 from monitor_node.replay.recorded_sessions import TIMEOUT_ALARM
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.codec import Encoded, Publication, decode_as
 from reactorwatch.contract.messages_pb2 import Alarm
 
 
@@ -30,14 +30,14 @@ class HandedOverAlarms:
 
     def on_message(self, plant: str, message: Encoded) -> None:
         """Record an alarm that another monitor published."""
-        alarm = alarm_of(message)
+        alarm = decode_as(message, Alarm)
         if alarm is not None and alarm.alarm in self._names:
             self._by_others.setdefault(plant, {})[alarm.alarm] = alarm
 
     def on_history(self, plant: str, messages: Iterable[Encoded]) -> None:
         """Record alarms from the publishers' caches, unless a later message on the same alarm arrived already."""
         for message in messages:
-            alarm = alarm_of(message)
+            alarm = decode_as(message, Alarm)
             known = self._by_others.get(plant, {}).get(alarm.alarm) if alarm is not None else None
             if alarm is not None and (known is None or alarm.time_ns >= known.time_ns):
                 self.on_message(plant, message)
@@ -107,15 +107,6 @@ class HandedOverAlarms:
             return False
         published = (before.get(topic.plant, {}).get(alarm.alarm) for before in (self._by_others, self._ours))
         return any(_covers(before, alarm) for before in published if before is not None)
-
-
-def alarm_of(message: Encoded) -> Alarm | None:
-    """Decode an alarm; None if the message is none."""
-    try:
-        alarm = decode(message.payload, message.encoding)
-    except DecodeError:
-        return None
-    return alarm if isinstance(alarm, Alarm) else None
 
 
 def _covers(before: Alarm, alarm: Alarm) -> bool:

@@ -25,15 +25,15 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.admission import PROVEN_MESSAGES, PROVEN_ROWS, PlantRegister
 from monitor_node.fleet.callbacks import NO_CALLBACKS, Callbacks
-from monitor_node.fleet.handed_over_alarms import HandedOverAlarms, alarm_of
+from monitor_node.fleet.handed_over_alarms import HandedOverAlarms
+from monitor_node.fleet.plant_kinds import ANY, PlantKind
 from monitor_node.fleet.recently_adopted import RecentlyAdopted
 from monitor_node.fleet.sharding import ShardGroup
-from monitor_node.fleet.watched_kinds import ANY, PlantKind, WatchedKinds
 from monitor_node.fleet.watched_plants import State, WatchedPlants
 from monitor_node.ingest.pending import PendingPlants, PlantHistory, truncate
 from monitor_node.replay.recorded_sessions import TIMEOUT_ALARM
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.codec import Encoded, Publication, decode_as
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
@@ -78,11 +78,7 @@ class FleetMonitor:
     ) -> None:
         self._shards, self._callbacks = shards, callbacks
         all_kinds = (*kinds, PlantKind(ANY, config, model))
-        self.watched: WatchedPlants | WatchedKinds = (
-            WatchedKinds(all_kinds, start_ns, points=points, diagnose=callbacks.diagnose)
-            if kinds
-            else WatchedPlants(config, start_ns, model, points=points, diagnose=callbacks.diagnose)
-        )
+        self.watched = WatchedPlants(all_kinds, start_ns, points=points, diagnose=callbacks.diagnose)
         self._pending = PendingPlants()
         self._presume_gone_ns: int | None = start_ns + PRESUME_GONE_NS
         self._register = PlantRegister()
@@ -244,7 +240,7 @@ class FleetMonitor:
             topic = keys.parse(message.key)
             if topic is None or topic.kind != keys.ALARM:
                 continue
-            alarm, own = alarm_of(message), self.watched.detach(topic.plant)
+            alarm, own = decode_as(message, Alarm), self.watched.detach(topic.plant)
             if alarm is not None and own is not None and alarm.time_ns > (own.last_ns or 0):
                 plants.add(topic.plant)
         return plants
@@ -434,12 +430,6 @@ class FleetMonitor:
         """Publish the health of all plants' monitors for the last time."""
         return self.watched.on_stop(now_ns)
 
-    def copy(self, plant: str, name: str) -> None:
-        """Adopt a copy of a quiet plant, for trials with many plants."""
-        self.watched.copy(plant, name)
-        self._register.add(name)
-        self._callbacks.on_ownership(name, True)
-
 
 def _plant_of_key(key: str) -> str:
     """Plant in a key; empty if there is none."""
@@ -449,8 +439,5 @@ def _plant_of_key(key: str) -> str:
 
 def _sample_time_ns(message: Encoded) -> int:
     """Time of a sample; the earliest if the message is none."""
-    try:
-        sample = decode(message.payload, message.encoding)
-    except DecodeError:
-        sample = None
-    return sample.time_ns if isinstance(sample, Sample) else -NEVER_NS
+    sample = decode_as(message, Sample)
+    return -NEVER_NS if sample is None else sample.time_ns

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
 import structlog
 
 from monitor_node.alarms.kpis import is_empty
@@ -17,8 +16,9 @@ from monitor_node.fleet.callbacks import Callbacks
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.monitor import FleetMonitor
 from monitor_node.fleet.partition import LeaseMonitor
+from monitor_node.fleet.plant_kinds import ANY, PlantKind, load_kinds
 from monitor_node.fleet.sharding import ShardGroup
-from monitor_node.fleet.watched_kinds import ANY, PlantKind, WatchedKinds
+from monitor_node.fleet.watched_plants import WatchedPlants
 from monitor_node.health.message import NODE
 from monitor_node.health.other_monitors import OtherMonitors, log_report
 from monitor_node.ingest.pending import PlantHistory
@@ -396,7 +396,7 @@ def run(
     # Inconsistent settings are refused here, and machine code is compiled before plants wait.
     config = fleet.share_promise(config)
     kinds = (*load_kinds(config, fleet), PlantKind(ANY, *load_process(config)))
-    WatchedKinds(kinds, 0, points=fleet.points).prepare()
+    WatchedPlants(kinds, 0, points=fleet.points).prepare()
     states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
     with serve_metrics(metrics_config, Metrics(NODE)) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop, uncached=UNCACHED, many_keys=True)
@@ -406,23 +406,6 @@ def run(
             watch(FleetNode(config, fleet, bus, time.time_ns(), states, metrics), bus, stop)
         finally:
             bus.close()
-
-
-def load_kinds(config: MonitorConfig, fleet: FleetConfig) -> tuple[PlantKind, ...]:
-    """Plants whose process the settings of the fleet name.
-
-    Args:
-        config: settings of each plant's monitor.
-        fleet: settings of the fleet.
-
-    Raises:
-        InputError: a process cannot be loaded, or does not fit the settings of the monitor.
-    """
-    watched = {
-        name: load_process(msgspec.structs.replace(config, process=name))
-        for name in dict.fromkeys(fleet.processes.values())
-    }
-    return tuple(PlantKind(pattern, *watched[name]) for pattern, name in fleet.processes.items())
 
 
 def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:

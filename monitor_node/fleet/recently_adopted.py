@@ -13,7 +13,7 @@ from typing import NamedTuple
 from monitor_node.core import Monitor
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import DecodeError, Encoded, decode
+from reactorwatch.contract.codec import Encoded, decode_as
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.runtime.delivery.gap_tracker import GapTracker
 
@@ -54,8 +54,5 @@ class RecentlyAdopted:
         newest = self._newest[plant].samples.get(message.key) if plant in self._newest else None
         if newest is None or len(message.payload) > LARGEST_SAMPLE:
             return False
-        try:
-            sample = decode(message.payload, message.encoding)
-        except DecodeError:
-            return False
-        return isinstance(sample, Sample) and newest.is_past(sample.sequence, sample.time_ns)
+        sample = decode_as(message, Sample)
+        return sample is not None and newest.is_past(sample.sequence, sample.time_ns)

@@ -1,24 +1,23 @@
 """The plants that one monitor of a fleet owns, each in one of two forms.
 
-A plant in its normal state is packed (`packed`); any other has an active monitor, until it is normal again.
-Publications are the same.
+A plant in its normal state is packed (`packed`), with the others of its kind; any other has an active monitor, until it
+is normal again. Publications are the same.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import msgspec
 
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
-from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.deadline_queue import DeadlineQueue
 from monitor_node.fleet.packed.conversion import Conversion
 from monitor_node.fleet.packed.plants import PackedPlants
+from monitor_node.fleet.plant_kinds import PlantKind, kind_finder
 from monitor_node.isolation import stage
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.errors import InputError
 from reactorwatch.identification.rls import RecursiveLeastSquares
-from reactorwatch.process.model import ProcessModel
 
 DEMOTE_EVERY_ROWS = 8
 """Rows between two attempts to pack a plant."""
@@ -31,14 +30,13 @@ class WatchedPlants:
     """The plants of one monitor.
 
     Args:
-        config: settings of each plant's monitor; its plant name is ignored.
+        kinds: kinds of plants; the last one has the pattern `plant_kinds.ANY`.
         start_ns: present time.
-        model: see `Monitor`.
         points: see `Monitor`.
         diagnose: called with a plant and the diagnosis of its training; the result is passed to `on_finding`.
 
     Attributes:
-        alarms: names of a plant's alarms.
+        alarms: names of the alarms of any plant.
 
     Raises:
         InputError: the settings are inconsistent.
@@ -46,29 +44,27 @@ class WatchedPlants:
 
     def __init__(
         self,
-        config: MonitorConfig,
+        kinds: Sequence[PlantKind],
         start_ns: int,
-        model: ProcessModel | None,
         *,
         points: bool,
         diagnose: Callable[[str, DiagnosisJob], None] = lambda _plant, _job: None,
     ) -> None:
-        self._config, self._model, self._points = config, model, points
+        self._kinds, self._points, self._find = kinds, points, kind_finder(kinds)
         self._diagnose = diagnose
         self._submitted: set[str] = set()  # plants whose training is being diagnosed
-        first = Monitor(config, start_ns, points=points, model=model)  # inconsistent settings are refused here
-        self._first_model = first.model
-        self.alarms = tuple(alarm.alarm for alarm in first.alarms.all_alarms())
-        is_common = first.model is not None and not first.model.uncertain  # else plants differ in what was learned
-        form = Conversion.of(first.config, first.model) if is_common and not points else None
-        self._quiet = None if form is None or first.model is None else PackedPlants(form, first.config, first.model)
+        # Inconsistent settings are refused here.
+        first = [Monitor(kind.config, start_ns, points=points, model=kind.model) for kind in kinds]
+        self._models = [monitor.model for monitor in first]
+        self.alarms = tuple(dict.fromkeys(alarm.alarm for monitor in first for alarm in monitor.alarms.all_alarms()))
+        self._packed = [None if points else _packed_form(monitor) for monitor in first]  # by kind; None: never packed
         self._monitors: dict[str, Monitor] = {}  # of plants that are not quiet
         self._demote_at_row: dict[str, int] = {}  # row of the next attempt to pack
         self._deadlines = DeadlineQueue()
         self._notes: list[tuple[str, str]] = []
 
     def __contains__(self, plant: str) -> bool:
-        return plant in self._monitors or self._is_quiet(plant)
+        return plant in self._monitors or self._quiet_with(plant) is not None
 
     @property
     def plants(self) -> list[str]:
@@ -78,7 +74,7 @@ class WatchedPlants:
     @property
     def quiet(self) -> list[str]:
         """The packed plants."""
-        return [] if self._quiet is None else self._quiet.plants
+        return [plant for packed in self._quiet_kinds for plant in packed.plants]
 
     def prepare(self) -> None:
         """Compile the machine code of the first use.
@@ -87,17 +83,20 @@ class WatchedPlants:
         the fleet would presume this one gone.
         """
         RecursiveLeastSquares(1).update([1.0], 1.0)
-        for _ in stage.preparation(self._config, self._first_model):
-            pass
-        if self._quiet is not None:
-            self._quiet.prepare()
+        for kind, model in zip(self._kinds, self._models, strict=True):
+            for _ in stage.preparation(kind.config, model):
+                pass
+        for packed in self._packed:
+            if packed is not None:
+                packed.prepare()
 
     # --- plants ----------------------------------------------------------------------------------------------
 
     def new_monitor(self, plant: str, now_ns: int) -> Monitor:
         """Make a monitor for a plant; `add` adds it."""
-        named = msgspec.structs.replace(self._config, plant=plant)
-        monitor = Monitor(named, now_ns, points=self._points, model=self._model)
+        kind = self._kinds[self._find(plant)]
+        named = msgspec.structs.replace(kind.config, plant=plant)
+        monitor = Monitor(named, now_ns, points=self._points, model=kind.model)
         monitor.failures.passes = ()
         return monitor
 
@@ -128,19 +127,15 @@ class WatchedPlants:
             self._submitted.discard(plant)
         return monitor
 
-    def copy(self, plant: str, name: str) -> None:
-        """Add a copy of a quiet plant, for trials with many plants."""
-        assert self._quiet is not None
-        self._quiet.copy(plant, name)
-
     def active_monitor(self, plant: str) -> Monitor | None:
         """Monitor of a plant; None if it is quiet, or there is no such plant."""
         return self._monitors.get(plant)
 
     def detach(self, plant: str) -> Monitor | None:
         """Unpack a plant, if it is quiet; returns its monitor. None: there is no such plant."""
-        if self._quiet is not None and plant in self._quiet:
-            self._add_detached(plant, self._quiet.give(plant))
+        packed = self._quiet_with(plant)
+        if packed is not None:
+            self._add_detached(plant, packed.give(plant))
             self._deadlines.schedule(plant, self._monitors[plant].next_tick_ns())
         return self._monitors.get(plant)
 
@@ -150,23 +145,26 @@ class WatchedPlants:
         Raises:
             InputError: there is no such plant.
         """
-        if self._quiet is not None and plant in self._quiet:
-            return self._quiet.state_of(plant)
+        packed = self._quiet_with(plant)
+        if packed is not None:
+            return packed.state_of(plant)
         if plant not in self._monitors:
             raise InputError(f"plant {plant!r} is not watched here (there are: {', '.join(self.plants)})")
         return self._monitors[plant].to_bytes()
 
     def received_count(self, plant: str) -> int | None:
         """Number of messages of a plant; None: there is no such plant."""
-        if self._quiet is not None and plant in self._quiet:
-            return self._quiet.received_count(plant)
+        packed = self._quiet_with(plant)
+        if packed is not None:
+            return packed.received_count(plant)
         monitor = self._monitors.get(plant)
         return None if monitor is None else monitor.received
 
     def count_not_stored(self, plant: str) -> None:
         """Count a failure to store the state of a plant."""
-        if self._quiet is not None and plant in self._quiet:
-            self._quiet.count_not_stored(plant)
+        packed = self._quiet_with(plant)
+        if packed is not None:
+            packed.count_not_stored(plant)
         elif (monitor := self._monitors.get(plant)) is not None:
             monitor.stats.not_stored += 1
 
@@ -177,12 +175,15 @@ class WatchedPlants:
 
         These plants are passed to `settle` after the other messages.
         """
-        if not self._quiet:
-            return [], messages, set()
-        publications, others, given = self._quiet.on_messages(messages, now_ns)
-        for plant, monitor in given.items():
-            self._add_detached(plant, monitor)
-        return publications, others, set(given)
+        publications: list[Publication] = []
+        touched: set[str] = set()
+        for packed in self._quiet_kinds:
+            published, messages, given = packed.on_messages(messages, now_ns)
+            publications += published
+            touched.update(given)
+            for plant, monitor in given.items():
+                self._add_detached(plant, monitor)
+        return publications, messages, touched
 
     def settle(self, plants: Iterable[str]) -> list[str]:
         """Pack plants that are normal now, and schedule the others; returns the packed ones."""
@@ -199,10 +200,10 @@ class WatchedPlants:
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Publish health where it is due; raise the alarms of plants without data."""
         publications: list[Publication] = []
-        if self._quiet:
-            for plant in self._quiet.overdue(now_ns):
+        for packed in self._quiet_kinds:
+            for plant in packed.overdue(now_ns):
                 self.detach(plant)
-            publications += self._quiet.healths(now_ns)
+            publications += packed.healths(now_ns)
         for plant in self._deadlines.pop_due(now_ns):
             monitor = self._monitors.get(plant)
             if monitor is not None:
@@ -213,13 +214,12 @@ class WatchedPlants:
 
     def next_tick_ns(self) -> int:
         """Earliest deadline of the plants."""
-        due_ns = self._deadlines.next_ns()
-        return min(due_ns, self._quiet.next_due_ns()) if self._quiet else due_ns
+        return min((self._deadlines.next_ns(), *(packed.next_due_ns() for packed in self._quiet_kinds)))
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish the health of all plants' monitors for the last time."""
         publications = [item for monitor in self._monitors.values() for item in monitor.on_stop(now_ns)]
-        return publications + (self._quiet.last_healths(now_ns) if self._quiet else [])
+        return publications + [item for packed in self._quiet_kinds for item in packed.last_healths(now_ns)]
 
     def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
         """Notes to log: plant and line."""
@@ -240,8 +240,15 @@ class WatchedPlants:
 
     # --- within ----------------------------------------------------------------------------------------------
 
-    def _is_quiet(self, plant: str) -> bool:
-        return self._quiet is not None and plant in self._quiet
+    @property
+    def _quiet_kinds(self) -> list[PackedPlants]:
+        """Packed plants of the kinds that have any."""
+        return [packed for packed in self._packed if packed]
+
+    def _quiet_with(self, plant: str) -> PackedPlants | None:
+        """The packed plants with this one; None if it is not packed."""
+        packed = self._packed[self._find(plant)]
+        return packed if packed is not None and plant in packed else None
 
     def _add_detached(self, plant: str, monitor: Monitor) -> None:
         """Add the monitor of an unpacked plant."""
@@ -256,11 +263,12 @@ class WatchedPlants:
 
     def _demote(self, plant: str, monitor: Monitor) -> bool:
         """Pack a plant, if it is normal; returns True if it is."""
-        if self._quiet is None or monitor.rows < self._demote_at_row.get(plant, 0):
+        packed = self._packed[self._find(plant)]
+        if packed is None or monitor.rows < self._demote_at_row.get(plant, 0):
             return False
         self._demote_at_row[plant] = monitor.rows + DEMOTE_EVERY_ROWS
         try:
-            if not self._quiet.take(plant, monitor):
+            if not packed.take(plant, monitor):
                 return False
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
             monitor.failures.add("demotion", error, "the plant keeps a monitor of its own")
@@ -268,3 +276,12 @@ class WatchedPlants:
         self._notes += [(plant, note) for note in monitor.notes]
         self._forget(plant)
         return True
+
+
+def _packed_form(monitor: Monitor) -> PackedPlants | None:
+    """Packed form of plants with the settings of a monitor; None if they cannot be packed."""
+    config, model = monitor.config, monitor.model
+    if model is None or model.uncertain:  # then plants differ in what was learned
+        return None
+    form = Conversion.of(config, model)
+    return None if form is None else PackedPlants(form, config, model)

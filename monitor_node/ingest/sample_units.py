@@ -13,19 +13,19 @@ SAME = (1.0, 0.0)
 
 
 class SampleUnits:
-    """Converts samples.
+    """Converts the samples of a plant; those of signals without a unit here are judged in the units that they come in.
 
     Args:
-        wanted: unit by signal; samples of another signal stay as they are.
-        declared: unit by signal of samples that name none, where it is not the wanted one.
+        declared: units of the signals as their process describes them.
+        model_units: units of the equations.
 
     Attributes:
         plain: newest unit by signal that needed no conversion.
         converted: signals whose newest sample in another unit than `plain` was converted.
     """
 
-    def __init__(self, wanted: Mapping[str, str], declared: Mapping[str, str]) -> None:
-        self._wanted, self._declared = dict(wanted), dict(declared)
+    def __init__(self, declared: Mapping[str, str], model_units: Mapping[str, str]) -> None:
+        self._wanted, self._declared = {**declared, **model_units}, dict(declared)
         self.plain: dict[str, str] = {}
         self.converted: set[str] = set()
         self._conversions: dict[tuple[str, str], tuple[float, float]] = {}
@@ -67,13 +67,3 @@ def _find_conversion(signal: str, unit: str, wanted: str) -> tuple[float, float]
         return conversion(unit, wanted, f"sample of {signal}")
     except UnknownUnitError:
         return SAME
-
-
-def make_sample_units(declared: Mapping[str, str], model_units: Mapping[str, str]) -> SampleUnits:
-    """Conversion of a plant's samples; those of signals without a unit here are judged in the units that they come in.
-
-    Args:
-        declared: units of the signals as their process describes them.
-        model_units: units of the equations.
-    """
-    return SampleUnits({**declared, **model_units}, declared)

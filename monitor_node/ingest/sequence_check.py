@@ -26,10 +26,11 @@ To tell the two apart at once, a sample would have to name the process that publ
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from monitor_node.ingest.alignment import REMEMBERED
 from monitor_node.ingest.sampling import Spacing
+from reactorwatch.codegen.numba_kernel import jit, python_function
 from reactorwatch.runtime.delivery.gap_tracker import GapTracker
 
 CONFIRMED, COUNTED = 8, 3
@@ -47,6 +48,22 @@ AT_FIRST = 4.0
 
 ALIKE = 0.01
 """Share of the usual spacing: a smaller deviation does not update the mean."""
+
+
+UNLIKE, LIKE, EQUAL = 0, 1, 2
+"""Comparison of a spacing with the usual one: of another run; of the run, and to be learned; the same, nearly."""
+
+
+@jit
+def compare_spacing(usual: Any, spacing_ns: float) -> int:
+    """Compare the spacing of two samples, per number, with the usual one of a run, which must be known."""
+    deviation_ns = abs(spacing_ns - usual.mean_ns)
+    if spacing_ns <= 0.0 or deviation_ns > TOLERANCE * usual.mean_ns + DEVIATIONS * usual.deviation_ns:
+        return UNLIKE
+    return EQUAL if deviation_ns <= ALIKE * usual.mean_ns else LIKE
+
+
+_COMPARE = python_function(compare_spacing)
 
 
 class HeldSample(NamedTuple):
@@ -71,12 +88,16 @@ class SequenceCheck(GapTracker):
     held: list[HeldSample] = field(default_factory=list)
 
     def accept_next(self, number: int, time_ns: int) -> bool:
-        """Accept a sample that has the next number at the usual time; returns True if it does."""
-        if self.held or number != self.expected:
+        """Accept a sample that has the next number, and follows; returns True if it does. The usual case."""
+        usual = self.spacing
+        if self.held or number != self.expected or usual.count < MEMORY:
             return False
-        spacing_ns = self.spacing.mean_ns
-        if self.spacing.count < MEMORY or abs(time_ns - self.newest_ns - spacing_ns) > ALIKE * spacing_ns:
+        spacing_ns = float(time_ns - self.newest_ns)
+        found = _COMPARE(usual, spacing_ns)
+        if found == UNLIKE:
             return False
+        if found == LIKE:
+            usual.learn(spacing_ns, MEMORY)
         self.expected, self.newest_ns = number + 1, time_ns
         return True
 
@@ -171,4 +192,4 @@ class SequenceCheck(GapTracker):
         spacing_ns, usual = time_ns / numbers, self.spacing
         if usual.count < MEMORY:
             return not usual.count or spacing_ns <= AT_FIRST * usual.mean_ns
-        return abs(spacing_ns - usual.mean_ns) <= TOLERANCE * usual.mean_ns + DEVIATIONS * usual.deviation_ns
+        return _COMPARE(usual, spacing_ns) != UNLIKE

@@ -44,7 +44,7 @@ class KeptBaselines:
         self.kept: list[KeptBaseline] = []
 
     @property
-    def baselines(self) -> list[Baseline]:
+    def all(self) -> list[Baseline]:
         """Baselines that can be restored, the oldest first, then the one in force."""
         return [*(Baseline.FromString(item.change) for item in self.kept), self._in_force]
 
@@ -64,7 +64,7 @@ class KeptBaselines:
         Raises:
             InputError: the command is refused.
         """
-        kept = [item.id for item in self.baselines[:-1]]
+        kept = [item.id for item in self.all[:-1]]
         has_rows, has_alarm = self._training.began_ns is not None, self._evaluation.incident is not None
         change = check_command(command, kept, has_rows=has_rows, has_alarm=has_alarm)
         self._update.changes.append(ScheduledChange(None, change))

@@ -9,7 +9,7 @@ from monitor_node.baseline.references import ProcessReference, Reference
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.pipeline.row_frame import Records
-from monitor_node.pipeline.row_step import FilterNumbers, RowStep, numbers_type
+from monitor_node.pipeline.row_step import FilterNumbers, RowStep, types_of
 from reactorwatch.arrays import Array
 from reactorwatch.records.record import MINUTE_NS
 
@@ -22,7 +22,7 @@ class OrdinaryRows:
         ranges: ranges of each input and of each output.
 
     Attributes:
-        numbers: numbers of the stages, shape (1,), see `row_frame.row_type`.
+        numbers: numbers of the stages, shape (1,), see `row_frame.FrameTypes`.
         kalman: numbers of the filter; None where there is no step.
     """
 
@@ -30,7 +30,7 @@ class OrdinaryRows:
         self._config, self._ranges = config, ranges
         self._step: RowStep | None = None
         self._row = np.empty(len(config.signals))
-        self.numbers: Records = np.zeros(1, numbers_type(config))
+        self.numbers: Records = np.zeros(1, types_of(config).numbers)
         self.kalman: FilterNumbers | None = None
 
     def start(self, reference: Reference) -> None:

@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Callable
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.commands import is_command
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.references import ProcessReference
@@ -36,7 +35,7 @@ from monitor_node.pipeline.row_step import FilterNumbers
 from monitor_node.pipeline.training_stage import TIMES_FEWEST, TrainingStage
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
+from reactorwatch.contract.messages_pb2 import Baseline
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -63,6 +62,8 @@ class PlantPipeline:
         evaluation: evaluation of the plant's rows.
         models: identified models.
         operation: operation of the plant, for the texts of alarms.
+        baselines: the baseline in force, and those that can be restored.
+        model_update: changes of the baseline to come, and the one in force.
     """
 
     def __init__(
@@ -102,11 +103,11 @@ class PlantPipeline:
             promises=promises or PromiseStage(config, board, self._failures, points=points),
         )
         self._training = TrainingStage(config, self.model, self.models)
-        self._update = ModelUpdate(config, deque() if changes is None else changes)
-        self._baselines = KeptBaselines(self.model, self.models, self._training, self.evaluation, self._update)
+        self.model_update = ModelUpdate(config, deque() if changes is None else changes)
+        self.baselines = KeptBaselines(self.model, self.models, self._training, self.evaluation, self.model_update)
         self._modes: OperatingModes | None = None
         if config.modes:
-            self._modes = OperatingModes(config, self.models, self._training, self.evaluation, self._baselines)
+            self._modes = OperatingModes(config, self.models, self._training, self.evaluation, self.baselines)
 
     # --- state -----------------------------------------------------------------------------------------------
 
@@ -114,21 +115,21 @@ class PlantPipeline:
     def state(self) -> PipelineState:
         """A copy of the state between two rows, without the alarms."""
         evaluation, training, reference = self.evaluation, self._training, self.evaluation.reference
-        is_changed = reference is None and self.baseline is not None
+        change = self.model_update.baseline if reference is None else None
         return PipelineState(
             self._sampling.copy_state(),
             evaluation.signals.state,
             self.models.state,
             training.refusals,
             training.began_ns,
-            self._update.rows or training.training.state,
-            None if reference is None else self._baselines.trained_state(reference),
+            self.model_update.rows or training.training.state,
+            None if reference is None else self.baselines.trained_state(reference),
             self.operation.state,
-            list(self._baselines.kept),
-            self.baseline.SerializeToString() if is_changed and self.baseline is not None else b"",
+            list(self.baselines.kept),
+            b"" if change is None else change.SerializeToString(),
             None if evaluation.incident is None else evaluation.incident.state,
             None if self._modes is None else self._modes.copy_state(),
-            [command.SerializeToString() for command in self._update.commands],
+            [command.SerializeToString() for command in self.model_update.commands],
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -146,12 +147,12 @@ class PlantPipeline:
         self.evaluation.signals.restore(state.signals, now_ns)
         self.models.restore(state.predictors)
         self._training.refusals, self._training.began_ns = state.refusals, state.began_ns
-        self._baselines.kept = list(state.kept)
-        self._update.changes.extend(ScheduledChange(None, Baseline.FromString(item)) for item in state.commands)
+        self.baselines.kept = list(state.kept)
+        self.model_update.changes.extend(ScheduledChange(None, Baseline.FromString(item)) for item in state.commands)
         watched = state.watched
         change = state.change if watched is None or not watched.baseline else watched.baseline
         if change:
-            self._update.baseline = Baseline.FromString(change)
+            self.model_update.baseline = Baseline.FromString(change)
         if state.incident is not None:
             self.evaluation.incident = TrainingRows(self._inputs, len(self._config.outputs))
             self.evaluation.incident.restore(state.incident)
@@ -161,8 +162,8 @@ class PlantPipeline:
             self._training.training.restore(state.training)
             return
         if state.training.times_ns and self._config.diagnose_training:
-            self._update.rows = state.training
-        self.evaluation.restore(watched, self.equations)
+            self.model_update.rows = state.training
+        self.evaluation.restore(watched, self.baselines.equations)
 
     def resume_from_alarms(self) -> None:
         """Follow alarms that were set from outside."""
@@ -208,12 +209,6 @@ class PlantPipeline:
         return reference.noise_levels if isinstance(reference, ProcessReference) else None
 
     @property
-    def unjudged_rows(self) -> int:
-        """Number of rows that a black box did not judge, as it knew too little of the point of operation."""
-        reference = self.evaluation.reference
-        return reference.unjudged if isinstance(reference, BlackBoxReference) else 0
-
-    @property
     def refused_trainings(self) -> int:
         """Number of refused trainings."""
         return self._training.refusals
@@ -245,7 +240,7 @@ class PlantPipeline:
             publications: list to which publications are added; those before an error are published nevertheless.
         """
         evaluation, time_ns = self.evaluation, row.time_ns
-        if self._update.changes:
+        if self.model_update.changes:
             self._change_baseline(time_ns, publications)
         if self._modes is not None and self._modes.is_change(self.operation.values):
             self._note(self._modes.change(self.operation.values))
@@ -352,7 +347,7 @@ class PlantPipeline:
     ) -> None:
         self._start(trained)
         if self._config.diagnose_training and equations_text(self.model):
-            self._update.rows = rows
+            self.model_update.rows = rows
         if self._diagnose is not None and (job := self.diagnosis_job) is not None:
             self.on_finding(self._diagnose(job))
         if not self._change_model(time_ns, publications):
@@ -366,13 +361,13 @@ class PlantPipeline:
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
-        trained = self._training.finish_early(times=TIMES_FEWEST).result
+        _, trained = self._training.finish_early(times=TIMES_FEWEST)
         state, reference = self.state, trained.reference.state
 
         def start(config: MonitorConfig) -> "PlantPipeline":
             pipeline = PlantPipeline(config, Annunciator(config), points=False, model=self.model)
             pipeline.restore(state, 0)
-            of_pipeline = pipeline.evaluation.restore_reference(reference, pipeline.equations)
+            of_pipeline = pipeline.evaluation.restore_reference(reference, pipeline.baselines.equations)
             pipeline._start(trained._replace(reference=of_pipeline, checks=list(trained.checks)))
             return pipeline
 
@@ -397,76 +392,43 @@ class PlantPipeline:
         """Judge the training by itself."""
         evaluation, reference = self.evaluation, self.evaluation.reference
         if reference is not None:
-            model = self.equations if isinstance(reference, ProcessReference) else None
+            model = self.baselines.equations if isinstance(reference, ProcessReference) else None
             self._note(evaluation.promises.check(rows, model, reference.kind, evaluation.rows_watched))
 
     # --- changes of the baseline -----------------------------------------------------------------------------
 
     @property
-    def baseline(self) -> Baseline | None:
-        """Change of the model in force; None: the model is as given."""
-        return self._update.baseline
-
-    @property
-    def baselines(self) -> list[Baseline]:
-        """Baselines that can be restored, the oldest first, then the one in force."""
-        return self._baselines.baselines
-
-    @property
-    def equations(self) -> ProcessModel | None:
-        """Process model in force; None: there is none."""
-        return self._baselines.equations
-
-    @property
-    def pending_commands(self) -> int:
-        """Number of accepted commands on the baseline that hold from the next row on."""
-        return len(self._update.commands)
-
-    def schedule_command(self, command: BaselineCommand) -> Baseline:
-        """Schedule a command on the baseline for the next row; returns the change.
-
-        Raises:
-            InputError: the command is refused.
-        """
-        return self._baselines.schedule(command)
-
-    @property
-    def awaits_diagnosis(self) -> bool:
-        """True while the diagnosis of the training is pending."""
-        return self._update.is_pending
-
-    @property
     def diagnosis_job(self) -> DiagnosisJob | None:
         """The diagnosis of the training, while it is pending."""
-        return self._update.job(equations_text(self.model)) if self._update.is_pending else None
+        return self.model_update.job(equations_text(self.model)) if self.model_update.is_pending else None
 
     def on_finding(self, finding: Finding) -> None:
         """Process the result of a diagnosis; a change holds from the next row on."""
-        note = self._update.resolve(finding)
+        note = self.model_update.resolve(finding)
         if finding.equations or isinstance(self.evaluation.reference, ProcessReference):
             self._note(note)
 
     def _change_baseline(self, time_ns: int, publications: list[Publication]) -> None:
         """Execute the change that holds from a row on, if there is one."""
-        if not is_command(self._update.changes[0].baseline):
+        if not is_command(self.model_update.changes[0].baseline):
             self._change_model(time_ns, publications)
-        elif (change := self._update.pop_due(time_ns)) is not None:
+        elif (change := self.model_update.pop_due(time_ns)) is not None:
             self.evaluation.leave_normal()
-            self._baselines.execute(change)
+            self.baselines.execute(change)
             if self._modes is not None and not self.watching:
                 self._modes.state.is_judged, self._modes.state.is_resumed = True, False
             publications.append(Publication(self._baseline_key, change))
 
     def _change_model(self, time_ns: int, publications: list[Publication]) -> bool:
         """Learn the baseline again with the model of a change, if one holds from this row on; returns True if so."""
-        if self._update.changes and is_command(self._update.changes[0].baseline):
+        if self.model_update.changes and is_command(self.model_update.changes[0].baseline):
             return False
-        rows, change = self._update.rows, self._update.pop_due(time_ns)
+        rows, change = self.model_update.rows, self.model_update.pop_due(time_ns)
         if change is None or rows is None:
             return False
         self.evaluation.leave_normal()
         try:
-            trained = self._update.relearn(change, self.models.predictors)
+            trained = self.model_update.relearn(change, self.models.predictors)
         except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
             self._failures.add("baseline", error, "the plant is judged by the equations as given")
             return False

@@ -54,74 +54,60 @@ CONSTANTS = np.dtype(
 """Constants of a step whose number is the same for all plants."""
 
 
-def row_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
-    """Type of the numbers of a plant's stages, composed of the stages' own; the filter has its belief elsewhere.
+class FrameTypes(NamedTuple):
+    """Types of the records of a step.
+
+    Attributes:
+        numbers: numbers of a plant's stages, composed of the stages' own; the filter has its belief elsewhere.
+        work: results of a step.
+        settings: constants of a step.
+    """
+
+    numbers: np.dtype[Any]
+    work: np.dtype[Any]
+    settings: np.dtype[Any]
+
+
+def frame_types(inputs: int, outputs: int, alarms: int) -> FrameTypes:
+    """Types of the records of a step.
 
     Args:
         inputs: number of inputs.
         outputs: number of monitored outputs.
         alarms: number of alarms that the charts can raise.
     """
-    return np.dtype(
-        [
-            *((name, HEAD[name]) for name in HEAD.names or ()),
-            ("inputs", "f8", (inputs,)),  # inputs of that row
-            ("timeouts", TIMEOUT, (1 + inputs + outputs,)),  # of the plant, each input and each output
-            ("whiteners", WHITENER, (outputs,)),
-            ("stuck", STUCK, (outputs,)),
-            ("spike_limits", "f8", (outputs,)),
-            ("shewhart", "f8", (Shewhart.numbers, outputs)),
-            ("ewma", "f8", (Ewma.numbers, outputs)),
-            ("cusum", "f8", (Cusum.numbers, outputs)),
-            ("mewma", "f8", (count_numbers(outputs),)),
-            ("delays", DELAY, (max(alarms, 1),)),
-        ],
-        align=True,
-    )
-
-
-def work_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
-    """Type of the results of a step.
-
-    Args:
-        inputs: number of inputs.
-        outputs: number of monitored outputs.
-        alarms: number of alarms that the charts can raise.
-    """
-    return np.dtype(
-        [
-            ("new", "f8", (3 + 2 * inputs + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
-            ("outputs", "f8", (5 * outputs + 1,)),  # its results
-            ("expected", "f8", (outputs,)),  # expected values of the prewhitening filters
-            ("e", "f8", (outputs,)),  # prewhitened residuals
-            ("columns", "f8", (_COLUMNS, outputs)),  # columns of a bank of charts, see `compiled_chart`
-            ("points", "f8", (max(alarms, 1), POINT)),  # points of the charts, one row an alarm
-        ],
-        align=True,
-    )
-
-
-def settings_type(inputs: int, outputs: int, alarms: int) -> np.dtype[Any]:
-    """Type of the constants of a step.
-
-    Args:
-        inputs: number of inputs.
-        outputs: number of monitored outputs.
-        alarms: number of alarms that the charts can raise.
-    """
-    return np.dtype(
-        [
-            ("constants", CONSTANTS),
-            ("resolutions", "f8", (outputs,)),  # stated resolution of each output; 0 where it is learned
-            ("ranges", "f8", (inputs + outputs, 2)),  # smallest and largest value of each signal
-            ("rules", "i8", (max(alarms, 1), 2)),  # violating points that raise each alarm, mask of its window
-        ],
-        align=True,
-    )
+    numbers = [
+        *((name, HEAD[name]) for name in HEAD.names or ()),
+        ("inputs", "f8", (inputs,)),  # inputs of that row
+        ("timeouts", TIMEOUT, (1 + inputs + outputs,)),  # of the plant, each input and each output
+        ("whiteners", WHITENER, (outputs,)),
+        ("stuck", STUCK, (outputs,)),
+        ("spike_limits", "f8", (outputs,)),
+        ("shewhart", "f8", (Shewhart.numbers, outputs)),
+        ("ewma", "f8", (Ewma.numbers, outputs)),
+        ("cusum", "f8", (Cusum.numbers, outputs)),
+        ("mewma", "f8", (count_numbers(outputs),)),
+        ("delays", DELAY, (max(alarms, 1),)),
+    ]
+    work = [
+        ("new", "f8", (3 + 2 * inputs + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
+        ("outputs", "f8", (5 * outputs + 1,)),  # its results
+        ("expected", "f8", (outputs,)),  # expected values of the prewhitening filters
+        ("e", "f8", (outputs,)),  # prewhitened residuals
+        ("columns", "f8", (_COLUMNS, outputs)),  # columns of a bank of charts, see `compiled_chart`
+        ("points", "f8", (max(alarms, 1), POINT)),  # points of the charts, one row an alarm
+    ]
+    settings = [
+        ("constants", CONSTANTS),
+        ("resolutions", "f8", (outputs,)),  # stated resolution of each output; 0 where it is learned
+        ("ranges", "f8", (inputs + outputs, 2)),  # smallest and largest value of each signal
+        ("rules", "i8", (max(alarms, 1), 2)),  # violating points that raise each alarm, mask of its window
+    ]
+    return FrameTypes(*(np.dtype(fields, align=True) for fields in (numbers, work, settings)))
 
 
 class Plant(NamedTuple):
-    """Numbers of a plant's stages, see `row_type`; within the compiled step."""
+    """Numbers of a plant's stages, see `FrameTypes`; within the compiled step."""
 
     head: Any
     inputs: Array
@@ -137,7 +123,7 @@ class Plant(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Results of a step, see `work_type`; within the compiled step."""
+    """Results of a step, see `FrameTypes`; within the compiled step."""
 
     new: Array
     outputs: Array
@@ -148,7 +134,7 @@ class Work(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """Constants of a step, see `settings_type`; within the compiled step."""
+    """Constants of a step, see `FrameTypes`; within the compiled step."""
 
     constants: Any
     resolutions: Array
@@ -167,9 +153,9 @@ def frame_of(sizes: tuple[int, int, int], scratch: Records, work: Records, setti
 
     Args:
         sizes: numbers of inputs, outputs and alarms.
-        scratch: numbers of one plant, shape (1,), see `row_type`.
-        work: shape (1,), see `work_type`.
-        settings: shape (1,), see `settings_type`.
+        scratch: numbers of one plant, shape (1,).
+        work: results, shape (1,).
+        settings: constants, shape (1,).
 
     Returns:
         the sizes, then the addresses of the fields.

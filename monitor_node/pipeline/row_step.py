@@ -27,17 +27,16 @@ from monitor_node.ingest.sampling import TOLERANCE, WHOLE
 from monitor_node.pipeline.row_frame import (
     CHARTS,
     POINT,
+    FrameTypes,
     Records,
     Words,
     frame_of,
+    frame_types,
     plant_at,
-    row_type,
     scratch_at,
     settings_at,
-    settings_type,
     words_of,
     work_at,
-    work_type,
 )
 from monitor_node.signal_checks.catalogue import CHECKS
 from monitor_node.signal_checks.stuck import is_stuck, take_reading
@@ -47,6 +46,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.codegen.numba_kernel import Entry, call_at, jit
 from reactorwatch.identification.black_box.filter import JUDGED, filter_row
+from reactorwatch.kalman.ekf import fill_row
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, row_function
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import ProcessModel
@@ -68,6 +68,9 @@ CHECKED = {"silence", "stuck", "spike", "range"}
 
 MOST_PERIODS = 1.99 - WHOLE
 """Between rows that are further apart one may be missing."""
+
+
+_fill_row = jit(fill_row)
 
 
 class FilterNumbers(NamedTuple):
@@ -97,17 +100,11 @@ def _predict(
 ) -> bool:
     """Filter a row that is not too far from the one before; returns True if all went well."""
     inputs, new, constants = p.inputs.size, work.new, settings.constants[0]
-    count = values.size - inputs
     spacing_min = time_min - p.head[0].time_min
     if not constants.spacing_min[0] < spacing_min <= constants.spacing_min[1]:
         return False
     step = 0.5 * spacing_min
-    for i in range(inputs):
-        new[i], new[inputs + i] = p.inputs[i], values[i]
-    row = 2 * inputs
-    new[row], new[row + 1], new[row + 2] = time_min, step, step
-    for i in range(count):
-        new[row + 3 + i], new[row + 3 + count + i] = values[inputs + i], GATE
+    _fill_row(new, p.inputs, values[:inputs], time_min, step, step, values[inputs:], GATE)
     first = parameters.size - variances.size
     for i in range(variances.size):
         parameters[first + i] = variances[i]
@@ -249,33 +246,16 @@ def step(
 _STEP = Entry(step)
 
 
-class RowFilter(NamedTuple):
-    """Filter of a step.
-
-    Attributes:
-        address: address of its machine code; 0: a black box.
-        belief: size of its belief.
-        parameters: parameters of the equations; none for a black box, whose constants are those of a plant.
-        constants: number of the other constants, see `FilterNumbers.variances`.
-        spacing_min: shortest and longest time between two rows, in minutes.
-        code: owner of the machine code.
-    """
-
-    address: int
-    belief: int
-    parameters: Array
-    constants: int
-    spacing_min: tuple[float, float]
-    code: CompiledFunction | None = None
-
-
 class RowStep:
     """The step for plants with certain settings.
 
     Args:
         config: settings of the plants' monitors.
-        row_filter: filter of the plants.
         ranges: ranges of each input and of each output.
+        code: machine code of the plants' filter; None: a black box.
+        parameters: parameters of the equations; none for a black box, whose constants are those of a plant.
+        filter_sizes: sizes of belief and variances of a filter, see `FilterNumbers`.
+        spacing_min: shortest and longest time between two rows, in minutes.
 
     Attributes:
         numbers_type: type of the numbers of a plant's stages.
@@ -286,16 +266,24 @@ class RowStep:
         after: belief of a filter, to work in.
     """
 
-    def __init__(self, config: MonitorConfig, row_filter: RowFilter, ranges: Sequence[SignalRange]) -> None:
+    def __init__(
+        self,
+        config: MonitorConfig,
+        ranges: Sequence[SignalRange],
+        code: CompiledFunction | None,
+        parameters: Array,
+        filter_sizes: tuple[int, int],
+        spacing_min: tuple[float, float],
+    ) -> None:
         kinds = [chart for chart, _ in alarm_names(config)]
         sizes = len(config.inputs), len(config.outputs), len(kinds)
-        self._code = row_filter.code
-        self.numbers_type = numbers_type(config)
-        self.filter_sizes = row_filter.belief, row_filter.constants
-        self._settings = np.zeros(1, settings_type(*sizes))
+        self._code = code  # it owns the memory
+        types = types_of(config)
+        self.numbers_type, self.filter_sizes = types.numbers, filter_sizes
+        self._settings = np.zeros(1, types.settings)
         p = self._settings[0]
         constants = p["constants"]
-        constants["filter_address"], constants["spacing_min"] = row_filter.address, row_filter.spacing_min
+        constants["filter_address"], constants["spacing_min"] = 0 if code is None else code.address, spacing_min
         constants["silence_limit"] = config.silence_periods
         p["resolutions"] = [config.resolution.get(name, 0.0) for name in config.outputs]
         p["ranges"] = [[item.lower, item.upper] for item in ranges]
@@ -303,12 +291,13 @@ class RowStep:
         for i, kind in enumerate(kinds):
             p["rules"][i] = (1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1)
         constants["reach"], constants["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
-        self.work = np.zeros(1, work_type(*sizes))
+        self.work = np.zeros(1, types.work)
         self._scratch = np.zeros(1, self.numbers_type)
         self.frame = frame_of(sizes, self._scratch, self.work, self._settings)
         self._numbers, self._words = self._scratch, words_of(self._scratch)
-        self.after: Array = np.empty(row_filter.belief)
-        self.parameters: Array = np.concatenate([row_filter.parameters, np.empty(row_filter.constants)])
+        belief, variances = filter_sizes
+        self.after: Array = np.empty(belief)
+        self.parameters: Array = np.concatenate([parameters, np.empty(variances)])
 
     @staticmethod
     def of(
@@ -326,10 +315,9 @@ class RowStep:
         if (model.input_names, model.output_names) != (config.inputs, config.outputs):
             return None
         outputs, states = len(config.outputs), len(model.states)
-        belief, spacing_min = states + states**2, (0.0, LONGEST_ROW_MIN)
-        code = compiled_filter(model)
-        row_filter = RowFilter(code.address, belief, model.values(), outputs + states, spacing_min, code)
-        return RowStep(config, row_filter, ranges or possible_ranges(config, model))
+        sizes, spacing_min = (states + states**2, outputs + states), (0.0, LONGEST_ROW_MIN)
+        known_ranges = ranges or possible_ranges(config, model)
+        return RowStep(config, known_ranges, compiled_filter(model), model.values(), sizes, spacing_min)
 
     @staticmethod
     def of_black_box(
@@ -346,7 +334,7 @@ class RowStep:
             return None
         belief, constants = reference.numbers
         shortest, longest = ((1.0 + sign * TOLERANCE) * reference.period_min for sign in (-1.0, 1.0))
-        return RowStep(config, RowFilter(0, belief.size, np.empty(0), constants.size, (shortest, longest)), ranges)
+        return RowStep(config, ranges, None, np.empty(0), (belief.size, constants.size), (shortest, longest))
 
     def update(self, numbers: Records, kalman: FilterNumbers, time_ns: int, time_min: float, values: Array) -> int:
         """Take a row of one plant through all stages; returns the verdict."""
@@ -365,9 +353,9 @@ def has_step(config: MonitorConfig) -> bool:
     return len(config.outputs) > 1 or Mewma.name not in config.charts
 
 
-def numbers_type(config: MonitorConfig) -> np.dtype[Any]:
-    """Type of the numbers of the stages of a plant with these settings."""
-    return row_type(len(config.inputs), len(config.outputs), len(alarm_names(config)))
+def types_of(config: MonitorConfig) -> FrameTypes:
+    """Types of the records of the step for a plant with these settings."""
+    return frame_types(len(config.inputs), len(config.outputs), len(alarm_names(config)))
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)

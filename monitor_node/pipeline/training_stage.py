@@ -1,7 +1,5 @@
 """Training of one plant, row by row, until there are rows enough to learn from."""
 
-from typing import NamedTuple
-
 from monitor_node.baseline.training import MOST_REFUSALS, Training, TrainingResult
 from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.config import MonitorConfig
@@ -14,13 +12,6 @@ from reactorwatch.stored_state import unpack_times
 
 TIMES_FEWEST = 2
 """Times the fewest rows of a training that a part of it needs to judge the rest: with fewer it is too rough."""
-
-
-class Learned(NamedTuple):
-    """A training and its result."""
-
-    rows: TrainingState
-    result: TrainingResult
 
 
 class TrainingStage:
@@ -89,8 +80,8 @@ class TrainingStage:
         self.training.add(row.time_ns, row.inputs, row.values)
         self._models.update(row, beside=False)
 
-    def finish(self, *, last_chance: bool | None = None) -> Learned:
-        """Learn from the rows.
+    def finish(self, *, last_chance: bool | None = None) -> tuple[TrainingState, TrainingResult]:
+        """Learn from the rows; returns them and the result.
 
         Args:
             last_chance: True to use the training even if it is disturbed; None: after some refusals.
@@ -99,10 +90,10 @@ class TrainingStage:
         is_last = self.refusals >= MOST_REFUSALS if last_chance is None else last_chance
         result = self.training.finish(last_chance=is_last)
         self.trained_rows = count
-        return Learned(rows, result)
+        return rows, result
 
-    def finish_early(self, *, times: int = 1) -> Learned:
-        """Learn from the rows so far.
+    def finish_early(self, *, times: int = 1) -> tuple[TrainingState, TrainingResult]:
+        """Learn from the rows so far; returns them and the result.
 
         Args:
             times: times the fewest rows that a training needs, for which this one must do.
@@ -116,7 +107,7 @@ class TrainingStage:
                 f"must have at least {fewest} rows with a value of each output to learn from, got "
                 f"{self.training.rows} rows"
             )
-        learned = self.finish(last_chance=True)
-        if learned.result.refused:
-            raise InputError(f"there is no output to watch: {learned.result.refused}")
-        return learned
+        rows, result = self.finish(last_chance=True)
+        if result.refused:
+            raise InputError(f"there is no output to watch: {result.refused}")
+        return rows, result

@@ -55,7 +55,7 @@ class SignalChecks:
         config: configuration of the monitor.
         board: the alarms of the plant; those of the signals are declared here.
         ranges: ranges of each input and of each output; None: no bounds are known.
-        numbers: numbers of the plant's stages, see `row_frame.row_type`; None: the checks have their own.
+        numbers: numbers of the plant's stages, see `row_frame.FrameTypes`; None: the checks have their own.
     """
 
     CHANCE_NAMES = tuple(check.name for check in CHECKS if check.can_be_false)

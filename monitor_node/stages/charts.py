@@ -257,7 +257,7 @@ class ChartWatch:
         return list(self._watched) == self.design.names and self._board.is_at_rest(self._alarms.values())
 
     def load(self, p: np.void) -> None:
-        """Fill the numbers of a plant, see `row_frame.row_type`, from the charts and their alarms."""
+        """Fill the numbers of a plant, see `row_frame.FrameTypes`, from the charts and their alarms."""
         for name, watched in self._watched.items():
             assert isinstance(watched.charts, _Banked | _OfAll)
             p[name] = watched.charts.numbers

@@ -108,9 +108,9 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
     return settings
 
 
-def seal_state(state: MonitorState) -> bytes:
-    """Serialise and seal a state."""
-    return SEAL.close(state.to_bytes())
+def seal_state(state: MonitorState, settings: dict[str, Any]) -> bytes:
+    """Serialise and seal a state, with the settings of its training (see `learning_settings`)."""
+    return SEAL.close(msgspec.structs.replace(state, settings=settings).to_bytes())
 
 
 def open_state(data: bytes, settings: dict[str, Any]) -> MonitorState:

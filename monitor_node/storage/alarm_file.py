@@ -1,6 +1,5 @@
 """File of the alarms' state, for a restart of the monitor."""
 
-import os
 from pathlib import Path
 
 from monitor_node.alarms.annunciator import Annunciator
@@ -8,7 +7,7 @@ from monitor_node.core import Monitor
 from monitor_node.state.seal import ForeignFileError, Seal
 from monitor_node.storage.kept_aside import DAMAGED, keep_aside, read_regular
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write, is_disk_full
+from reactorwatch.records.atomic import is_disk_full, write_durably
 
 SEAL = Seal(b"reactorwatch alarms", 1, "alarm state")
 
@@ -94,10 +93,7 @@ class AlarmFile:
         if self._stored == (board, board.changes):
             return
         try:
-            with atomic_write(self._path) as temporary, temporary.open("wb") as file:
-                file.write(SEAL.close(board.to_bytes()))
-                file.flush()
-                os.fsync(file.fileno())
+            write_durably(self._path, SEAL.close(board.to_bytes()))
         except OSError as error:
             raise InputError(f"alarm_state_file {self._path}: cannot be written: {error.strerror}") from error
         self._stored = board, board.changes

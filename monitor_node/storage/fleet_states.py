@@ -11,7 +11,6 @@ left alone, and nothing is stored of its plant.
 """
 
 import contextlib
-import os
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -21,7 +20,7 @@ from typing import TypeAlias
 from monitor_node.storage.claims import Claims
 from monitor_node.storage.kept_aside import find_kept_aside, keep_aside, put_back, read_regular
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write, is_disk_full
+from reactorwatch.records.atomic import atomic_write, is_disk_full, write_durably
 
 ENDING = ".state"
 
@@ -234,12 +233,8 @@ class FleetStates:
                 return f"state {path}: cannot be used and is not overwritten; move it away"
             self._protected.discard(plant)
         try:
-            with atomic_write(path) as temporary:
-                with temporary.open("wb") as file:
-                    file.write(state)
-                    file.flush()
-                    os.fsync(file.fileno())
-                self._check_mark(plant)  # only now: a slow disk or a stall may come between
+            # The mark is checked just before the file is replaced: a slow disk or a stall may come between.
+            write_durably(path, state, lambda: self._check_mark(plant))
             self._update_mark(plant)
         except _WrittenElsewhereError:
             self._lost.append(plant)

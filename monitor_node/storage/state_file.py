@@ -4,7 +4,6 @@ It is written under a temporary name and renamed, so that a kill leaves the file
 state is kept aside, and used again when it fits (see `kept_aside`). A file that is no state is refused and left alone.
 """
 
-import os
 from pathlib import Path
 
 from monitor_node.core import Monitor
@@ -12,7 +11,7 @@ from monitor_node.state.monitor_state import OtherSettingsError
 from monitor_node.state.seal import ForeignFileError
 from monitor_node.storage.kept_aside import DAMAGED, OTHER_SETTINGS, find_kept_aside, keep_aside, put_back, read_regular
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write, is_disk_full
+from reactorwatch.records.atomic import is_disk_full, write_durably
 
 
 class StateFile:
@@ -82,10 +81,7 @@ class StateFile:
 
     def _write(self) -> None:
         try:
-            with atomic_write(self._path) as temporary, temporary.open("wb") as file:
-                file.write(self._monitor.to_bytes())
-                file.flush()
-                os.fsync(file.fileno())
+            write_durably(self._path, self._monitor.to_bytes())
         except InputError:
             self._monitor.stats.not_stored += 1
             raise

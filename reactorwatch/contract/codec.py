@@ -6,7 +6,7 @@ many of them as an empty message.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias, get_args
+from typing import NamedTuple, TypeAlias, TypeVar, get_args
 
 from google.protobuf.message import DecodeError as ProtobufDecodeError
 from google.protobuf.message import Message
@@ -64,6 +64,9 @@ class Encoded(NamedTuple):
     received_ns: int = 0
 
 
+Kind = TypeVar("Kind", bound=Message)
+
+
 class DecodeError(ValueError):
     """Bytes that do not match their encoding. `reason` is a word to count by."""
 
@@ -119,3 +122,12 @@ def decode(payload: bytes, encoding: str) -> Message:
     except ProtobufDecodeError as error:
         name = encoding.removeprefix(PREFIX)
         raise DecodeError("payload", f"{len(payload)} bytes are not a {name}: {error}") from error
+
+
+def decode_as(message: Encoded, kind: type[Kind]) -> Kind | None:
+    """Decode a message of a type; None if it is of another type, or cannot be decoded."""
+    try:
+        body = decode(message.payload, message.encoding)
+    except DecodeError:
+        return None
+    return body if isinstance(body, kind) else None

@@ -34,6 +34,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from math import ceil, inf, isfinite, nan
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -60,6 +61,26 @@ LONGEST_GAP_MIN = 30.0
 
 LEAST_PROCESS_SD = 1e-6
 """Relative to the scale of a state. Without any process noise its covariance would underflow."""
+
+
+def fill_row(
+    new: Any,
+    before: Sequence[float] | Array,
+    inputs: Sequence[float] | Array,
+    time_min: float,
+    first_min: float,
+    second_min: float,
+    measured: Sequence[float] | Array,
+    limit: float,
+) -> None:
+    """Fill the `new` values of `ekf_step.row_function` in place, with one limit for all outputs; kernels compile it."""
+    n_u, n_y = len(inputs), len(measured)
+    for i in range(n_u):
+        new[i], new[n_u + i] = before[i], inputs[i]
+    row = 2 * n_u
+    new[row], new[row + 1], new[row + 2] = time_min, first_min, second_min
+    for i in range(n_y):
+        new[row + 3 + i], new[row + 3 + n_y + i] = measured[i], limit
 
 
 class NoiseLevels(msgspec.Struct, frozen=True):
@@ -124,10 +145,9 @@ class Filter:
         self._row = ArrayFunction(row_function(model))
         self._belief, new, self._constants = (item[0] for item in self._row.arguments)
         after, outputs = (item[0] for item in self._row.results)
-        self._belief_view, self._new, self._after, self._outputs = (
-            memoryview(item) for item in (self._belief, new, after, outputs)
-        )
-        self._pack, self._unpack = struct.Struct(f"{new.size}d").pack_into, struct.Struct(f"{outputs.size}d").unpack
+        self._belief_view, self._after, self._outputs = (memoryview(item) for item in (self._belief, after, outputs))
+        self._new = cast("memoryview[float]", memoryview(new))
+        self._unpack = struct.Struct(f"{outputs.size}d").unpack
         self._break_indices = [model.parameter_names.index(name) for name in model.breakpoints]
         self._time_min: float | None = None
         self._lasting, self._learned = list(model.constant_states), False
@@ -245,8 +265,10 @@ class Filter:
             steps = (0.0, 0.0)
         elif 2.0 * step > LONGEST_ROW_MIN or self._breaks:
             steps = self._steps(before, time_min, step)
-        limits = [inf if follow else gate for follow in accept] if True in accept else [gate] * n
-        self._pack(self._new, 0, *self._inputs, *inputs, time_min, *steps, *measured, *limits)
+        fill_row(self._new, self._inputs, inputs, time_min, *steps, measured, gate)
+        if True in accept:
+            for i, follow in enumerate(accept, -n):
+                self._new[i] = inf if follow else gate
         self._row()
         outputs = self._unpack(self._outputs)
         if not outputs[-1]:

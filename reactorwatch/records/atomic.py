@@ -2,7 +2,7 @@
 
 import glob
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from errno import EDQUOT, ENOSPC
 from pathlib import Path
@@ -39,6 +39,25 @@ def atomic_write(path: Path) -> Iterator[Path]:
         for rest in temporary.parent.glob(f"{glob.escape(temporary.name)}*"):  # a writer may add a suffix
             rest.unlink()
         raise
+
+
+def write_durably(path: Path, data: bytes, check: Callable[[], None] = lambda: None) -> None:
+    """Replace a file atomically; it is on the disk when this returns.
+
+    Args:
+        path: the file.
+        data: its new bytes.
+        check: called just before the file is replaced; if it raises, `path` is unchanged.
+
+    Raises:
+        InputError: see `atomic_write`.
+    """
+    with atomic_write(path) as temporary:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        check()
 
 
 @contextmanager

@@ -11,8 +11,8 @@ CUSUM and MEWMA charts, as by default. Others keep their monitors.
 |---|---|
 | `record` | type of a plant's record, beside the numbers of its stages |
 | `samples` | alignment of samples, compiled |
-| `rows` | rows through the step and into the ring, compiled |
-| `ring` | newest rows, compressed without loss |
+| `rows` | rows through the step, compiled |
+| `ring` | newest rows, compressed without loss, compiled |
 | `pending` | conversion of the alignment's state |
 | `conversion` | conversion of a monitor's state |
 | `array` | the arrays |

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from monitor_node.fleet.packed.conversion import Conversion, Rest
 from monitor_node.fleet.packed.record import Records
-from monitor_node.fleet.packed.ring import Kept, NewestRows, newest_rows, row_bytes
+from monitor_node.fleet.packed.ring import NewestRows, keep_rows, newest_rows, row_bytes
 from monitor_node.pipeline.row_step import FilterNumbers
 from reactorwatch.contract import keys
 from reactorwatch.records.record import NEVER_NS
@@ -90,24 +90,9 @@ class PlantArray:
             self._occupied = np.array(sorted(self.of.values()), dtype=np.int64)
         return self._occupied
 
-    def keep(self, slot: int, spacings: NDArray[np.int32], kept: Kept) -> None:
-        """Fill the rings of a new plant, and the fields of its record that describe them."""
-        p, count = self.plants[slot], spacings.size
-        p["kept"], p["head"] = count, count % self._form.keeps
-        p["levels"], p["level_rows"] = kept.levels, kept.level_rows
-        p["reference"][: kept.reference.size] = kept.reference
-        self.ring[slot, :count] = kept.rows
-        _write(self.times[slot, :count], spacings)
-        _write(self.others[slot, : len(kept.others)], kept.others)
-
-    def copy(self, of: int, slot: int) -> None:
-        """Fill the arrays of a slot with those of another."""
-        self.plants[slot], self.ring[slot] = self.plants[of], self.ring[of]
-        self.numbers[slot] = self.numbers[of]
-        self.kalman.belief[slot], self.kalman.variances[slot] = self.kalman.belief[of], self.kalman.variances[of]
-        self.health_due_ns[slot] = self.health_due_ns[of]
-        _write(self.times[slot], self.times[of])
-        _write(self.others[slot], self.others[of])
+    def keep(self, slot: int, rows: NewestRows, usual_ns: int) -> bool:
+        """Fill the rings of a new plant; returns False if they cannot keep its rows, see `keep_rows`."""
+        return keep_rows(self.plants, slot, self.times[slot], self.ring[slot], self.others[slot], rows, usual_ns)
 
     def rest(self, slot: int) -> Rest:
         """State of a plant beside its numbers."""
@@ -140,12 +125,6 @@ class PlantArray:
         due_ns = np.full(plants, NEVER_NS)
         due_ns[:before] = self.health_due_ns[:before]
         self.health_due_ns = due_ns
-
-
-def _write(into: NDArray[Any], values: NDArray[Any]) -> None:
-    """Write values that differ: pages that were never written take no memory."""
-    changed = np.nonzero(into != values)
-    into[changed] = values[changed]
 
 
 def _zeros(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:

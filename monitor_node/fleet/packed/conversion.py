@@ -148,11 +148,7 @@ class Conversion:
             record: filled, shape (1,).
         """
         pipeline = monitor.pipeline
-        if monitor.is_replaying_history or monitor.phase != "watching" or not pipeline.is_normal:
-            return None
-        if pipeline.pending_commands:
-            return None
-        if None in monitor.silence.of_plant.receipts_ns or monitor.converts_samples:
+        if not monitor.is_normal or None in monitor.silence.of_plant.receipts_ns:
             return None
         state = monitor.state
         watched, alignment = state.watch.watched, state.alignment

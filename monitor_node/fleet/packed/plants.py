@@ -12,7 +12,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.packed.array import PlantArray
 from monitor_node.fleet.packed.conversion import Conversion
-from monitor_node.fleet.packed.ring import kept_spacings, kept_values
+from monitor_node.fleet.packed.ring import NewestRows
 from monitor_node.fleet.packed.rows import NEW_MINUTE, step_rows
 from monitor_node.fleet.packed.samples import find_deadlines, take_samples
 from monitor_node.health.message import NODE, health_message
@@ -20,7 +20,7 @@ from monitor_node.ingest.alignment import Counts, Row
 from monitor_node.ingest.receive_stats import STALL_NS, ReceiveStats
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE, USABLE
 from monitor_node.pipeline.row_frame import words_of
-from monitor_node.state.monitor_state import learning_settings, seal_state
+from monitor_node.state.monitor_state import MonitorState, learning_settings, seal_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Sample
@@ -35,20 +35,6 @@ LOOK_AGAIN_NS = 250_000_000
 """Longest time between two searches for plants without data; samples since may have made deadlines earlier."""
 
 _SAMPLE = encoding_of(Sample)
-
-
-class Taken(NamedTuple):
-    """Result for some messages.
-
-    Attributes:
-        publications: publications because of them.
-        others: messages that were not processed, in order: of other plants, or of plants that were unpacked.
-        given: monitors of the plants that were unpacked; they have processed rows up to the first of `others`.
-    """
-
-    publications: list[Publication]
-    others: list[Encoded]
-    given: dict[str, Monitor]
 
 
 class PackedPlants:
@@ -81,11 +67,12 @@ class PackedPlants:
         return list(self._slots.of)
 
     def prepare(self) -> None:
-        """Compile the machine code of the first use: on a new machine that takes seconds."""
+        """Compile the machine code of the first use, before there are plants: on a new machine that takes seconds."""
         nobody, now = np.array([-1], np.int32), np.zeros(1, np.int64)
         rows, _ = self._align(nobody, parse_samples([b""]), now, 0)
         self._step_rows(rows, [])
         self._silent_from_ns()
+        self._slots.keep(0, NewestRows([], np.empty((0, self._form.columns))), 0)
 
     # --- coming and going ------------------------------------------------------------------------------------
 
@@ -101,19 +88,15 @@ class PackedPlants:
             return False
         rest, rows = found
         usual_ns = round(float(monitor.pipeline.numbers[0]["period_ns"][0]))
-        spacings = kept_spacings(rows.times_ns, usual_ns)
-        values = kept_values(rows.values, self._form.inputs)
-        if spacings is None or values is None:
-            return False
         slot = self._slots.take(plant)
         self._slots.plants[slot] = self._scratch[0]
+        if not self._slots.keep(slot, rows, usual_ns):
+            self._slots.leave(plant)
+            return False
         numbers, kalman = monitor.pipeline.numbers
         self._slots.numbers[slot] = numbers[0]
         self._slots.kalman.belief[slot], self._slots.kalman.variances[slot] = kalman.belief[0], kalman.variances[0]
         self._slots.health_due_ns[slot] = self._scratch[0]["health_due_ns"]
-        p = self._slots.plants[slot]
-        p["unit_ns"], p["usual_ns"] = spacings[0], usual_ns
-        self._slots.keep(slot, spacings[1], values)
         shared = self._shared.setdefault
         self._slots.rests[slot] = rest._replace(
             units=shared(rest.units, rest.units),
@@ -124,11 +107,15 @@ class PackedPlants:
 
     def state_of(self, plant: str) -> bytes:
         """Serialised state of a plant, as its monitor would store it."""
-        slot = self._slots.of[plant]
-        rest, rows = self._slots.rest(slot), self._slots.newest(slot)
-        p, numbers, belief = self._slots.plants[slot], self._slots.numbers[slot], self._slots.kalman.belief[slot]
-        state = self._form.promote(plant, p, numbers, belief, rest, rows, [])
-        return seal_state(msgspec.structs.replace(state, settings=self._settings | {"plant": plant}))
+        return seal_state(self._promote(plant, []), self._settings | {"plant": plant})
+
+    def _promote(self, plant: str, waiting: list[Row]) -> MonitorState:
+        """State of a monitor of a packed plant, with rows that were aligned and are not processed yet."""
+        slots, slot = self._slots, self._slots.of[plant]
+        numbers, belief, times_ns = slots.numbers[slot], slots.kalman.belief[slot], [row.time_ns for row in waiting]
+        return self._form.promote(
+            plant, slots.plants[slot], numbers, belief, slots.rest(slot), slots.newest(slot), times_ns
+        )
 
     def received_count(self, plant: str) -> int:
         """Number of messages of a plant."""
@@ -142,28 +129,13 @@ class PackedPlants:
         """Unpack a plant; returns its monitor."""
         return self._give(plant, [])
 
-    def copy(self, plant: str, name: str) -> None:
-        """Add a copy of a plant, for trials with many plants.
-
-        Args:
-            plant: a packed plant that never had an alarm.
-            name: name of the copy.
-        """
-        of, slot = self._slots.of[plant], self._slots.take(name)
-        slots = self._slots
-        slots.copy(of, slot)
-        rest = slots.rest(of)
-        slots.rests[slot] = rest._replace(runs=bytes(bytearray(rest.runs)))
-
     def _give(self, plant: str, waiting: list[Row]) -> Monitor:
         slot = self._slots.of[plant]
-        p, rows = self._slots.plants[slot], self._slots.newest(slot)
+        p = self._slots.plants[slot]
         monitor = Monitor(msgspec.structs.replace(self._config, plant=plant), 0, points=False, model=self._model)
         monitor.failures.passes = ()
         try:
-            numbers, belief, rest = self._slots.numbers[slot], self._slots.kalman.belief[slot], self._slots.rest(slot)
-            times_ns = [row.time_ns for row in waiting]
-            monitor.restore(self._form.promote(plant, p, numbers, belief, rest, rows, times_ns))
+            monitor.restore(self._promote(plant, waiting))
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
             monitor.failures.add("promotion", error, "the plant is learned again")
         monitor.on_history_end()
@@ -176,14 +148,21 @@ class PackedPlants:
 
     # --- samples ---------------------------------------------------------------------------------------------
 
-    def on_messages(self, messages: list[Encoded], now_ns: int) -> Taken:
-        """Process samples of packed plants."""
+    def on_messages(
+        self, messages: list[Encoded], now_ns: int
+    ) -> tuple[list[Publication], list[Encoded], dict[str, Monitor]]:
+        """Process samples of packed plants.
+
+        Returns:
+            Publications because of them; messages that were not processed, in order: of other plants, or of plants
+            that were unpacked; monitors of the latter, which have processed rows up to the first of these messages.
+        """
         code_of = self._slots.codes.get
         codes = np.array(
             [code_of(key, -1) if encoding == _SAMPLE else -1 for key, _, encoding, _ in messages], dtype=np.int32
         )
         if codes.max(initial=-1) < 0:
-            return Taken([], messages, {})
+            return [], messages, {}
         samples = parse_samples([payload if len(payload) <= LARGEST_SAMPLE else b"" for _, payload, _, _ in messages])
         received_ns = np.fromiter([came_ns for _, _, _, came_ns in messages], np.int64, len(messages))
         rows, others = self._align(codes, samples, received_ns, now_ns)
@@ -197,7 +176,7 @@ class PackedPlants:
             plant = self._slots.names[slot]
             monitor = given[plant] = self._give(plant, left)
             publications += monitor.on_rows(left)
-        return Taken(publications, [messages[place] for place in others.tolist()], given)
+        return publications, [messages[place] for place in others.tolist()], given
 
     def _align(
         self, codes: NDArray[np.int32], samples: SampleColumns, received_ns: NDArray[np.int64], now_ns: int

@@ -76,7 +76,7 @@ def record_type(inputs: int, outputs: int, states: int) -> np.dtype[Any]:
         ("head", np.int32, ()),  # where the next one goes
         ("unit_ns", i, ()),  # unit of the kept spacings
         ("usual_ns", i, ()),  # spacing that is kept as 0
-        ("reference", i, (outputs,)),  # see `ring.Kept`
+        ("reference", i, (outputs,)),  # bits of values that outputs had, see `ring`
         ("levels", i, (inputs, LEVELS)),
         ("level_rows", np.int16, (inputs, LEVELS)),
     ]

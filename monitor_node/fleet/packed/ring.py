@@ -5,7 +5,7 @@ The 600 rows for isolation are most of the memory of a plant.
 The ring holds when each row came, as the spacing before it: in a unit in which all are whole, and less the usual one,
 in 32 bits. If that does not fit, as when a plant whose times are in nanoseconds was away for more than two seconds, it
 has a monitor until the ring is past it. Of a plant whose rows come evenly all are zero, and memory that never held
-anything else takes no room (see `slots`).
+anything else takes no room (see `array`).
 
 What was measured is kept in seven bytes: the 64 bits of its number, less those of a value that the signal had before.
 That fits as long as values are of one sign and within a factor of 200 of that one, and it fits for zero, which has a
@@ -16,11 +16,12 @@ kept rows have, as far as there are no more than `LEVELS`. One that is none of t
 it is, in an array that takes memory only where that happened.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from monitor_node.fleet.packed.record import LEVELS, Array, Bytes, Ints, Places
+from monitor_node.fleet.packed.record import LEVELS, Array, Bytes, Ints, Places, Records
+from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.records.record import MINUTE_NS
 
 UNITS_NS = (1_000_000, 1_000, 1)
@@ -43,39 +44,8 @@ class NewestRows(NamedTuple):
     values: Array
 
 
-def kept_spacings(times_ns: list[int], usual_ns: int) -> tuple[int, Places] | None:
-    """Spacings of rows as the ring keeps them, and their unit; None if they do not fit.
-
-    Args:
-        times_ns: times of the rows; before the first the spacing is unknown, and kept as the usual one.
-        usual_ns: usual spacing.
-    """
-    over = np.diff(times_ns, prepend=times_ns[0] - usual_ns) - usual_ns
-    unit_ns = next(unit for unit in UNITS_NS if not np.any(over % unit))
-    kept = over // unit_ns
-    return None if np.any(np.abs(kept) >= 2**31) else (unit_ns, kept.astype(np.int32))
-
-
-class Kept(NamedTuple):
-    """Values as they are kept; n rows of u inputs and s - u outputs.
-
-    Attributes:
-        rows: the level of each input, then the outputs, shape (n, bytes).
-        reference: bits of the values from which outputs are kept as differences, shape (s - u,).
-        levels: bits of the values of each input, shape (u, LEVELS).
-        level_rows: number of rows at each of them, shape (u, LEVELS).
-        others: bits of each input where it is at none of them, shape (n, u).
-    """
-
-    rows: Bytes
-    reference: Ints
-    levels: Ints
-    level_rows: Places
-    others: Ints
-
-
 def row_bytes(columns: int, inputs: int) -> int:
-    """Size of a row in bytes.
+    """Size of a row in bytes: the level of each input, then the outputs.
 
     Args:
         columns: number of its values; 0 if they are not kept.
@@ -84,50 +54,101 @@ def row_bytes(columns: int, inputs: int) -> int:
     return inputs + VALUE_BYTES * (columns - inputs) if columns else 0
 
 
-def kept_values(values: Array, inputs: int) -> Kept | None:
-    """Values as they are kept; None if they do not fit.
+@jit
+def _level(p: Any, i: int, bits: int) -> int:
+    """Index of the level that an input is at, perhaps one that was unused; `LEVELS` if there is none."""
+    free = LEVELS
+    for level in range(LEVELS):
+        if p.level_rows[i, level] == 0:
+            free = min(free, level)
+        elif p.levels[i, level] == bits:
+            return level
+    if free < LEVELS:
+        p.levels[i, free] = bits
+    return free
+
+
+@jit
+def _keep(p: Any, row: Bytes, others: Ints, bits: Ints) -> None:
+    inputs = others.shape[1]
+    for i in range(inputs):
+        if p.kept == others.shape[0] and row[i] < LEVELS:
+            p.level_rows[i, row[i]] -= 1  # of the row that goes
+        level = _level(p, i, bits[i])
+        row[i] = level
+        if level < LEVELS:
+            p.level_rows[i, level] += 1
+        else:
+            others[p.head, i] = bits[i]
+    for k in range(bits.size - inputs):
+        code = bits[inputs + k] - p.reference[k] if bits[inputs + k] else ZERO
+        for byte in range(VALUE_BYTES):
+            row[inputs + VALUE_BYTES * k + byte] = code >> 8 * byte & 0xFF
+
+
+@jit
+def fits(p: Any, spacing_ns: int, bits: Ints, is_kept: bool) -> bool:
+    """True if the ring of a plant can keep a row.
 
     Args:
-        values: inputs first, shape (rows, signals).
-        inputs: number of inputs.
+        p: record of the plant.
+        spacing_ns: time since the row before.
+        bits: values of the row as bits, the inputs first.
+        is_kept: True if values are kept.
     """
-    bits = np.ascontiguousarray(values).view(np.int64)
-    levels, level_rows = np.zeros((inputs, LEVELS), np.int64), np.zeros((inputs, LEVELS), np.int32)
-    if not values.shape[1]:
-        none = np.empty((len(values), 0), np.uint8)
-        return Kept(none, bits[0, :0], levels, level_rows, np.empty((0, inputs), np.int64))
-    measured = bits[:, inputs:]
-    last = [column[np.flatnonzero(column)[-1:]] for column in measured.T]
-    reference = np.array([each[0] if each.size else 0 for each in last], dtype=np.int64)
-    codes = np.where(measured == 0, ZERO, measured - reference)
-    if np.any((measured != 0) & ((codes <= ZERO) | (codes >= -ZERO))):
-        return None
-    whole = np.ascontiguousarray(codes.astype("<i8")).view(np.uint8).reshape(*codes.shape, 8)
-    at = np.empty((len(values), inputs), np.uint8)
-    for i in range(inputs):
-        found, which, counts = np.unique(bits[:, i], return_inverse=True, return_counts=True)
-        most = np.argsort(-counts, kind="stable")[:LEVELS]
-        levels[i, : most.size], level_rows[i, : most.size] = found[most], counts[most]
-        index = np.full(found.size, LEVELS, np.uint8)
-        index[most] = np.arange(most.size)
-        at[:, i] = index[which]
-    rows = np.column_stack([at, whole[:, :, :VALUE_BYTES].reshape(len(values), -1)])
-    return Kept(rows, reference, levels, level_rows, np.where(at == LEVELS, bits[:, :inputs], 0))
+    over_ns = spacing_ns - p.usual_ns
+    found = over_ns % p.unit_ns == 0 and abs(over_ns // p.unit_ns) < 2**31
+    inputs = bits.size - p.reference.size
+    for i in range(p.reference.size if is_kept else 0):
+        off = bits[inputs + i] - p.reference[i]
+        found = found and (bits[inputs + i] == 0 or ZERO < off < -ZERO)
+    return bool(found)
 
 
-def values_of(kept: Kept) -> Array:
-    """The values that are kept, shape (rows, signals)."""
-    rows, count = kept.rows, len(kept.levels)
-    if not rows.shape[1]:
-        return np.empty((len(rows), 0))
-    whole = np.zeros((len(rows), (rows.shape[1] - count) // VALUE_BYTES, 8), np.uint8)
-    whole[:, :, 8 - VALUE_BYTES :] = rows[:, count:].reshape(len(rows), -1, VALUE_BYTES)
-    codes = whole.view("<i8")[:, :, 0] >> 8 * (8 - VALUE_BYTES)  # with its sign
-    measured = np.where(codes == ZERO, 0, codes + kept.reference)
-    at = rows[:, :count]
-    held = kept.levels[np.arange(count), np.minimum(at, LEVELS - 1)]
-    inputs = np.where(at < LEVELS, held, kept.others)
-    return np.ascontiguousarray(np.column_stack([inputs, measured])).view(np.float64)
+@jit
+def add_row(p: Any, times: Places, ring: Bytes, others: Ints, spacing_ns: int, bits: Ints) -> None:
+    """Put a row that fits into the ring of a plant; arguments as for `fits` and `newest_rows`."""
+    over = (spacing_ns - p.usual_ns) // p.unit_ns
+    if times[p.head] != over:  # or a page of zeros would take memory
+        times[p.head] = over
+    if ring.shape[1] > 0:
+        _keep(p, ring[p.head], others, bits)
+    p.head = p.head + 1 if p.head + 1 < times.size else 0
+    p.kept = min(p.kept + 1, times.size)
+
+
+@jit
+def _add_rows(plants: Records, slot: int, times: Places, ring: Bytes, others: Ints, times_ns: Ints, bits: Ints) -> bool:
+    p = plants[slot]
+    for k in range(times_ns.size):
+        spacing_ns = times_ns[k] - times_ns[k - 1] if k else p.usual_ns
+        if not fits(p, spacing_ns, bits[k], ring.shape[1] > 0):
+            return False
+        add_row(p, times, ring, others, spacing_ns, bits[k])
+    return True
+
+
+def keep_rows(
+    plants: Records, slot: int, times: Places, ring: Bytes, others: Ints, rows: NewestRows, usual_ns: int
+) -> bool:
+    """Fill the empty ring of a plant; returns False if it cannot keep the rows.
+
+    Args:
+        plants: records.
+        slot: index of the plant.
+        times: see `newest_rows`.
+        ring: see `newest_rows`.
+        others: see `newest_rows`.
+        rows: rows of the plant. The spacing before the first is unknown, and kept as the usual one.
+        usual_ns: usual spacing.
+    """
+    p, times_ns = plants[slot], np.array(rows.times_ns, np.int64)
+    bits = np.ascontiguousarray(rows.values).view(np.int64)
+    over_ns = np.diff(times_ns) - usual_ns
+    p["usual_ns"], p["unit_ns"] = usual_ns, next(unit for unit in UNITS_NS if not np.any(over_ns % unit))
+    for k, column in enumerate(bits[:, others.shape[1] :].T):
+        p["reference"][k] = column[column != 0][-1:].sum()  # the newest that is not 0
+    return bool(_add_rows(plants, slot, times, ring, others, times_ns, bits))
 
 
 def newest_rows(p: np.void, last_ns: int, times: Places, ring: Bytes, others: Ints) -> NewestRows:
@@ -138,15 +159,26 @@ def newest_rows(p: np.void, last_ns: int, times: Places, ring: Bytes, others: In
         last_ns: time of the newest row.
         times: spacings, shape (rows kept,).
         ring: values, shape (rows kept, bytes).
-        others: inputs at no level, shape (rows kept, inputs).
+        others: bits of the inputs at no level, shape (rows kept, inputs).
     """
     count, keeps = int(p["kept"]), len(times)
     order = (int(p["head"]) - count + np.arange(count)) % keeps
     over = times[order].astype(np.int64) * p["unit_ns"] + p["usual_ns"]
-    at_no_level = others[order] if others.size else others
-    kept = Kept(ring[order], p["reference"], p["levels"], p["level_rows"], at_no_level)
     since = np.concatenate([[0], np.cumsum(over[:0:-1])])  # from each row to the newest, newest first
-    return NewestRows((last_ns - since)[::-1].tolist(), values_of(kept))
+    values = _values(p, ring[order], others[order]) if ring.shape[1] else np.empty((count, 0))
+    return NewestRows((last_ns - since)[::-1].tolist(), values)
+
+
+def _values(p: np.void, rows: Bytes, others: Ints) -> Array:
+    """Values of rows, shape (rows, signals)."""
+    inputs = others.shape[1]
+    whole = np.zeros((len(rows), (rows.shape[1] - inputs) // VALUE_BYTES, 8), np.uint8)
+    whole[:, :, 8 - VALUE_BYTES :] = rows[:, inputs:].reshape(len(rows), -1, VALUE_BYTES)
+    codes = whole.view("<i8")[:, :, 0] >> 8 * (8 - VALUE_BYTES)  # with its sign
+    measured = np.where(codes == ZERO, 0, codes + p["reference"])
+    at = rows[:, :inputs]
+    held = p["levels"][np.arange(inputs), np.minimum(at, LEVELS - 1)]
+    return np.ascontiguousarray(np.column_stack([np.where(at < LEVELS, held, others), measured])).view(np.float64)
 
 
 def times_ns_of(times_min: Array) -> list[int]:

@@ -13,8 +13,7 @@ from monitor_node.fleet.packed.record import Array, Ints, Places, Records
 from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS
 from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_VALUE
 from monitor_node.ingest.sampling import learn_spacing
-from monitor_node.ingest.sequence_check import ALIKE, TOLERANCE
-from monitor_node.ingest.sequence_check import DEVIATIONS as RUN_DEVIATIONS
+from monitor_node.ingest.sequence_check import LIKE, UNLIKE, compare_spacing
 from monitor_node.ingest.sequence_check import MEMORY as RUN_MEMORY
 from monitor_node.signal_checks.timeout import LEARN_FROM, receive, timeout_ns
 from reactorwatch.codegen.numba_kernel import jit
@@ -22,16 +21,12 @@ from reactorwatch.codegen.numba_kernel import jit
 
 @jit
 def _follows(p: Any, signal: int, time_ns: int) -> bool:
-    """Accept the sample with the next number into the run of its signal; as `SequenceCheck` if none is held."""
-    spacing_ns = float(time_ns - p.left_ns)
-    usual = p.runs[signal]
-    off = abs(spacing_ns - usual.mean_ns)
-    if off <= ALIKE * usual.mean_ns:
-        return True
-    if off > TOLERANCE * usual.mean_ns + RUN_DEVIATIONS * usual.deviation_ns:
-        return False
-    learn_spacing(usual, spacing_ns, RUN_MEMORY)
-    return True
+    """Accept the sample with the next number into the run of its signal; as `SequenceCheck.accept_next`."""
+    usual, spacing_ns = p.runs[signal], float(time_ns - p.left_ns)
+    found = compare_spacing(usual, spacing_ns)
+    if found == LIKE:
+        learn_spacing(usual, spacing_ns, RUN_MEMORY)
+    return bool(found != UNLIKE)
 
 
 @jit

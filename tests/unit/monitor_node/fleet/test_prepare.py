@@ -8,6 +8,7 @@ import numba
 import pytest
 
 from monitor_node.fleet.packed import plants
+from monitor_node.fleet.plant_kinds import ANY, PlantKind
 from monitor_node.fleet.watched_plants import WatchedPlants
 from reactorwatch.contract import sample_bytes
 from reactorwatch.identification import information
@@ -34,7 +35,7 @@ def test_what_is_called_while_plants_are_watched_was_compiled_before(monkeypatch
             return kernel(*arguments)
 
         monkeypatch.setattr(module, name, noting)
-    WatchedPlants(QUICK, 0, None, points=False).prepare()
+    WatchedPlants([PlantKind(ANY, QUICK, None)], 0, points=False).prepare()
     before = {name: set(found) for name, found in types.items()}
     watching = fleet()
     messages = row_by_row([run_of("a", 1), run_of("b", 2)])

@@ -11,7 +11,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.monitor import FleetMonitor
-from monitor_node.fleet.node import load_kinds
+from monitor_node.fleet.plant_kinds import load_kinds
 from monitor_node.fleet.sharding import WHOLE, ShardGroup
 from monitor_node.watched_process import load_process
 from plant_node.config import PlantConfig

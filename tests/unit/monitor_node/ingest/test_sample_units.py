@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.sample_units import make_sample_units
+from monitor_node.ingest.sample_units import SampleUnits
 from monitor_node.replay.backtest import run
 from monitor_node.watched_process import watch_process
 from reactorwatch.contract.codec import encode
@@ -32,16 +32,16 @@ DECLARED = {"qc": "l/h", "C": "mol/m^3", "T": "degC"}
 def test_a_sample_is_converted_to_the_unit_of_the_equations(
     unit: str, value: float, expected: tuple[float, str]
 ) -> None:
-    units = make_sample_units({"T": "degC"}, {"T": "K"})
+    units = SampleUnits({"T": "degC"}, {"T": "K"})
     assert units.convert("T", unit, value) == expected
     assert units.convert("T2", unit, value) == (value, unit)
 
 
 def test_a_unit_of_another_quantity_is_refused_and_without_units_nothing_is_converted() -> None:
-    units = make_sample_units({"T": "degC"}, {})
+    units = SampleUnits({"T": "degC"}, {})
     with pytest.raises(InputError, match="sample of T: unit must convert to 'degC', got 'bar'"):
         units.convert("T", "bar", 1.0)
-    assert make_sample_units({}, {}).convert("T", "bar", 1.0) == (1.0, "bar")
+    assert SampleUnits({}, {}).convert("T", "bar", 1.0) == (1.0, "bar")
 
 
 @pytest.mark.parametrize("names_units", [True, False])
