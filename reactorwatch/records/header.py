@@ -127,7 +127,7 @@ class HeaderSearch:
             if units_row
             else [unit_of_name(name) for name in names]
         )
-        sample = [cells for _, cells in self._table[first:] if len(cells) == self._width]
+        sample = [cells for _, cells in self._table[first:] if len(cells) == len(names)]
         notes = []
         if self._separator != ",":
             notes.append(describe_separator(self._separator))

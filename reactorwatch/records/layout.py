@@ -114,7 +114,8 @@ def blank_repeats(layout: Layout) -> tuple[bytes, int]:
     """Text with blank lines in place of repeats of the header, as in files put together, and their number."""
     lines = layout.text.split(b"\n", layout.first_row - 1)
     head, rest = lines[:-1], b"\n" + lines[-1]
-    header = b"" if layout.header_row is None else head[layout.header_row - 1]
+    row = layout.header_row or 0  # in a comment, a header may stand below the rows
+    header = head[row - 1] if 0 < row <= len(head) else b""
     repeats = rest.count(b"\n" + header + b"\n") if header.strip() else 0
     if not repeats:
         return layout.text, 0

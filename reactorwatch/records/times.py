@@ -62,7 +62,8 @@ def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Time
     epoch = find_epoch(table.layout, column, values)
     if epoch is not None:
         digits_ns = 1_000_000 if epoch.zero else 1000  # a double holds more
-        time_ns = np.round((np.nan_to_num(values) - epoch.zero) * (epoch.unit_s * 1e9 / digits_ns)).astype(np.int64)
+        since = np.where(valid, values - epoch.zero, 0.0)
+        time_ns = np.round(since * (epoch.unit_s * 1e9 / digits_ns)).astype(np.int64)
         note = f"time {name} {epoch.name}"
         if not epoch.zero:
             return Times(time_ns * digits_ns, valid, is_clock=True, notes=[note])
