@@ -22,7 +22,7 @@ from monitor_node.baseline.training import NO_VALUE
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.health.failures import Failures
-from monitor_node.health.message import NODE, health_message
+from monitor_node.health.message import NODE, complete_health
 from monitor_node.ingest.alignment import Aligner, Row
 from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, ReceiveStats
 from monitor_node.ingest.rejects import RejectCounter
@@ -39,7 +39,7 @@ from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode, encode
 from reactorwatch.contract.commands import decode_command
-from reactorwatch.contract.messages_pb2 import Alarm, Baseline, BaselineCommand, CommandReply, Promise, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, BaselineCommand, CommandReply, Health, Promise, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -541,11 +541,7 @@ class Monitor:
         self.resume_from_alarms(alarms)
 
     def _health(self, now_ns: int, phase: str) -> Publication:
-        health = health_message(
-            now_ns,
-            self.stats,
-            self._aligner.state.counts,
-            self.rejects.by_reason,
+        health = Health(
             phase=phase,
             received=self.received,
             published=self._published,
@@ -554,5 +550,6 @@ class Monitor:
             reference=self.pipeline.reference,
             training=self.pipeline.trained_share(self.last_ns),
         )
+        complete_health(health, now_ns, self.stats, self._aligner.state.counts, self.rejects.by_reason)
         self.stats.lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

@@ -95,7 +95,7 @@ class KpiCounter:
                     raised=self.state.raised.get(priority, 0),
                     standing=sum(alarm.priority == priority for alarm in active),
                 )
-                for priority in reversed([*PRIORITIES.values()])
+                for priority in sorted(PRIORITIES.values(), reverse=True)
             ],
             unacknowledged=states.count(State.UNACKNOWLEDGED) + states.count(State.RETURNED_UNACKNOWLEDGED),
             shelved=states.count(State.SHELVED),

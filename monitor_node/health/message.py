@@ -1,7 +1,6 @@
 """Health message of a plant's monitor."""
 
 from collections.abc import Mapping
-from typing import Any
 
 from monitor_node.ingest.alignment import Counts
 from monitor_node.ingest.receive_stats import ReceiveStats
@@ -11,19 +10,19 @@ from reactorwatch.contract.messages_pb2 import Health
 NODE = "monitor"
 
 
-def health_message(
-    now_ns: int, stats: ReceiveStats, samples: Counts, refused: Mapping[str, int], **others: Any
-) -> Health:
-    """Health message of a plant's monitor.
+def complete_health(
+    health: Health, now_ns: int, stats: ReceiveStats, samples: Counts, refused: Mapping[str, int]
+) -> None:
+    """Fill the fields of a health message that statistics and counts give.
 
     Args:
+        health: message with the other fields.
         now_ns: present time.
         stats: statistics by receive time.
         samples: counts of samples and rows since the monitor was made, or since its state was.
         refused: number of rejected messages by reason.
-        others: further fields of the message, by name.
     """
-    return Health(
+    counted = Health(
         time_ns=now_ns,
         node=NODE,
         version=__version__,
@@ -39,5 +38,5 @@ def health_message(
         incomplete_rows=samples.incomplete_rows,
         not_stored=stats.not_stored,
         stalls=stats.stalls,
-        **others,
     )
+    health.MergeFrom(counted)

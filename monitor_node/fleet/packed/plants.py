@@ -15,7 +15,7 @@ from monitor_node.fleet.packed.conversion import Conversion
 from monitor_node.fleet.packed.ring import NewestRows
 from monitor_node.fleet.packed.rows import NEW_MINUTE, step_rows
 from monitor_node.fleet.packed.samples import find_deadlines, take_samples
-from monitor_node.health.message import NODE, health_message
+from monitor_node.health.message import NODE, complete_health
 from monitor_node.ingest.alignment import Counts, Row
 from monitor_node.ingest.receive_stats import STALL_NS, ReceiveStats
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE, USABLE
@@ -23,7 +23,7 @@ from monitor_node.pipeline.row_frame import words_of
 from monitor_node.state.monitor_state import MonitorState, learning_settings, seal_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
-from reactorwatch.contract.messages_pb2 import AlarmKpis, Sample
+from reactorwatch.contract.messages_pb2 import AlarmKpis, Health, Sample
 from reactorwatch.contract.sample_bytes import SampleColumns, parse_samples
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS
@@ -287,11 +287,7 @@ class PackedPlants:
 
     def _health(self, slot: int, now_ns: int, phase: str) -> Publication:
         p, rest, plant = self._slots.plants[slot], self._slots.rest(slot), self._slots.names[slot]
-        health = health_message(
-            now_ns,
-            _receive_stats(p),
-            Counts(*p["counts"].tolist()),
-            rest.refused or {},
+        health = Health(
             phase=phase,
             received=int(p["received"]),
             published=int(p["published"]),
@@ -300,6 +296,7 @@ class PackedPlants:
             reference=ProcessReference.kind,
             training=1.0,
         )
+        complete_health(health, now_ns, _receive_stats(p), Counts(*p["counts"].tolist()), rest.refused or {})
         p["lag_ns"] = 0
         return Publication(keys.key(plant, keys.HEALTH, NODE), health)
 
