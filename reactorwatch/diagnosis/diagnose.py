@@ -24,6 +24,7 @@ from reactorwatch.diagnosis.integration_error import looks_like_integration
 from reactorwatch.diagnosis.lasting import LastingResult, prefer_lasting
 from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
 from reactorwatch.diagnosis.law.localise import NOISY_SHARE, Localised, UnknownSearch
+from reactorwatch.diagnosis.noise_spectrum import estimate_sensor_noise
 from reactorwatch.diagnosis.parameter_priors import add_priors
 from reactorwatch.diagnosis.practical_significance import exceeds_tolerance, residual_exceeds_tolerance, tolerances_of
 from reactorwatch.diagnosis.record_checks import make_run
@@ -45,7 +46,6 @@ from reactorwatch.diagnosis.search.noise_growth import search_noise_growth
 from reactorwatch.diagnosis.search.noise_masking import search_single_cause
 from reactorwatch.diagnosis.search.pairs import search_pairs
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult, smallest_noise
-from reactorwatch.diagnosis.sensor_noise import estimate_sensor_noise
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, minus_log10_p
 from reactorwatch.process import effects_of
 from reactorwatch.process.effect import TIMING, Effect

@@ -4,7 +4,7 @@ The coloured part is v <- phi v + white noise, with phi = exp(-h / tau) over a r
 autoregression from row to row, uncorrelated between rows far apart. The filter has it as one more state, initially
 zero, that is added to the sensor's output (Bryson & Johansen 1965, Linear filtering for time-varying systems using
 measurements containing colored noise, IEEE Trans. Automatic Control 10). Its standard deviation and time constant are
-estimated with the other noise levels, by maximum likelihood.
+estimated with the other noise levels, by maximum likelihood (`kalman.noise_estimation`).
 
 More states make a filter slower, so coloured noise is modelled only where the record calls for it. Model error and
 process noise have almost no power at high frequencies; white noise has the same power at all of them. So the power of

@@ -20,8 +20,8 @@ from reactorwatch.diagnosis.law.fit import ShapeFit, ShapeFitter
 from reactorwatch.diagnosis.law.formula import FormulaSearch, law_shape
 from reactorwatch.diagnosis.law.path import Scale, scales_along, variables_along
 from reactorwatch.diagnosis.law.shapes import Shape, make_shape
+from reactorwatch.diagnosis.noise_spectrum import estimate_sensor_noise
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.sensor_noise import estimate_sensor_noise
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p
 from reactorwatch.process.law import ExtendedLaw
 from reactorwatch.process.model import ProcessModel

@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.fitting.colored_noise import ColoredNoise, Noise
+from reactorwatch.diagnosis.noise_spectrum import estimate_sensor_noise
 from reactorwatch.diagnosis.result import UNKNOWN
-from reactorwatch.diagnosis.sensor_noise import estimate_sensor_noise
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
