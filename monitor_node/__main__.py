@@ -225,7 +225,7 @@ def run(
     """
     node = MonitorNode(config, time.time_ns())
     config = node.config
-    node.preparation = chain(drift.preparation(config, node.equations), stage.preparation(config, node.equations))
+    node.preparation = chain(drift.preparation(config, wanted=True), stage.preparation(config, node.equations))
     page = Metrics(NODE, {config.plant: node.alarms.all_alarms})
     with serve_metrics(metrics_config, page) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop)

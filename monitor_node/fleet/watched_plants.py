@@ -5,6 +5,7 @@ is normal again. Publications are the same.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain
 
 import msgspec
 
@@ -15,6 +16,7 @@ from monitor_node.fleet.packed.conversion import Conversion
 from monitor_node.fleet.packed.plants import PackedPlants
 from monitor_node.fleet.plant_kinds import PlantKind, kind_finder
 from monitor_node.isolation import stage
+from monitor_node.stages import drift
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.errors import InputError
 from reactorwatch.identification.rls import RecursiveLeastSquares
@@ -84,7 +86,8 @@ class WatchedPlants:
         """
         RecursiveLeastSquares(1).update([1.0], 1.0)
         for kind, model in zip(self._kinds, self._models, strict=True):
-            for _ in stage.preparation(kind.config, model):
+            drifts = drift.preparation(kind.config, wanted=self._points)
+            for _ in chain(drifts, stage.preparation(kind.config, model)):
                 pass
         for packed in self._packed:
             if packed is not None:

@@ -16,7 +16,6 @@ from monitor_node.config import MonitorConfig
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.parameter_drift import adaptive_weight
 from reactorwatch.spc.run_length.parameters import prepare_limit
@@ -31,15 +30,20 @@ NAMED = 2
 """Parameters that the alarm names."""
 
 
-def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[None]:
+def preparation(config: MonitorConfig, *, wanted: bool) -> Iterator[None]:
     """Compute what the limits take seconds for, step by step, so that no row waits for it at the end of the training.
 
     Args:
         config: settings of the monitor.
-        model: process model of the plant; None without one: the adaptive models then judge, with a longer memory.
+        wanted: the drift is published; without, it has limits only where it raises an alarm.
     """
-    forgetting = config.forgetting if model is not None else max(config.forgetting, JUDGING_FORGETTING)
-    return prepare_limit(arx_structure(config).parameters, adaptive_weight(forgetting))
+    if not (wanted or ParameterT2.name in config.charts):
+        return
+    memory, judging = config.forgetting, max(config.forgetting, JUDGING_FORGETTING)
+    # The adaptive models have a longer memory where they judge, which the training decides if the settings do not.
+    memories = {"arx": [judging], "auto": [memory, judging]}.get(config.reference, [memory])
+    for forgetting in dict.fromkeys(memories):
+        yield from prepare_limit(arx_structure(config).parameters, adaptive_weight(forgetting))
 
 
 class DriftWatch:

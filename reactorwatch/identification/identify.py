@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import msgspec
 import numpy as np
@@ -47,7 +47,7 @@ SCHEMES: Mapping[str, Mapping[str, Callable[..., FittedModel]]] = {
 
 FORGETTING = "forgetting"
 
-RECURSIVE_MODELS: Mapping[str, Kind] = {kind: kind for kind in get_args(Kind)}
+RECURSIVE_MODELS: tuple[str, ...] = get_args(Kind)
 """Models that can be learned row by row."""
 
 WORST_MINUS_LOG10_P = 6.0
@@ -318,7 +318,7 @@ def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
         return SCHEMES[form.scheme][form.model](structure, u, y, t)
     scaling = Scaling.of(u, y)
     if form.model != "arx":
-        running = RecursivePredictionError(structure, scaling, form.forgetting, RECURSIVE_MODELS[form.model])
+        running = RecursivePredictionError(structure, scaling, form.forgetting, cast(Kind, form.model))
         for k, unbroken_rows in enumerate(consecutive_rows(np.concatenate([u, y], axis=1), t)):
             if unbroken_rows <= 1:
                 running.restart()

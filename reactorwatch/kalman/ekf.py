@@ -265,6 +265,8 @@ class Filter:
             steps = (0.0, 0.0)
         elif 2.0 * step > LONGEST_ROW_MIN or self._breaks:
             steps = self._steps(before, time_min, step)
+        if len(inputs) != len(self._inputs) or len(measured) != n:
+            raise ValueError(f"expected {len(self._inputs)} inputs and {n} measurements, got {inputs} and {measured}")
         fill_row(self._new, self._inputs, inputs, time_min, *steps, measured, gate)
         if True in accept:
             for i, follow in enumerate(accept, -n):

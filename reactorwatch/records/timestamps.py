@@ -231,7 +231,7 @@ def _offsets(cells: Any) -> NDArray[np.float64]:
     encoded = cells.dictionary_encode()
     values: list[float] = []
     for text in encoded.dictionary.to_pylist():
-        offset_s = fixed_offset_s(text)
+        offset_s = fixed_offset_s(text.rstrip(":"))
         values.append(_OFFSETS_H.get(text.upper(), np.nan) * 3600 if offset_s is None else offset_s)
     index = np.asarray(encoded.indices.fill_null(len(values)))
     return np.asarray(np.array([*values, np.nan], dtype=np.float64)[index], dtype=np.float64)

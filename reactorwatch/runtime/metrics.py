@@ -156,12 +156,13 @@ class Metrics:
 
     def _family(
         self, kind: Any, name: str, meaning: str, values: Iterable[tuple[str, str, object]], label: str = ""
-    ) -> Any:
+    ) -> "Metric":
         """A metric with its values, each by its plant and by the value of a label of its own if it has one."""
         family = kind(f"{PREFIX}_{name}", meaning, labels=["plant", "node", *filter(None, [label])])
         for plant, own, value in values:
             family.add_metric([plant, self.node, *([own] if label else [])], value)
-        return family
+        metric: Metric = family
+        return metric
 
 
 @contextmanager

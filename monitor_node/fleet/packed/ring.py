@@ -119,12 +119,15 @@ def add_row(p: Any, times: Places, ring: Bytes, others: Ints, spacing_ns: int, b
 
 @jit
 def _add_rows(plants: Records, slot: int, times: Places, ring: Bytes, others: Ints, times_ns: Ints, bits: Ints) -> bool:
-    p = plants[slot]
-    for k in range(times_ns.size):
-        spacing_ns = times_ns[k] - times_ns[k - 1] if k else p.usual_ns
-        if not fits(p, spacing_ns, bits[k], ring.shape[1] > 0):
+    p, spacings_ns = plants[slot], np.empty_like(times_ns)
+    for k in range(
+        times_ns.size
+    ):  # all are checked before any is written: memory of a plant that is not kept stays zero
+        spacings_ns[k] = times_ns[k] - times_ns[k - 1] if k else p.usual_ns
+        if not fits(p, spacings_ns[k], bits[k], ring.shape[1] > 0):
             return False
-        add_row(p, times, ring, others, spacing_ns, bits[k])
+    for k in range(times_ns.size):
+        add_row(p, times, ring, others, spacings_ns[k], bits[k])
     return True
 
 

@@ -3,8 +3,9 @@
 A filter without process noise is a simulation whose start is estimated from the first rows.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 
@@ -19,9 +20,10 @@ from reactorwatch.diagnosis.fitting.fault_filter import (
 )
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.process.model import ProcessModel
+
+Linearize: TypeAlias = Callable[[ProcessModel, tuple[str, ...]], ErrorLinearization]
 
 
 class FittedSimulation:
@@ -32,6 +34,7 @@ class FittedSimulation:
         names: names of the fitted parameters.
         run: the record.
         noise: noise levels.
+        linearize_cached: cached form of `linearize`, for models that are used again; None: kept for this object.
 
     Attributes:
         names: names of the fitted parameters.
@@ -39,8 +42,16 @@ class FittedSimulation:
         ekf: the filter.
     """
 
-    def __init__(self, model: ProcessModel, names: Sequence[str], run: Run, noise: Noise) -> None:
+    def __init__(
+        self,
+        model: ProcessModel,
+        names: Sequence[str],
+        run: Run,
+        noise: Noise,
+        linearize_cached: Linearize | None = None,
+    ) -> None:
         self.names, self.run = tuple(names), run
+        self._linearize = linearize_cached or lru_cache(linearize)
         self.ekf = FaultFilter(model, (), noise, run.period_min)
         if not run.breaks:  # a fit that loses an unstable plant is given up instead of started again in each row
             self.ekf.limit(None)
@@ -54,7 +65,7 @@ class FittedSimulation:
         self, values: Mapping[str, float], evaluation: FilterEvaluation, further: Sequence[str] = ()
     ) -> ErrorDynamics:
         """Error equations about a run of the filter, for the fitted parameters and further ones of the model."""
-        errors = _linearization(self.ekf.model, (*self.names, *further)).with_noise(self.ekf.noise_levels)
+        errors = self._linearize(self.ekf.model, (*self.names, *further)).with_noise(self.ekf.noise_levels)
         errors.changes = self.ekf.noise.parameter_changes | dict(values)
         inputs, used = self.ekf.inputs(self.run, ()), self.ekf.used_values(self.run)
         return error_dynamics_between(errors, self.run, inputs, evaluation.innovations, used)
@@ -67,9 +78,8 @@ class FittedSimulation:
         return g.T @ (g * weights[:, None]), g.T @ (weights * w)
 
 
-@lru_cache(maxsize=MODEL_CACHE_SIZE)
-def _linearization(model: ProcessModel, names: tuple[str, ...]) -> ErrorLinearization:
-    """Error equations of a model for some of its parameters; cached with what is compiled from them."""
+def linearize(model: ProcessModel, names: tuple[str, ...]) -> ErrorLinearization:
+    """Error equations of a model for some of its parameters."""
     symbols = [model.parameter(name).symbol for name in names]
     unknown = NoiseLevels((1.0,) * len(model.outputs), (0.0,) * len(model.states))
     return ErrorLinearization(model, unknown, symbols, symbols)

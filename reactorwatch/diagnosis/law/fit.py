@@ -6,6 +6,7 @@ backward elimination, on the normal equations), so that a simple law is not beat
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import log
 
 import numpy as np
@@ -13,9 +14,10 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvaluation
-from reactorwatch.diagnosis.fitting.simulation import FittedSimulation
+from reactorwatch.diagnosis.fitting.simulation import FittedSimulation, linearize
 from reactorwatch.diagnosis.law.shapes import LARGEST, Shape
 from reactorwatch.diagnosis.run import Run
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.places import Place
 
@@ -25,6 +27,8 @@ MOST_TERMS = 6
 HALVINGS = 4
 CONVERGED = 0.5
 """Gain in BIC below which a fit has converged."""
+
+_linearize_shape = lru_cache(maxsize=MODEL_CACHE_SIZE)(linearize)  # shapes are made once for a model and a place
 
 _RIDGE = 1e-9
 _RUNAWAY = 1e100
@@ -75,7 +79,7 @@ class ShapeFitter:
 
     def __init__(self, shape: Shape, run: Run, noise: Noise) -> None:
         self.shape, self._run = shape, run
-        self._simulation = FittedSimulation(shape.model, shape.parameters, run, noise)
+        self._simulation = FittedSimulation(shape.model, shape.parameters, run, noise, _linearize_shape)
         self._first = np.array([shape.model.parameter(name).value for name in shape.parameters])
 
     def evaluate(self, coefficients: Array, select: bool = True) -> ShapeFit:

@@ -152,9 +152,15 @@ class FormulaSearch:
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Twice the loss as a quadratic form of the values at the knots, zero and its slopes there first.
+    """Twice the loss as a quadratic form of the correction's values at the knots.
 
-    With the variables at the knots, and their means and standard deviations along the path.
+    Attributes:
+        variables: values of each variable at the knots, shape (knots,).
+        means: mean of each variable along the path.
+        spreads: standard deviation of each variable along the path.
+        information: curvature of twice the loss, halved, shape (knots, knots).
+        gradient: minus half its slope where the correction is zero, shape (knots,).
+        constant: its value where the correction is zero.
     """
 
     variables: Mapping[str, Array]

@@ -252,9 +252,11 @@ class ZenohBus:
                 on_history_end()
             return
         # The subscriber's own query of the history left out keys that were being published on meanwhile.
-        newest, is_complete = self._query_caches(key_expression, lambda _waited_s: LAST)
-        for last in newest:
-            delivery.set_last(last)
+        is_complete = False
+        for newest, all_replied in self._query_caches(key_expression, lambda _waited_s: LAST):
+            is_complete = all_replied
+            for last in newest:
+                delivery.set_last(last)
         started, missing, since_s = time.monotonic(), history_s > 0.0, history_s
         for _ in range(MAX_QUERIES):
             if not missing:
@@ -290,8 +292,9 @@ class ZenohBus:
         buffer: ReorderBuffer[Encoded] = ReorderBuffer(await_history=True)
         with contextlib.suppress(zenoh.ZError):  # it is closed
             selector = _history_selector(self._config.history_s)
-            for sent in self._query_caches(key_expression, lambda _waited_s: selector)[0]:
-                buffer.add_history(sent.publisher, sent.stream, sent.message.key, sent.number, sent.message)
+            for messages, _ in self._query_caches(key_expression, lambda _waited_s: selector):
+                for sent in messages:
+                    buffer.add_history(sent.publisher, sent.stream, sent.message.key, sent.number, sent.message)
         released = list(buffer.end_history(0))
         while (due_ns := buffer.due_ns()) is not None:  # missing messages are not waited for
             released += buffer.release_overdue(due_ns)
@@ -299,25 +302,26 @@ class ZenohBus:
 
     def _query_stream(self, stream: str, since_s: float) -> list[SequencedMessage]:
         """Messages of a stream from publishers' caches."""
+        messages = list[SequencedMessage]()
         try:
-            return self._query_caches(
+            for replies, _ in self._query_caches(
                 keys_of(stream), lambda waited_s: _history_selector(since_s + waited_s + MAX_TRANSIT_S)
-            )[0]
+            ):
+                messages += replies
         except zenoh.ZError as error:  # the bus is being closed, for instance
             log.info("cannot query missing messages", stream=stream, why=first_line(error))
-            return []
+        return messages
 
     def _query_caches(
         self, key_expression: str, selector: Callable[[float], str]
-    ) -> tuple[list[SequencedMessage], bool]:
-        """Query the publishers' caches until all of them reply in time; `selector` depends on the seconds waited."""
-        messages, started, is_complete = list[SequencedMessage](), time.monotonic(), False
+    ) -> Iterator[tuple[list[SequencedMessage], bool]]:
+        """Yield replies until all publishers reply in time; `selector` depends on the seconds waited."""
+        started = time.monotonic()
         for _ in range(MAX_QUERIES):
             replies, is_complete = self._query_cache(key_expression, selector(time.monotonic() - started))
-            messages += replies
+            yield replies, is_complete
             if is_complete:
-                break
-        return messages, is_complete
+                return
 
     def _query_cache(self, key_expression: str, which: str) -> tuple[list[SequencedMessage], bool]:
         """Query the publishers' caches once; returns their messages, and True if every publisher replied in time."""

@@ -26,7 +26,6 @@ beyond the limit, there is one lasting false alarm.
 """
 
 from collections.abc import Iterator
-from contextlib import suppress
 from functools import lru_cache
 from math import inf, isfinite, log
 
@@ -77,17 +76,22 @@ def parameter_limit(arl0: float, dimension: int, weight: float, freedom: float, 
 
 
 def prepare_limit(dimension: int, weight: float) -> Iterator[None]:
-    """Compute what `parameter_limit` takes seconds for, a tenth of a second for each item of the iterator.
+    """Compute what `parameter_limit` takes seconds for, up to half a second for each item of the iterator.
 
     Args:
         dimension: see there.
         weight: see there.
     """
+    is_known = False
     for _ in _known_chart(dimension, weight):
+        is_known = True
         yield
-    with suppress(InputError):  # an argument out of its range, which `parameter_limit` reports
-        _rates(dimension, weight)
-    from scipy import optimize  # noqa: F401 # the import that `parameter_limit` needs
+    if not is_known:  # an argument is out of its range, which `parameter_limit` reports
+        return
+    from scipy import interpolate, optimize  # noqa: F401 # the imports that `parameter_limit` needs
+
+    yield
+    _rates(dimension, weight)
 
 
 class _Rates:

@@ -420,6 +420,14 @@ def test_noise_that_cannot_be_is_refused(noise: NoiseLevels, message: str) -> No
         Filter(cstr(), noise)
 
 
+@pytest.mark.parametrize(("inputs", "measured"), [([], [0.0, 0.0]), ([1.0], [0.0]), ([1.0, 1.0], [0.0, 0.0])])
+def test_a_row_with_another_number_of_values_is_refused(inputs: list[float], measured: list[float]) -> None:
+    ekf = Filter(linear_model(), NOISE)
+    ekf.update(0.0, [1.0], [0.0, 0.0])
+    with pytest.raises(ValueError, match="expected 1 inputs and 2 measurements"):
+        ekf.update(0.07, inputs, measured)
+
+
 def test_a_parameter_that_there_is_not_is_refused() -> None:
     arguments: Any = (cstr(), SENSORS, {"qx": 1.0})
     with pytest.raises(ValueError, match="cstr has no parameter 'qx'"):

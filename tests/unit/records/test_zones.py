@@ -1,6 +1,7 @@
 """Local times to UTC around the changes of clocks, held to the standard library's zones."""
 
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import NoReturn
 from zoneinfo import ZoneInfo
 
@@ -11,6 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import FileFormat
+from reactorwatch.records.read_table import read_table
 from reactorwatch.records.zones import to_utc
 
 CHANGES = {
@@ -65,3 +68,10 @@ def test_rows_of_one_pass_of_an_hour_that_occurs_twice_join_their_neighbours(gap
 def test_a_fixed_offset_is_subtracted(zone: str, hours: float) -> None:
     local = np.array([10**18], dtype=np.int64)
     assert to_utc(local, zone, refuse)[0] == 10**18 - hours * 3600 * 10**9
+
+
+@pytest.mark.parametrize("offset", ["+01:00", "+0100", "+01", "+01:"])
+def test_an_offset_is_read_in_each_of_its_forms(tmp_path: Path, offset: str) -> None:
+    path = tmp_path / "record.csv"
+    path.write_text("time,T\n" + "".join(f"2026-01-01 10:0{minute}:00{offset},{minute}\n" for minute in range(3)))
+    assert read_table(path, None, FileFormat()).zero_ns == datetime(2026, 1, 1, 9, tzinfo=UTC).timestamp() * 1e9
