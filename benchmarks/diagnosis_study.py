@@ -25,6 +25,7 @@ from benchmarks.hidden.classes import CLASSES, StudyClass, draw_record, find_cla
 from benchmarks.hidden.reliability import reliability_table
 from benchmarks.hidden.suspects import SuspectsJudged, judge_suspects
 from benchmarks.hidden.tables import confusion_table, failures, main_table
+from benchmarks.stamp import stamp
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.runtime.parallel.jobs import Failed, choose_executor
@@ -44,7 +45,7 @@ TEMPLATE = """## Results
 
 Made by `make study`, from seeds of {seed} on. Every record is drawn from a seed, made by equations and a solver that
 the diagnosis does not use, and compared with the truth. The classes are in `benchmarks/hidden/classes.py`, the sizes of
-the hidden causes in `tests/hidden_effect/catalogue.py`.
+the hidden causes in `tests/hidden_effect/catalogue.py`. {stamp}
 
 {main}
 
@@ -176,6 +177,7 @@ def section(found: dict[str, list[Judged]], seed: int, suspects: Sequence[Suspec
     """Section of the page on the study."""
     text = TEMPLATE.format(
         seed=seed,
+        stamp=stamp(),
         main=main_table(found),
         reliability=reliability_table(found, suspects),
         confusion=confusion_table(found),

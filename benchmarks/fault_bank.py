@@ -31,6 +31,7 @@ from benchmarks.faults.report_method import METHODS, calibrated_width
 from benchmarks.faults.score import rows_to_false_alarm
 from benchmarks.faults.study import Widths, fault_free_statistics, run_case, run_fault_free
 from benchmarks.faults.tables import as_json, print_fault_free, print_summary, print_table
+from benchmarks.stamp import stamp
 from reactorwatch.runtime.parallel.jobs import Executor, Failed, choose_executor, in_job_order
 
 SEEDS, FAULT_FREE_RUNS, CALIBRATION_RUNS = 20, 200, 400
@@ -78,7 +79,7 @@ def main() -> None:
         print_fault_free(console, quiet, budget)
     console.print(f"\n{len(found)} runs with a fault, {len(quiet)} without, {time.perf_counter() - began:.0f} s")
     if chosen.write is not None:
-        chosen.write.write_text(f"{HEAD}\n```\n{console.export_text()}```\n")
+        chosen.write.write_text(f"{HEAD}\n{stamp()}\n\n```\n{console.export_text()}```\n")
     if chosen.json is not None:
         chosen.json.write_text(json.dumps(as_json(found, quiet, budgets, widths), indent=1) + "\n")
 

@@ -2,14 +2,13 @@
 
 import argparse
 import re
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 from benchmarks.outside import free_run, tennessee, three_tanks, water_circuit
 from benchmarks.outside.table import Row, markdown
+from benchmarks.stamp import stamp
 
 SEED = 1
 
@@ -76,12 +75,7 @@ def measure_benchmark(benchmark: Benchmark, folder: Path) -> str:
     if not path.exists():
         return f"## {benchmark.title}\n\nNot measured: {path.name} is not in the folder."
     rows = benchmark.measure(path, SEED)
-    return f"## {benchmark.title}\n\n{_stamp()}\n\n{markdown(rows)}"
-
-
-def _stamp() -> str:
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], check=True, capture_output=True, text=True).stdout
-    return f"Measured on {datetime.now(UTC):%Y-%m-%d} with commit {commit.strip()}."
+    return f"## {benchmark.title}\n\n{stamp()}\n\n{markdown(rows)}"
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import pytest
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.arx_fit import arx_structure
+from monitor_node.baseline.predictor import JUDGING_FORGETTING
 from monitor_node.config import MonitorConfig, ReferenceName
 from monitor_node.stages import drift
 from reactorwatch.spc.parameter_drift import adaptive_weight
@@ -13,8 +14,8 @@ from reactorwatch.spc.run_length.parameters import parameter_limit
 @pytest.mark.parametrize(
     ("reference", "memories"),
     [
-        ("auto", {0.99, drift.JUDGING_FORGETTING}),
-        ("arx", {drift.JUDGING_FORGETTING}),
+        ("auto", {0.99, JUDGING_FORGETTING}),
+        ("arx", {JUDGING_FORGETTING}),
         ("equations", {0.99}),
         ("black-box", {0.99}),
     ],
