@@ -154,7 +154,7 @@ def test_a_monitor_prepares_part_by_part_once_it_listens_and_then_no_more(monkey
             assert len(prepared) == parts
         assert node.next_tick_ns() > now_ns + 10**9  # health: nothing else is due
 
-    monkeypatch.setattr(drift, "preparation", lambda *_: iter(()))
+    monkeypatch.setattr(drift, "preparation", lambda *_, **__: iter(()))
     monkeypatch.setattr(stage, "preparation", preparation)
     monkeypatch.setattr(EventLoop, "run", run)
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", lambda *_: MemoryBus(Exchange()))
