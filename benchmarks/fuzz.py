@@ -186,7 +186,7 @@ def fuzz_messages(count: int, seed: int = 1) -> dict[str, int]:
     _health([recorder.health(2**62)])
     assert health.received == len(plant) + strange
     counted = Counter(health.refused_by_reason) | Counter(duplicated=health.duplicated, late=health.late)
-    waiting = sum(len(run.held) for run in monitor._runs)
+    waiting = sum(len(run.held) for run in monitor.memory.runs)
     taken = strange - counted.total() - waiting
     assert 0 <= taken <= strange // 1000, f"{taken} strange messages are not counted"
     return {

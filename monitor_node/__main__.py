@@ -115,7 +115,7 @@ class MonitorNode(Monitor):
         """See `Monitor`; alarms are stored before the reply, and logged; too many commands are refused."""
         refusal = self._rate.check(sender_name(question), now_ns)
         if refusal is not None:
-            self.received += 1
+            self.memory.received += 1
             self.rejects.add("too_many_commands", refusal)
             return CommandReply(accepted=False, text=refusal), []
         reply, publications = super().on_command(question, now_ns)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from typing import Any, cast
 
+import msgspec
 from google.protobuf.message import Message
 
 from monitor_node.alarms.annunciator import Annunciator
@@ -34,7 +35,7 @@ from monitor_node.pipeline.pipeline import PlantPipeline
 from monitor_node.pipeline.promise_stage import PromiseStage
 from monitor_node.pipeline.training_check import check_training
 from monitor_node.signal_checks.timeout import SilenceCheck
-from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
+from monitor_node.state.monitor_state import MonitorMemory, MonitorState, learning_settings, open_state, seal_state
 from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode, encode
@@ -68,11 +69,8 @@ class Monitor:
         failures: contained errors of this software.
         alarms: alarms of the plant.
         pipeline: pipeline of the plant's rows.
-        first_ns: time of the first row; None before it.
-        last_ns: time of the last row; None before the first.
-        watching_since_ns: time of the first evaluated row; None before it.
+        memory: what the monitor itself remembers, beside its parts.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
-        received: number of messages so far.
         on_row_end: called after each row with its time and the publications because of it; None: not called.
         unconfirmed: the newest publications, which a kill may keep from leaving the process; the caller sets them. They
             are stored with the state.
@@ -94,41 +92,34 @@ class Monitor:
         self._points, self._model, self._diagnose = points, model, diagnose
         self._changes: deque[ScheduledChange] = deque()
         self._republishes_baseline = False
-        self.rejects = RejectCounter()
-        self.failures = Failures()
         self._signals = config.signals
+        self.memory = MonitorMemory(
+            runs=[SequenceCheck() for _ in self._signals], units=dict.fromkeys(self._signals, "")
+        )
+        self.rejects, self.failures = RejectCounter(self.memory.refused), Failures(self.memory.failures)
         known = (*self._signals, *config.carried_signals)
         self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in known}
         self._label_keys = {keys.key(config.plant, keys.SAMPLE, signal) for signal in config.labels}
         self._indices = {signal: place for place, signal in enumerate(self._signals)}
         self._aligner = Aligner(self._signals, config.reorder_rows)
-        self._runs = [SequenceCheck() for _ in self._signals]
         self._replay_filter: ReplayFilter | None = None
         self.alarms = Annunciator(config)
         self.pipeline = self._new_pipeline(self.alarms)
         judged_by = self.pipeline.model
         self._sample_units = SampleUnits(config.units, {} if judged_by is None else judged_by.units)
         self._plain_units = self._sample_units.plain
-        self._units = dict.fromkeys(self._signals, "")
-        self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
-        self.first_ns: int | None = None
-        self.last_ns: int | None = None
         self.span_ns = 0
-        self.watching_since_ns: int | None = None
-        self.received = 0
         self.stats = ReceiveStats(start_ns, start_ns)
         self.on_row_end: Callable[[int, list[Publication]], None] | None = None
-        self._published = 0
         self.unconfirmed: list[Publication] = []
-        self._snapshot_due_ns: int | None = None
         self._snapshot_ns = int(config.snapshot_min * MINUTE_NS)
 
     # --- event loop ------------------------------------------------------------------------------------------
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Process a message on a key of the plant's samples; returns publications."""
-        self.received += 1
+        self.memory.received += 1
         if message.received_ns and now_ns - message.received_ns > self.stats.lag_ns:
             self.stats.lag_ns = now_ns - message.received_ns
         signal = self._signal_by_key.get(message.key)
@@ -170,7 +161,7 @@ class Monitor:
             return []
         publications: list[Publication] = []
         time_ns, number = sample.time_ns, sample.sequence
-        run, is_accepted = self._runs[index], True
+        run, is_accepted = self.memory.runs[index], True
         if run.accept_next(number, time_ns):  # as nearly always
             self._accept(signal, time_ns, number, value, unit, publications)
         elif not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):
@@ -188,17 +179,17 @@ class Monitor:
         if is_accepted and now_ns >= self.stats.heard_ns + HEARD_AGAIN_NS:
             self.stats.heard_ns = now_ns
             self.silence.of_plant.on_receipt(now_ns)
-        self._published += len(publications)
+        self.memory.published += len(publications)
         return publications
 
     def _accept(
         self, signal: str, time_ns: int, number: int, value: float, unit: str, publications: list[Publication]
     ) -> None:
         """Process an accepted sample."""
-        if unit != self._units[signal] or signal not in self._heard_from_ns:
-            self._heard_from_ns.setdefault(signal, time_ns)
-            self._units[signal] = unit
-            self._output_units = [self._units[output] for output in self.config.outputs]
+        if unit != self.memory.units[signal] or signal not in self.memory.heard_from_ns:
+            self.memory.heard_from_ns.setdefault(signal, time_ns)
+            self.memory.units[signal] = unit
+            self._output_units = [self.memory.units[output] for output in self.config.outputs]
         for row in self._aligner.update(signal, time_ns, number, value):
             self._on_row(row, publications)
 
@@ -211,14 +202,14 @@ class Monitor:
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """Execute an operator's command at the time of the newest row, or refuse it."""
-        self.received += 1
+        self.memory.received += 1
         try:
             reply, publications = self._execute(question)
         except (InputError, DecodeError) as error:
             reason = error.reason if isinstance(error, DecodeError) else "command"
             self.rejects.add(reason, f"{question.key}: {error}")
             return CommandReply(accepted=False, text=str(error)), []
-        self._published += len(publications)
+        self.memory.published += len(publications)
         return reply, publications
 
     def _execute(self, question: Encoded) -> tuple[CommandReply, list[Publication]]:
@@ -242,7 +233,7 @@ class Monitor:
         if self._republishes_baseline and self.baseline is not None:
             publications.append(Publication(keys.key(self.config.plant, keys.BASELINE, NODE), self.baseline))
         self._republishes_baseline = False
-        self._published += len(publications)
+        self.memory.published += len(publications)
         if now_ns >= self.stats.health_due_ns:
             self.stats.health_due_ns = now_ns + int(self.config.health_period_s * 1e9)
             publications.append(self._health(now_ns, self.phase))
@@ -284,22 +275,12 @@ class Monitor:
     def state(self) -> MonitorState:
         """The state that `to_bytes` stores, without the settings. Parts of it are not copied."""
         return MonitorState(
-            {},
-            self._runs,
-            self._aligner.state,
-            self.alarms.to_bytes(),
-            self.pipeline.state,
-            self._units,
-            self._heard_from_ns,
-            self.first_ns,
-            self.last_ns,
-            self.watching_since_ns,
-            self._snapshot_due_ns,
-            self.received,
-            self._published,
-            self.rejects.by_reason,
-            self.failures.by_stage,
-            [encode(item)[:3] for item in self.unconfirmed],
+            **msgspec.structs.asdict(self.memory),
+            settings={},
+            alignment=self._aligner.state,
+            board=self.alarms.to_bytes(),
+            watch=self.pipeline.state,
+            unconfirmed=[encode(item)[:3] for item in self.unconfirmed],
         )
 
     def restore(self, state: MonitorState) -> None:
@@ -320,15 +301,10 @@ class Monitor:
             raise InputError(f"is no state of this software's monitor: {error}") from error
         self.alarms, self.pipeline = board, pipeline
         self._republishes_baseline = True  # it may not have been published before the stop
-        self._runs = state.runs
+        self.memory = memory = msgspec.convert(state, MonitorMemory, from_attributes=True)
+        self.rejects.by_reason, self.failures.by_stage = memory.refused, memory.failures
         self._aligner.state, self._replay_filter = state.alignment, ReplayFilter(state.alignment)
-        self._units, self._heard_from_ns = state.units, state.heard_from_ns
-        self._output_units = [self._units[output] for output in self.config.outputs]
-        self.first_ns, self.last_ns = state.first_ns, state.last_ns
-        self.watching_since_ns, self._snapshot_due_ns = state.watching_since_ns, state.snapshot_due_ns
-        self.received, self._published = state.received, state.published
-        self.rejects.by_reason = state.refused
-        self.failures.restore(state.failures)
+        self._output_units = [memory.units[output] for output in self.config.outputs]
         self.unconfirmed = unconfirmed
 
     @cached_property
@@ -337,7 +313,7 @@ class Monitor:
 
     def count_duplicate(self) -> None:
         """Count a sample that was processed before."""
-        self.received += 1
+        self.memory.received += 1
         self._aligner.state.counts.duplicated += 1
 
     def on_history_end(self) -> None:
@@ -400,7 +376,7 @@ class Monitor:
     @property
     def phase(self) -> str:
         """`waiting` for the first row, `training` or `watching`."""
-        if self.first_ns is None:
+        if self.memory.first_ns is None:
             return "waiting"
         return "watching" if self.pipeline.watching or not self.pipeline.is_judged else "training"
 
@@ -445,12 +421,16 @@ class Monitor:
     def promise(self) -> Promise | None:
         """Promise of false alarms, as it is now; None before the end of the training."""
         promise = self.pipeline.evaluation.promises.promise
-        return None if promise is None else promise.message(self.last_ns or 0, self.pipeline.evaluation.rows_watched)
+        return (
+            None
+            if promise is None
+            else promise.message(self.memory.last_ns or 0, self.pipeline.evaluation.rows_watched)
+        )
 
     @property
     def excluded_signals(self) -> dict[str, str]:
         """Signals that are not monitored, with the reason: no value came, or the training could not use them."""
-        never_came = (signal for signal in self._signals if signal not in self._heard_from_ns)
+        never_came = (signal for signal in self._signals if signal not in self.memory.heard_from_ns)
         return dict.fromkeys(never_came, NO_VALUE) | self.pipeline.evaluation.left_out
 
     @property
@@ -468,13 +448,13 @@ class Monitor:
         publications: list[Publication] = []
         for row in rows:
             self._on_row(row, publications)
-        self._published += len(publications)
+        self.memory.published += len(publications)
         return publications
 
     def finish(self) -> list[Publication]:
         """Evaluate pending rows, as at the end of a record."""
         publications: list[Publication] = []
-        for signal, run in zip(self._signals, self._runs, strict=True):
+        for signal, run in zip(self._signals, self.memory.runs, strict=True):
             for sample in run.release():
                 self._accept(signal, *sample, publications)
         for row in self._aligner.flush():
@@ -482,21 +462,21 @@ class Monitor:
         return publications
 
     def _on_row(self, row: Row, publications: list[Publication]) -> None:
-        time_ns, due_ns, before = row.time_ns, self._snapshot_due_ns, len(publications)
-        if self.first_ns is None or time_ns < self.first_ns:
-            self.first_ns = time_ns
-        if self.last_ns is not None and not row.restarted:
-            self.span_ns += time_ns - self.last_ns
-        self.last_ns = time_ns
+        time_ns, due_ns, before = row.time_ns, self.memory.snapshot_due_ns, len(publications)
+        if self.memory.first_ns is None or time_ns < self.memory.first_ns:
+            self.memory.first_ns = time_ns
+        if self.memory.last_ns is not None and not row.restarted:
+            self.span_ns += time_ns - self.memory.last_ns
+        self.memory.last_ns = time_ns
         try:
             self.pipeline.update(row, self._output_units, publications)
             publications.extend(self.alarms.end_row(time_ns))
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
             self._contain("row", error)
-        if self.watching_since_ns is None and self.pipeline.watching:
-            self.watching_since_ns = time_ns
+        if self.memory.watching_since_ns is None and self.pipeline.watching:
+            self.memory.watching_since_ns = time_ns
         if due_ns is None or not 0 <= due_ns - time_ns <= self._snapshot_ns:
-            self._snapshot_due_ns = time_ns + self._snapshot_ns
+            self.memory.snapshot_due_ns = time_ns + self._snapshot_ns
             if due_ns is not None:
                 publications.extend(self._guard("models", self.pipeline.snapshots, time_ns))
         if self.on_row_end is not None:
@@ -537,18 +517,18 @@ class Monitor:
         notes, receipts_ns = self.pipeline.evaluation.notes, self.silence.of_plant.receipts_ns
         self.pipeline = self._new_pipeline(self.alarms)
         self.pipeline.evaluation.notes, self.silence.of_plant.receipts_ns = notes, receipts_ns
-        self.watching_since_ns = None
+        self.memory.watching_since_ns = None
         self.resume_from_alarms(alarms)
 
     def _health(self, now_ns: int, phase: str) -> Publication:
         health = Health(
             phase=phase,
-            received=self.received,
-            published=self._published,
+            received=self.memory.received,
+            published=self.memory.published,
             failures=self.failures.by_stage,
-            heard_from_ns=self._heard_from_ns,
+            heard_from_ns=self.memory.heard_from_ns,
             reference=self.pipeline.reference,
-            training=self.pipeline.trained_share(self.last_ns),
+            training=self.pipeline.trained_share(self.memory.last_ns),
         )
         complete_health(health, now_ns, self.stats, self._aligner.state.counts, self.rejects.by_reason)
         self.stats.lag_ns = 0

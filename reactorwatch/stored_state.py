@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
-class StoredState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base class of the states; a subclass lists the fields."""
+class Storable:
+    """What has a form that can be stored, as MessagePack."""
+
+    __slots__ = ()
 
     def to_bytes(self) -> bytes:
         """The state as MessagePack; numbers come back bit for bit."""
@@ -30,6 +32,14 @@ class StoredState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return msgspec.msgpack.decode(data, type=cls)
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
             raise ValueError(f"not a {cls.__name__}: {error}") from error
+
+
+class Memory(Storable, msgspec.Struct, forbid_unknown_fields=True):
+    """Base class of what changes with the rows, and is its own state: its fields are what is stored."""
+
+
+class StoredState(Storable, msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base class of the states of what keeps its memory in another form; a subclass lists the fields."""
 
 
 def pack_numbers(values: ArrayLike) -> bytes:

@@ -193,7 +193,7 @@ class FleetMonitor:
         monitor = self.watched.remove(plant)
         if monitor is None:
             return
-        self._handed_over.publish_ours(plant, monitor.alarms.all_alarms(), monitor.last_ns, withheld_ns)
+        self._handed_over.publish_ours(plant, monitor.alarms.all_alarms(), monitor.memory.last_ns, withheld_ns)
         self._callbacks.on_ownership(plant, False)
         if self._shards.is_ours(plant):
             self._start_adoption(plant, now_ns, taken_over=True)
@@ -241,7 +241,7 @@ class FleetMonitor:
             if topic is None or topic.kind != keys.ALARM:
                 continue
             alarm, own = decode_as(message, Alarm), self.watched.detach(topic.plant)
-            if alarm is not None and own is not None and alarm.time_ns > (own.last_ns or 0):
+            if alarm is not None and own is not None and alarm.time_ns > (own.memory.last_ns or 0):
                 plants.add(topic.plant)
         return plants
 
@@ -374,8 +374,8 @@ class FleetMonitor:
 
     def _evaluate(self, plant: str, own: Monitor, message: Encoded, now_ns: int) -> list[Publication]:
         """Process a message of a plant; returns publications that its previous owners have not published."""
-        before_ns, publications = own.last_ns, own.on_message(message, now_ns)
-        if before_ns is not None and own.last_ns is not None and own.last_ns < before_ns:
+        before_ns, publications = own.memory.last_ns, own.on_message(message, now_ns)
+        if before_ns is not None and own.memory.last_ns is not None and own.memory.last_ns < before_ns:
             self._handed_over.remove(plant)  # the clock was set back: their alarms would cover those to come
         return self._handed_over.filter_new(publications)
 

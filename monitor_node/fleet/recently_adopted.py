@@ -40,7 +40,7 @@ class RecentlyAdopted:
             monitor: monitor of the plant.
             now_ns: present time.
         """
-        runs = zip(monitor.config.signals, monitor.state.runs, strict=True)
+        runs = zip(monitor.config.signals, monitor.memory.runs, strict=True)
         samples = {
             keys.key(plant, keys.SAMPLE, signal): GapTracker(run.expected, run.newest_ns) for signal, run in runs
         }

@@ -161,7 +161,7 @@ class WatchedPlants:
         if packed is not None:
             return packed.received_count(plant)
         monitor = self._monitors.get(plant)
-        return None if monitor is None else monitor.received
+        return None if monitor is None else monitor.memory.received
 
     def count_not_stored(self, plant: str) -> None:
         """Count a failure to store the state of a plant."""

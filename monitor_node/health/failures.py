@@ -6,7 +6,6 @@ and reported once for each line of code that raises it, with its cause.
 """
 
 import traceback
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from reactorwatch.errors import InputError
@@ -55,7 +54,3 @@ class Failures:
         cause = " ".join(str(error).split())[:LONGEST_CAUSE]
         self.notes.append(f"error of this software in the stage {stage}: {origin}: {cause}; {cost}; please report it")
         self.tracebacks.append("".join(traceback.format_exception(error)))
-
-    def restore(self, by_stage: Mapping[str, int]) -> None:
-        """Resume the counts of an earlier process."""
-        self.by_stage = dict(by_stage)

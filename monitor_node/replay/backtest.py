@@ -118,7 +118,7 @@ def train(
         if message.key.startswith(prefix):
             monitor.on_message(message, message.received_ns)
     monitor.finish()
-    monitor.pipeline.end_training(monitor.last_ns or 0)
+    monitor.pipeline.end_training(monitor.memory.last_ns or 0)
     return TrainedPlant(monitor.pipeline.training_rows, monitor.pipeline.state, [*monitor.notes])
 
 
@@ -154,7 +154,7 @@ def run(
         rows = log  # the same log for the checker of types
 
         def log_row(time_ns: int, publications: list[Publication]) -> None:
-            rows.add(time_ns, publications, judged=monitor.watching_since_ns is not None)
+            rows.add(time_ns, publications, judged=monitor.memory.watching_since_ns is not None)
 
         monitor.on_row_end = log_row
 
@@ -166,17 +166,17 @@ def run(
         if message.key.startswith(prefix) and (publications := monitor.on_message(message, message.received_ns)):
             keep(publications)
         if first_ns is None:
-            first_ns = monitor.first_ns
+            first_ns = monitor.memory.first_ns
     keep(monitor.finish())
     return Backtest(
         inputs=monitor.config.inputs,
         outputs=monitor.config.outputs,
         rows=monitor.rows,
-        first_ns=(monitor.first_ns or 0) if first_ns is None else first_ns,
-        last_ns=monitor.last_ns or 0,
+        first_ns=(monitor.memory.first_ns or 0) if first_ns is None else first_ns,
+        last_ns=monitor.memory.last_ns or 0,
         span_ns=monitor.span_ns,
         runs=1 + monitor.restarts,
-        watching_since_ns=monitor.watching_since_ns,
+        watching_since_ns=monitor.memory.watching_since_ns,
         expected_false_alarms=monitor.pipeline.expected_false_alarms,
         alarm_messages=alarms,
         refused=dict(monitor.rejects.by_reason),

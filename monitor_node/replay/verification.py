@@ -99,7 +99,7 @@ def verify(
         if session.lost:
             found.notes.append(f"{session.lost} samples did not reach the monitor, by its own account")
         found.rows += replay.monitor.rows
-        found.first_ns = found.first_ns or replay.monitor.first_ns or 0
+        found.first_ns = found.first_ns or replay.monitor.memory.first_ns or 0
     if not verified:
         raise InputError(f"cannot be verified: {found.notes[0]}")
     if len(sessions) > 1:

@@ -31,13 +31,12 @@ but isolated far values are then what the signal has.
 """
 
 from bisect import bisect_left, insort
-from collections import deque
 from collections.abc import Sequence
 from math import ceil, isfinite, log, sqrt
-from typing import Literal, NamedTuple, TypeAlias
+from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from msgspec.structs import replace
+from msgspec import field
 from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
 
@@ -50,9 +49,9 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, format_quantity, positive
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.spike_rate import SpikeRate, UsualSpikes, of_trainings
+from reactorwatch.spc.spike_rate import SpikeRate
 from reactorwatch.spc.training_errors import TrainingErrors, two_sided_tail
-from reactorwatch.stored_state import StoredState
+from reactorwatch.stored_state import Memory
 
 NORMAL = 0.5
 """Share of the limit within which a value is normal."""
@@ -94,47 +93,25 @@ class Verdict(NamedTuple):
 NO_SPIKE = Verdict(False, False, 0.0)
 
 
-class SpikeState(StoredState, frozen=True):
-    """State of a check.
-
-    Attributes:
-        limit: see `Spike`.
-        phase: the value before was normal (quiet), is quarantined, is quarantined after a spike, or was part of a
-            change.
-        held: quarantined value; 0 if there is none.
-        recent: newest values since an alarm is active, oldest first; empty without one.
-        usual: spikes at a steady rate; None: there were none in the training.
-    """
-
-    limit: float
-    phase: Phase
-    held: float
-    recent: list[float]
-    usual: UsualSpikes | None = None
-
-
 class RecentValues:
     """The newest values of a signal, `RECENT` at most, with their median and median absolute deviation.
 
     They are also kept in ascending order, so that a row does not sort them.
+
+    Args:
+        values: the values, oldest first; the same list from now on.
     """
 
-    def __init__(self) -> None:
-        self._values: deque[float] = deque()
-        self._ascending: list[float] = []
+    def __init__(self, values: list[float]) -> None:
+        self._values, self._ascending = values, sorted(values)
 
     def __len__(self) -> int:
         return len(self._ascending)
 
-    @property
-    def values(self) -> list[float]:
-        """The values, oldest first."""
-        return list(self._values)
-
     def append(self, value: float) -> None:
         """Add a finite value; the oldest one goes if there are too many."""
         if len(self._values) == RECENT:
-            del self._ascending[bisect_left(self._ascending, self._values.popleft())]
+            del self._ascending[bisect_left(self._ascending, self._values.pop(0))]
         self._values.append(value)
         insort(self._ascending, value)
 
@@ -165,8 +142,8 @@ class RecentValues:
         return level, (largest + max(below, ordered[low + half - 1] - level)) / 2
 
 
-class Spike:
-    """Distinguishes spikes from changes in the standardised residuals of one signal.
+class Spike(Memory, dict=True):
+    """Distinguishes spikes from changes in the standardised residuals of one signal; the object is its own state.
 
     >>> spike = Spike(limit=6.0)
     >>> [spike.update(z) for z in (0.3, 9.0, -0.5)][1:]
@@ -174,43 +151,37 @@ class Spike:
     >>> [spike.update(z).quarantine for z in (9.0, 9.0, 9.0)]  # a change
     [True, False, False]
 
-    Args:
+    Attributes:
         limit: limit in standard deviations, beyond which a value may be a spike.
+        phase: the value before was normal (quiet), is quarantined, is quarantined after a spike, or was part of a
+            change.
+        held: quarantined value; 0 if there is none.
+        recent: newest values since an alarm is active, oldest first; empty without one.
+        usual: spikes at a steady rate; None: there were none in the training.
 
     Raises:
         InputError: limit is not a positive number.
+        ValueError: a value is not finite.
     """
 
-    name = "spike"
+    limit: float
+    phase: Phase = "quiet"
+    held: float = 0.0
+    recent: list[float] = field(default_factory=list)
+    usual: SpikeRate | None = None
 
-    def __init__(self, limit: float) -> None:
-        self.limit = positive("limit", limit)
-        self._phase: Phase = "quiet"
-        self._held = 0.0
-        self._recent = RecentValues()
+    name: ClassVar[str] = "spike"
 
-    @classmethod
-    def from_state(cls, state: SpikeState) -> "Spike":
-        """Resume from a state.
-
-        Raises:
-            ValueError: the state is damaged.
-        """
-        spike = cls(state.limit)
-        spike._phase, spike._held = state.phase, finite(state.held)
-        for z in state.recent:
-            spike._recent.append(finite(z))
-        return spike
-
-    @property
-    def state(self) -> SpikeState:
-        """A copy of the state."""
-        return SpikeState(self.limit, self._phase, self._held, self._recent.values)
+    def __post_init__(self) -> None:
+        positive("limit", self.limit)
+        for z in (self.held, *self.recent):
+            finite(z)
+        self._newest = RecentValues(self.recent)
 
     @property
     def is_normal(self) -> bool:
         """True if a value within the limit would change nothing."""
-        return self._phase == "quiet" and not self._recent
+        return self.phase == "quiet" and not self.recent
 
     def update(self, z: float, *, is_moved: bool = False) -> Verdict:
         """Update with the next standardised residual; leave missing ones out.
@@ -222,19 +193,19 @@ class Spike:
         Raises:
             ValueError: the residual is not finite.
         """
-        recent = self._recent
+        recent = self._newest
         if not is_moved:
             if recent:
                 recent.clear()
             return self._decide(z)
-        level, spread, is_decided = 0.0, 1.0, recent or self._phase in ("quiet", "changed")
+        level, spread, is_decided = 0.0, 1.0, recent or self.phase in ("quiet", "changed")
         if len(recent) >= LEAST_RECENT:
             level, deviation = recent.median_and_deviation()
             margin = 1.0 + ERRORS / sqrt(len(recent))
             spread = max(1.0, margin * _TO_SD * deviation)
         elif is_decided:
             recent.append(finite(z))
-            self._phase, self._held = "changed", 0.0
+            self.phase, self.held = "changed", 0.0
             return NO_SPIKE
         verdict = self._decide((finite(z) - level) / spread)
         if not verdict.quarantine:
@@ -243,35 +214,35 @@ class Spike:
 
     def _decide(self, z: float) -> Verdict:
         """Decide on a residual about 0."""
-        if self._phase == "quiet" and abs(z) <= self.limit:  # as nearly always
+        if self.phase == "quiet" and abs(z) <= self.limit:  # as nearly always
             return NO_SPIKE
         if not abs(z) < LARGEST_VALUE:
             finite(z)
         beyond, normal = abs(z) > self.limit, abs(z) <= NORMAL * self.limit
-        held, self._held = self._held, 0.0
-        if self._phase in ("quiet", "changed"):
-            if self._phase == "changed" and not normal:
+        held, self.held = self.held, 0.0
+        if self.phase in ("quiet", "changed"):
+            if self.phase == "changed" and not normal:
                 return NO_SPIKE
-            self._phase = "held" if beyond else "quiet"
-            self._held = z if beyond else 0.0
+            self.phase = "held" if beyond else "quiet"
+            self.held = z if beyond else 0.0
             return Verdict(beyond, False, 0.0)
-        if not normal and (self._phase == "held again" or z * held > 0.0):
-            self._phase = "changed"
+        if not normal and (self.phase == "held again" or z * held > 0.0):
+            self.phase = "changed"
             return NO_SPIKE
-        self._phase = "held again" if beyond else "quiet"
-        self._held = z if beyond else 0.0
+        self.phase = "held again" if beyond else "quiet"
+        self.held = z if beyond else 0.0
         return Verdict(beyond, True, held)
 
     def restart(self) -> None:
         """Drop earlier values, as after a gap or a restart of the plant: a quarantined value stays undecided."""
-        self._phase, self._held = "quiet", 0.0
-        self._recent.clear()
+        self.phase, self.held = "quiet", 0.0
+        self._newest.clear()
 
 
 def false_spike_rate(limit: float) -> float:
     """Rate of false spikes per value among independent normal values.
 
-    The stationary rate of the Markov chain of `SpikeState.phase`.
+    The stationary rate of the Markov chain of `Spike.phase`.
 
     >>> round(1e9 * false_spike_rate(6.0), 2)
     1.97
@@ -322,7 +293,6 @@ class SpikeCheck(SignalCheck):
             for name in self.outputs
         ]
         self._spikes: list[Spike | None] = []
-        self._rates: list[SpikeRate | None] = [None] * len(self.outputs)
         self.limits = np.full(len(self.outputs), np.inf)
         """Limit of each output, within which a residual is no spike; infinite without a check."""
         self._none = (False,) * len(self.outputs)
@@ -330,18 +300,13 @@ class SpikeCheck(SignalCheck):
         self._quiet_limits: list[float] = []
 
     @property
-    def state(self) -> list[SpikeState | None]:
-        """State of each output; None for an output without the check; empty before the training ends."""
-        return [
-            None if spike is None else replace(spike.state, usual=None if rate is None else rate.state)
-            for spike, rate in zip(self._spikes, self._rates, strict=False)
-        ]
+    def state(self) -> list[Spike | None]:
+        """The check of each output; None for an output without one; empty before the training ends."""
+        return self._spikes
 
-    def restore(self, state: list[SpikeState | None]) -> None:
+    def restore(self, state: list[Spike | None]) -> None:
         """See `SignalCheck`."""
-        self._spikes = [None if item is None else Spike.from_state(item) for item in state]
-        usual = [None if item is None else item.usual for item in state] or [None] * len(self.outputs)
-        self._rates = [None if item is None else SpikeRate(item) for item in usual]
+        self._spikes = state
         self._set_limits()
 
     def learn_rates(self, counts: Sequence[int], rows: int, period_ns: float, arl0: float) -> None:
@@ -353,7 +318,9 @@ class SpikeCheck(SignalCheck):
             period_ns: sampling period.
             arl0: run length of each alarm without a fault, in rows.
         """
-        self._rates = of_trainings(counts, rows, period_ns, arl0)
+        for spike, count in zip(self._spikes, counts, strict=True):
+            if spike is not None and count:
+                spike.usual = SpikeRate.learn(count, rows, period_ns, arl0)
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """See `SignalCheck`."""
@@ -399,7 +366,7 @@ class SpikeCheck(SignalCheck):
             alarm, verdict = self._alarms[index], spike.update(e[index], is_moved=is_moved)
             if verdict.quarantine:
                 flags = (*flags[:index], True, *flags[index + 1 :])
-            rate, count = self._rates[index], 1
+            rate, count = spike.usual, 1
             if verdict.spike and rate is not None:
                 count = rate.add(time_ns)
             is_alarm = verdict.spike and count > 0

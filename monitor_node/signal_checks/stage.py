@@ -18,7 +18,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import Flags, SignalCheck
 from monitor_node.signal_checks.catalogue import CHECKS
 from monitor_node.signal_checks.range import RangeCheck
-from monitor_node.signal_checks.spike import SpikeCheck, SpikeState
+from monitor_node.signal_checks.spike import Spike, SpikeCheck
 from monitor_node.signal_checks.stuck import StuckCheck, StuckState
 from monitor_node.signal_checks.timeout import DataTimeoutState, SilenceCheck
 from reactorwatch.arrays import Array
@@ -34,13 +34,13 @@ class SignalChecksState(StoredState, frozen=True, omit_defaults=True):
     Attributes:
         silences: state of the plant, of each input and of each output.
         stuck: state of each output; empty before the training ends.
-        spikes: state of each output; None for an output without the check; empty before the training ends.
+        spikes: check of each output; None for an output without the check; empty before the training ends.
         others: the states of the other checks, by name.
     """
 
     silences: list[DataTimeoutState]
     stuck: list[StuckState]
-    spikes: list[SpikeState | None]
+    spikes: list[Spike | None]
     others: dict[str, bytes] = msgspec.field(default_factory=dict)
 
 

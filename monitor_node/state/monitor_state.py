@@ -19,7 +19,7 @@ from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.value_chart import ValueChart
-from reactorwatch.stored_state import StoredState
+from reactorwatch.stored_state import Memory
 
 MAGIC = b"reactorwatch monitor"
 UPGRADES = {2: lambda body: version_3.upgrade(version_2.upgrade(body)), 3: version_3.upgrade}
@@ -42,15 +42,11 @@ class OtherSettingsError(InputError):
     """The state is intact, but was learned with other settings."""
 
 
-class MonitorState(StoredState, frozen=True):
-    """State of a monitor.
+class MonitorMemory(Memory, kw_only=True):
+    """What a monitor remembers beside its parts, while it runs and in its stored state.
 
     Attributes:
-        settings: settings of the training, see `learning_settings`.
         runs: sequence checks of the signals, the inputs first.
-        alignment: state of the alignment.
-        board: state of the alarms, see `Annunciator.to_bytes`.
-        watch: state of the pipeline.
         units: newest unit by signal.
         heard_from_ns: time of the first accepted sample by signal.
         first_ns: time of the first row; None before it.
@@ -61,24 +57,36 @@ class MonitorState(StoredState, frozen=True):
         published: number of messages published.
         refused: number of rejected messages by reason.
         failures: number of contained errors of this software by stage.
+    """
+
+    runs: list[SequenceCheck]
+    units: dict[str, str]
+    heard_from_ns: dict[str, int] = msgspec.field(default_factory=dict)
+    first_ns: int | None = None
+    last_ns: int | None = None
+    watching_since_ns: int | None = None
+    snapshot_due_ns: int | None = None
+    received: int = 0
+    published: int = 0
+    refused: dict[str, int] = msgspec.field(default_factory=dict)
+    failures: dict[str, int] = msgspec.field(default_factory=dict)
+
+
+class MonitorState(MonitorMemory, kw_only=True):
+    """State of a monitor: its memory and its parts.
+
+    Attributes:
+        settings: settings of the training, see `learning_settings`.
+        alignment: state of the alignment.
+        board: state of the alarms, see `Annunciator.to_bytes`.
+        watch: state of the pipeline.
         unconfirmed: the newest publications, which may not have left the process; empty if they have.
     """
 
     settings: dict[str, Any]
-    runs: list[SequenceCheck]
     alignment: AlignmentState
     board: bytes
     watch: PipelineState
-    units: dict[str, str]
-    heard_from_ns: dict[str, int]
-    first_ns: int | None
-    last_ns: int | None
-    watching_since_ns: int | None
-    snapshot_due_ns: int | None
-    received: int
-    published: int
-    refused: dict[str, int]
-    failures: dict[str, int] = msgspec.field(default_factory=dict)
     unconfirmed: list[tuple[str, bytes, str]] = msgspec.field(default_factory=list)  # key, payload and encoding
 
 

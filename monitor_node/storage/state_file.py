@@ -58,7 +58,7 @@ class StateFile:
 
     def due_ns(self) -> int | None:
         """Time of the next storage; None: nothing has changed."""
-        return None if self._monitor.received == self._heard_stored else self._due_ns
+        return None if self._monitor.memory.received == self._heard_stored else self._due_ns
 
     def is_due(self, now_ns: int) -> bool:
         """True if an alarm or the baseline has changed, or messages were received and the interval is over."""
@@ -67,7 +67,7 @@ class StateFile:
         if self._monitor.changes == self._alarms_stored and now_ns < self._due_ns:
             return False
         self._due_ns = now_ns + self._every_ns
-        return self._monitor.changes != self._alarms_stored or self._monitor.received != self._heard_stored
+        return self._monitor.changes != self._alarms_stored or self._monitor.memory.received != self._heard_stored
 
     def store(self) -> None:
         """Write the present state.
@@ -77,7 +77,7 @@ class StateFile:
         """
         self._alarms_stored, self._heard_stored = self._monitor.changes, None
         self._write()
-        self._heard_stored = self._monitor.received
+        self._heard_stored = self._monitor.memory.received
 
     def _write(self) -> None:
         try:

@@ -10,10 +10,7 @@ rows that chance has as many no more often than once in `arl0` rows. A signal wi
 alarm at each.
 """
 
-from collections import deque
-from collections.abc import Sequence
-from typing import NamedTuple
-
+import msgspec
 from scipy.special import nbdtrc
 
 SHARE = 0.5
@@ -22,8 +19,8 @@ SHARE = 0.5
 MOST = 10_000
 
 
-class UsualSpikes(NamedTuple):
-    """Spikes of a training, and those since.
+class SpikeRate(msgspec.Struct, array_like=True):
+    """Decides which spike is an alarm; the object is its own state.
 
     Attributes:
         outliers: number of outliers in the training.
@@ -37,18 +34,6 @@ class UsualSpikes(NamedTuple):
     limit: int
     recent_ns: list[int]
 
-
-class SpikeRate:
-    """Decides which spike is an alarm.
-
-    Args:
-        usual: spikes of the training, and those since.
-    """
-
-    def __init__(self, usual: UsualSpikes) -> None:
-        self._usual = usual
-        self._recent: deque[int] = deque(usual.recent_ns, maxlen=usual.limit)
-
     @classmethod
     def learn(cls, count: int, rows: int, period_ns: float, arl0: float) -> "SpikeRate":
         """Learn from a training.
@@ -60,30 +45,25 @@ class SpikeRate:
             arl0: least mean number of rows between two false alarms.
         """
         window = max(int(SHARE * rows), 1)
-        return cls(UsualSpikes(count, round(window * period_ns), spike_count_limit(count, rows, window, arl0), []))
-
-    @property
-    def state(self) -> UsualSpikes:
-        """A copy of the state."""
-        return self._usual._replace(recent_ns=list(self._recent))
+        return cls(count, round(window * period_ns), spike_count_limit(count, rows, window, arl0), [])
 
     @property
     def usual(self) -> float:
         """Number of spikes that are usual in the window."""
-        return SHARE * self._usual.outliers
+        return SHARE * self.outliers
 
     @property
     def window_min(self) -> float:
         """Length of the window in minutes."""
-        return self._usual.window_ns / 60e9
+        return self.window_ns / 60e9
 
     def add(self, time_ns: int) -> int:
         """Count a spike; returns the number in the window if it is an alarm, else 0."""
-        recent = self._recent
+        recent = self.recent_ns
         recent.append(time_ns)
-        while time_ns - recent[0] > self._usual.window_ns or recent[0] > time_ns:
-            recent.popleft()
-        if len(recent) < self._usual.limit:
+        while time_ns - recent[0] > self.window_ns or recent[0] > time_ns:
+            del recent[0]
+        if len(recent) < self.limit:
             return 0
         count = len(recent)
         recent.clear()
@@ -110,8 +90,3 @@ def spike_count_limit(count: int, rows: int, window: int, arl0: float) -> int:
         if rate * (float(nbdtrc(others - 1, count + 1, share)) if others else 1.0) <= 1.0 / arl0:
             return others + 1
     return MOST
-
-
-def of_trainings(counts: Sequence[int], rows: int, period_ns: float, arl0: float) -> list[SpikeRate | None]:
-    """The rate of each output; None where the training had no outlier. Arguments as for `SpikeRate.learn`."""
-    return [SpikeRate.learn(count, rows, period_ns, arl0) if count else None for count in counts]

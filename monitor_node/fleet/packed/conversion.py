@@ -36,7 +36,7 @@ from monitor_node.ingest.sampling import SamplingState
 from monitor_node.isolation.stage import SuspicionState, has_causes
 from monitor_node.pipeline.pipeline_state import PipelineState, TrainedState
 from monitor_node.pipeline.row_step import RowStep
-from monitor_node.signal_checks.spike import SpikeState
+from monitor_node.signal_checks.spike import Spike
 from monitor_node.signal_checks.stage import SignalChecksState
 from monitor_node.signal_checks.stuck import Stuck
 from monitor_node.signal_checks.timeout import DataTimeout
@@ -291,21 +291,20 @@ class Conversion:
             watched,
         )
         return MonitorState(
-            {},
-            runs_of(p),
-            alignment_of(p, [*rows.times_ns, *waiting]),
-            self._board_of(plant, p, numbers, rest),
-            watch,
-            dict(zip(self._signals, rest.units, strict=True)),
-            dict(zip(self._signals, p["heard_from_ns"].tolist(), strict=True)),
-            int(p["first_ns"]),
-            last_ns,
-            int(p["watching_since_ns"]),
-            None,
-            int(p["received"]),
-            int(p["published"]),
-            dict(rest.refused or {}),
-            dict(rest.failures or {}),
+            settings={},
+            runs=runs_of(p),
+            alignment=alignment_of(p, [*rows.times_ns, *waiting]),
+            board=self._board_of(plant, p, numbers, rest),
+            watch=watch,
+            units=dict(zip(self._signals, rest.units, strict=True)),
+            heard_from_ns=dict(zip(self._signals, p["heard_from_ns"].tolist(), strict=True)),
+            first_ns=int(p["first_ns"]),
+            last_ns=last_ns,
+            watching_since_ns=int(p["watching_since_ns"]),
+            received=int(p["received"]),
+            published=int(p["published"]),
+            refused=dict(rest.refused or {}),
+            failures=dict(rest.failures or {}),
         )
 
     def _signals_of(self, p: np.void, numbers: np.void, trainings: list[EqualRuns]) -> SignalChecksState:
@@ -321,10 +320,7 @@ class Conversion:
                 Stuck.of_numbers(arl0, runs, numbers["stuck"][i : i + 1]).state
                 for i, (runs, arl0) in enumerate(trainings)
             ],
-            [
-                SpikeState(limit, "quiet", 0.0, []) if isfinite(limit) else None
-                for limit in numbers["spike_limits"].tolist()
-            ],
+            [Spike(limit) if isfinite(limit) else None for limit in numbers["spike_limits"].tolist()],
         )
 
     def _charts(self, numbers: np.void) -> dict[str, bytes]:

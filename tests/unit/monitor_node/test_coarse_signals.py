@@ -31,8 +31,8 @@ def test_an_output_in_steps_is_watched_with_the_others(step: float, seed: int) -
     sound = Monitor(config_of(3, TRAINING), 0, points=False)
     assert raised(watch(sound, values)) == []
     assert sound.excluded_signals == {}
-    assert sound.watching_since_ns is not None
-    assert sound.watching_since_ns / 6e9 == TRAINING
+    assert sound.memory.watching_since_ns is not None
+    assert sound.memory.watching_since_ns / 6e9 == TRAINING
     assert not any("outliers" in note or "anew" in note for note in sound.notes)
     values[1, 500:] += 2 * step * np.ceil(6 * NOISE / (2 * step))
     faulty = Monitor(config_of(3, TRAINING), 0, points=False)
@@ -46,7 +46,7 @@ def test_a_coarse_thermometer_of_the_reactor_costs_no_training(step: float, refe
     columns["T"] = np.round(columns["T"] / step) * step
     config = MonitorConfig(isolation=False, reference=reference)  # type: ignore[arg-type]
     run = watched(time_min, columns, config)
-    assert run.monitor.watching_since_ns == 100 * 60 * 10**9
+    assert run.monitor.memory.watching_since_ns == 100 * 60 * 10**9
     assert run.monitor.excluded_signals == {}
 
 

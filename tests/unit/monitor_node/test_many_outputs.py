@@ -77,7 +77,7 @@ def test_the_default_charts_watch_any_number_of_outputs(outputs: int, training_r
     values[-1, training_rows + 60 :] += 6.0
     said = watch(monitor, values)
     assert monitor.phase == "watching"
-    assert monitor.watching_since_ns == max(training_rows, 73) * ROW_NS  # ten rows for each of seven parameters
+    assert monitor.memory.watching_since_ns == max(training_rows, 73) * ROW_NS  # ten rows for each of seven parameters
     assert f"ewma/y{outputs - 1}" in raised(said)
     assert not any(name.endswith("/y0") for name in raised(said) if outputs > 1)
     assert training_notes(monitor) == []
@@ -127,8 +127,8 @@ def test_the_default_promise_is_refused_at_no_period_and_what_is_promised_is_sai
     alarms = 5 * outputs + (outputs > 1)
     fewest, most = (30 * 86_400 / period_s * alarms / arl0 for arl0 in (1e8, 50.0))
     promised = min(max(1.0, fewest), most)
-    assert monitor.watching_since_ns is not None
-    days = 200 * period_s / 86_400 - monitor.watching_since_ns / 86_400e9
+    assert monitor.memory.watching_since_ns is not None
+    days = 200 * period_s / 86_400 - monitor.memory.watching_since_ns / 86_400e9
     assert monitor.pipeline.expected_false_alarms == pytest.approx(promised * days / 30)
     told = f"training: {promised:.3g} false alarms in 30 days are promised instead of 1: that is the nearest"
     assert [note.startswith(told) for note in monitor.notes] == ([True] if promised != 1.0 else [])

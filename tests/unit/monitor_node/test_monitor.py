@@ -162,7 +162,7 @@ def test_what_judges_is_published_with_its_noise_levels_and_nothing_else_says_th
 ) -> None:
     monitor, said = watch(leak, MonitorConfig(reference=setting, isolation=False))
     models = [(item.key, item.message) for item in said if isinstance(item.message, ModelSnapshot)]
-    since_ns = monitor.watching_since_ns
+    since_ns = monitor.memory.watching_since_ns
     assert since_ns is not None
     for key in ("reactor/cstr/model/C", "reactor/cstr/model/T"):
         judging = [model for where, model in models if where == key and model.reference]

@@ -22,9 +22,9 @@ def stated(**length: object) -> MonitorConfig:
 def test_a_training_of_so_many_rows_ends_with_them(rows: int) -> None:
     monitor = Monitor(stated(training_rows=rows), 0, points=False)
     watch(monitor, plant(1, rows))
-    assert (monitor.phase, monitor.pipeline.trained_share(monitor.last_ns)) == ("training", 1.0)
+    assert (monitor.phase, monitor.pipeline.trained_share(monitor.memory.last_ns)) == ("training", 1.0)
     watch(monitor, plant(1, rows + 1), first=rows)
-    assert monitor.watching_since_ns == rows * ROW_NS
+    assert monitor.memory.watching_since_ns == rows * ROW_NS
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,8 @@ def test_a_training_of_which_too_much_is_disturbed_begins_anew() -> None:
     columns["T"][550:1000] += 3.0
     run = watched(time_min, columns)
     assert run.monitor.notes[0] == "the training starts again: more than a third of it was disturbed in T"
-    assert run.monitor.watching_since_ns is not None
-    assert run.monitor.watching_since_ns / 60e9 == pytest.approx(200.0, abs=0.2)
+    assert run.monitor.memory.watching_since_ns is not None
+    assert run.monitor.memory.watching_since_ns / 60e9 == pytest.approx(200.0, abs=0.2)
 
 
 def test_a_plant_that_never_rests_is_watched_after_the_third_training() -> None:

@@ -154,7 +154,7 @@ def test_a_finding_of_another_training_is_ignored(warm: Run) -> None:
 def test_without_the_setting_no_training_is_diagnosed(warm: Run) -> None:
     monitor = Monitor(GIVEN, 0)
     publish(monitor, warm.messages[: TRAINED + 3])
-    assert monitor.watching_since_ns is not None
+    assert monitor.memory.watching_since_ns is not None
     assert monitor.diagnosis_job is None
 
 

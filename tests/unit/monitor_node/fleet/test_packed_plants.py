@@ -325,7 +325,7 @@ def test_a_plant_whose_samples_are_converted_keeps_a_monitor_of_its_own() -> Non
     for begin in range(0, len(run), 30):
         monitor.on_messages(run[begin : begin + 30], 10**9 * begin)
     assert monitor.quiet == []
-    assert monitor.monitor("x").watching_since_ns is not None
+    assert monitor.monitor("x").memory.watching_since_ns is not None
 
 
 def comparable(state: MonitorState) -> MonitorState:

@@ -140,7 +140,7 @@ def test_a_silence_that_was_raised_after_the_state_was_stored_is_cleared_by_who_
     run, at_home = run_of("b", 2), home_shard("b", 2)
     first = fleet(shard=Shard(at_home, 2), name="first")
     first.on_messages(run[:300], 0)
-    state, last_ns = first.monitor("b").to_bytes(), first.monitor("b").last_ns
+    state, last_ns = first.monitor("b").to_bytes(), first.monitor("b").memory.last_ns
     assert last_ns is not None
     raised_ns = last_ns + 30 * SECOND_NS
     silent = Alarm(time_ns=raised_ns, alarm="silence/plant", event="raised", raised_ns=raised_ns)

@@ -100,7 +100,7 @@ def test_whatever_happens_to_the_plant_the_monitor_goes_on_and_says_what_it_know
     assert told
     for alarm in told:
         assert 0.5 < sum(item.probability for item in alarm.suspects) <= 1.0 + 1e-9
-    assert run.monitor.last_ns == round(SPAN_MIN * 10 - 1) * 6_000_000_000
+    assert run.monitor.memory.last_ns == round(SPAN_MIN * 10 - 1) * 6_000_000_000
 
 
 def test_a_monitor_that_resumes_between_two_looks_publishes_the_same_suspects() -> None:

@@ -179,7 +179,7 @@ def test_a_wrong_command_gets_one_line_and_changes_nothing(
     assert not reply.accepted
     assert reply.text.startswith(text)
     assert published == []
-    run.monitor.received -= 1
+    run.monitor.memory.received -= 1
     run.monitor.rejects.by_reason.clear()
     assert run.monitor.to_bytes() == before
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from monitor_node.signal_checks.spike import RECENT, RecentValues, Spike, SpikeState, false_spike_rate, spike_limit
+from monitor_node.signal_checks.spike import RECENT, RecentValues, Spike, false_spike_rate, spike_limit
 from reactorwatch.errors import InputError
 
 LIMIT = 6.0
@@ -121,7 +121,7 @@ def test_when_no_alarm_stands_any_more_values_are_judged_about_zero_again() -> N
     for _ in range(40):
         spike.update(8.0, is_moved=True)
     assert [spike.update(z).quarantine for z in (0.2, 8.0, 0.1)] == [False, True, False]
-    assert spike.state.recent == []
+    assert spike.recent == []
 
 
 def test_a_value_that_was_withheld_when_the_alarm_came_is_decided_by_the_next() -> None:
@@ -216,7 +216,7 @@ def test_it_goes_on_from_its_stored_state_as_if_it_had_never_stopped(
     through, stopped = Spike(LIMIT), Spike(LIMIT)
     expected = [through.update(z, is_moved=is_moved) for z, is_moved in values]
     said = [stopped.update(z, is_moved=is_moved) for z, is_moved in values[:cut]]
-    resumed = Spike.from_state(SpikeState.from_bytes(stopped.state.to_bytes()))
+    resumed = Spike.from_bytes(stopped.to_bytes())
     assert said + [resumed.update(z, is_moved=is_moved) for z, is_moved in values[cut:]] == expected
 
 
@@ -229,10 +229,11 @@ def test_whether_an_alarm_stands_or_not_no_three_values_in_a_row_are_withheld(va
 
 @given(st.lists(st.one_of(st.floats(-1e3, 1e3), st.sampled_from([-1.0, 0.0, 2.0])), min_size=1, max_size=2 * RECENT))
 def test_median_and_deviation_of_recent_values_are_those_of_the_sorted_values(values: list[float]) -> None:
-    recent = RecentValues()
+    kept: list[float] = []
+    recent = RecentValues(kept)
     for end, value in enumerate(values, start=1):
         recent.append(value)
         newest = values[max(0, end - RECENT) : end]
-        assert recent.values == newest
+        assert kept == newest
         level = median(newest)
         assert recent.median_and_deviation() == (level, median(abs(item - level) for item in newest))

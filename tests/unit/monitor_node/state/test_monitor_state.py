@@ -282,8 +282,8 @@ def test_a_plant_that_began_anew_meanwhile_is_heard(leak: list[Encoded]) -> None
     run(monitor, leak, 0, 2300)
     again.from_bytes(monitor.to_bytes())
     rows = again.rows
-    assert again.last_ns is not None
-    begin_min = again.last_ns / 60e9 - 1.0
+    assert again.memory.last_ns is not None
+    begin_min = again.memory.last_ns / 60e9 - 1.0
     for row in range(50):
         for signal, value in (("qc", 100.0), ("C", 0.1), ("T", 438.5)):
             again.on_message(sample(signal, row, begin_min + row / 10, value), 0)
