@@ -66,7 +66,12 @@ IDLE_S = 10.0
 HELD_ROWS = KNOWN_ROWS + 2  # of each plant, while it is seen what it takes: none of them is out
 HELD_PER_S = 10_000  # so slowly that nothing waits in a buffer
 PATIENT = 1e6  # periods: between training and the first sample live a plant is no silent one
-FAST = MonitorConfig(training_min=20.0, charts=("shewhart", "ewma", "cusum", "mewma"), silence_periods=PATIENT)
+FAST = MonitorConfig(
+    training_min=20.0,
+    charts=("shewhart", "ewma", "cusum", "mewma"),
+    silence_periods=PATIENT,
+    diagnose_training=False,  # which unpacks a plant for a row, and is the work of another process
+)
 SHARP = MonitorConfig(
     training_min=20.0,
     charts=("shewhart",),
@@ -75,6 +80,7 @@ SHARP = MonitorConfig(
     clear_count=1,
     isolation=False,
     silence_periods=PATIENT,
+    diagnose_training=False,
 )
 """One point out raises an alarm, one point back in clears it."""
 
