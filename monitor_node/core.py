@@ -69,7 +69,7 @@ class Monitor:
         failures: contained errors of this software.
         alarms: alarms of the plant.
         pipeline: pipeline of the plant's rows.
-        memory: what the monitor itself remembers, beside its parts.
+        memory: what the monitor remembers beside its parts.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
         on_row_end: called after each row with its time and the publications because of it; None: not called.
         unconfirmed: the newest publications, which a kill may keep from leaving the process; the caller sets them. They

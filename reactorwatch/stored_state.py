@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class Storable:
-    """What has a form that can be stored, as MessagePack."""
+    """Mixin of structures that can be stored, as MessagePack."""
 
     __slots__ = ()
 
@@ -35,7 +35,7 @@ class Storable:
 
 
 class Memory(Storable, msgspec.Struct, forbid_unknown_fields=True):
-    """Base class of what changes with the rows, and is its own state: its fields are what is stored."""
+    """Base class of structures that change with the rows and are their own state: their fields are what is stored."""
 
 
 class StoredState(Storable, msgspec.Struct, frozen=True, forbid_unknown_fields=True):

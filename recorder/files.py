@@ -28,10 +28,10 @@ from recorder.policy.retention import CompleteRecording, Limits, select_deletion
 from recorder.storage.ages import Ages, BootClock, read_boot_clock
 from recorder.storage.background import BackgroundTasks
 from recorder.storage.black_box_files import BlackBoxFiles
+from recorder.storage.crash_recovery import find_orphans, list_damaged, repair
 from recorder.storage.gaps import GAP, to_metadata
 from recorder.storage.mcap_scan import RawMessage, Scan, Wanted
 from recorder.storage.mcap_writer import FILE_INDEX, RecordingWriter, check_free, part_of
-from recorder.storage.orphans import find_orphans, list_damaged, repair
 from recorder.storage.part_file import PART, PartFile
 from recorder.storage.process_metadata import PROCESS
 from recorder.storage.process_metadata import to_metadata as process_metadata

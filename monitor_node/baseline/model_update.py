@@ -11,7 +11,7 @@ from typing import NamedTuple
 from monitor_node.baseline.arx_fit import arx_structure
 from monitor_node.baseline.commands import is_command
 from monitor_node.baseline.predictor import ArxPredictor
-from monitor_node.baseline.references import ProcessReference
+from monitor_node.baseline.process_reference import ProcessReference
 from monitor_node.baseline.training import Training, TrainingResult
 from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, Finding, read_equations
 from monitor_node.baseline.training_rows import TrainingState

@@ -18,11 +18,13 @@ import numpy as np
 from msgspec.structs import replace
 
 from monitor_node.baseline.arx_fit import ROWS_A_PARAMETER, arx_structure, fewest_rows
+from monitor_node.baseline.arx_reference import ArxReference
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.move_check import AfterMoves, compare_after_moves
 from monitor_node.baseline.outlier_blocks import Screening, screen_baseline
 from monitor_node.baseline.predictor import ArxPredictor
-from monitor_node.baseline.references import ArxReference, ProcessReference, Reference
+from monitor_node.baseline.process_reference import ProcessReference
+from monitor_node.baseline.references import Reference
 from monitor_node.baseline.resolution import resolution_sd
 from monitor_node.baseline.signal_range import possible_ranges
 from monitor_node.baseline.training_rows import TrainingRows

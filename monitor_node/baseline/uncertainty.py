@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from monitor_node.baseline.outlier_blocks import screen_baseline
-from monitor_node.baseline.references import GATE, fit_training_noise, output_indices
+from monitor_node.baseline.process_reference import fit_training_noise, output_indices
+from monitor_node.baseline.references import GATE
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.whiteness import minus_log10_p
 from reactorwatch.kalman.ekf import Filter, FilterState

@@ -21,7 +21,7 @@ import msgspec
 
 from monitor_node.alarms.alarms import STUCK_SENSOR, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.baseline.references import ProcessReference, output_indices
+from monitor_node.baseline.process_reference import ProcessReference, output_indices
 from monitor_node.config import MonitorConfig
 from monitor_node.isolation.candidate import ProgressState
 from monitor_node.isolation.causes import causes_of
@@ -37,7 +37,7 @@ from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.effect import SensorEffect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
+from reactorwatch.stored_state import Memory, pack_numbers, unpack_numbers
 
 LOOKS = (10, 30, 100, 300, 1000, 1300)
 """Numbers of rows after the first alarm of an incident at which the causes are compared."""
@@ -86,33 +86,41 @@ def has_causes(config: MonitorConfig, model: ProcessModel) -> bool:
     return config.isolation and bool(model.inputs and causes_of(model))
 
 
-class SuspicionState(StoredState, frozen=True):
-    """State of the search for causes.
+class SuspicionMemory(Memory, kw_only=True):
+    """Memory of a search for causes beside its parts, while it runs and in its stored state.
 
     Attributes:
-        rows: newest rows as doubles: time in minutes, inputs, outputs of the model.
         incident: number of the latest incident with a search.
         since: number of rows since its first alarm; None: no active alarm has an unknown cause.
-        way: `ProgressState` of a large fault; None without one. Earlier versions stored another structure, which is
-            ignored: the fault is then followed from its start again.
         output: output of the newest reconstruction.
         cause: cause of the reconstruction.
-        reconstruction: state of the reconstruction; None without one.
-        live: state of the probabilities that follow the rows; None without an active alarm of unknown cause.
         published: probabilities of the suspects that were published last, by cause.
         named_rows: number of rows since the first alarm at the last look, if it named a cause; else 0.
     """
 
-    rows: bytes
-    incident: int
-    since: int | None
-    way: object
-    output: str
-    cause: str
-    reconstruction: ReconstructionState | None
-    live: LivePosteriorState | None = None
-    published: dict[str, float] = {}  # noqa: RUF012 # msgspec copies it
+    incident: int = 0
+    since: int | None = None
+    output: str = ""
+    cause: str = ""
+    published: dict[str, float] = msgspec.field(default_factory=dict)
     named_rows: int = 0
+
+
+class SuspicionState(SuspicionMemory, kw_only=True):
+    """State of the search for causes: its memory and its parts.
+
+    Attributes:
+        rows: newest rows as doubles: time in minutes, inputs, outputs of the model.
+        way: `ProgressState` of a large fault; None without one. Earlier versions stored another structure, which is
+            ignored: the fault is then followed from its start again.
+        reconstruction: state of the reconstruction; None without one.
+        live: state of the probabilities that follow the rows; None without an active alarm of unknown cause.
+    """
+
+    rows: bytes
+    way: object = None
+    reconstruction: ReconstructionState | None = None
+    live: LivePosteriorState | None = None
 
 
 class Suspicion:
@@ -131,30 +139,21 @@ class Suspicion:
         self._effects = {effect.name: effect for effect in causes_of(reference.equations)}
         self._isolation: Isolation | None = None
         self._live: LivePosterior | None = None
-        self._published: dict[str, float] = {}
-        self._named_rows = 0
         # Flat, as most of the memory of a plant: time in minutes, inputs, outputs of the model.
         self._rows: deque[tuple[float, ...]] = deque(maxlen=config.isolation_rows)
-        self._incident = 0
-        self._since: int | None = None
         self._reconstruction: Reconstruction | None = None
-        self._output = self._cause = ""
+        self._memory = SuspicionMemory()
 
     @property
     def state(self) -> SuspicionState:
         """A copy of the state."""
         progress = None if self._isolation is None else self._isolation.progress
         return SuspicionState(
-            pack_numbers(list(self._rows)),
-            self._incident,
-            self._since,
-            None if progress is None else msgspec.to_builtins(progress),
-            self._output,
-            self._cause,
-            None if self._reconstruction is None else self._reconstruction.state,
-            None if self._live is None else self._live.state,
-            dict(self._published),
-            self._named_rows,
+            **msgspec.structs.asdict(self._memory),
+            rows=pack_numbers(list(self._rows)),
+            way=None if progress is None else msgspec.to_builtins(progress),
+            reconstruction=None if self._reconstruction is None else self._reconstruction.state,
+            live=None if self._live is None else self._live.state,
         )
 
     def restore(self, state: SuspicionState) -> None:
@@ -164,7 +163,7 @@ class Suspicion:
             ValueError: the state is damaged.
         """
         model = self._reference.equations
-        self._incident = state.incident
+        self._memory = msgspec.convert(state, SuspicionMemory, from_attributes=True)
         self._set_since(state.since)
         self._rows.extend(map(tuple, unpack_numbers(state.rows, 1 + len(model.inputs) + len(model.outputs)).tolist()))
         if state.way is not None:
@@ -173,12 +172,10 @@ class Suspicion:
         if state.live is not None:
             live = self._made_isolation().new_live_posterior()
             self._live = live if live.restore(state.live) else None
-        self._published, self._named_rows = dict(state.published), state.named_rows
         if state.reconstruction is not None:
             self._reconstruct(state.output, state.cause, 0.0, ())
             assert self._reconstruction is not None
             self._reconstruction.restore(state.reconstruction)
-        self._output, self._cause = state.output, state.cause
 
     def update(
         self, time_ns: int, inputs: Sequence[float], values: list[float], units: list[str], stuck: list[bool]
@@ -197,24 +194,24 @@ class Suspicion:
         board = self._board
         if not board.has_unexplained and True not in stuck:  # the usual case
             self._reconstruction = None
-            if self._since is not None:
+            if self._memory.since is not None:
                 self._set_since(None)
             return []
         if True in stuck:
             self._reconstruct(self._config.outputs[stuck.index(True)], STUCK_SENSOR, time_min, self._split_rows()[:-1])
-        elif self._cause == STUCK_SENSOR or not board.has_unexplained:
+        elif self._memory.cause == STUCK_SENSOR or not board.has_unexplained:
             self._reconstruction = None
         publications = self._publish_reconstruction(time_ns, inputs, measured, values, units)
         if not board.has_unexplained:
             self._set_since(None)
             return publications
-        is_new = self._since is None or board.incident != self._incident
-        self._incident = board.incident
+        is_new = self._memory.since is None or board.incident != self._memory.incident
+        self._memory.incident = board.incident
         if is_new:
             self._live = None
             if self._isolation is not None:
                 self._isolation.progress = None
-        since = 1 if is_new or self._since is None else self._since + 1
+        since = 1 if is_new or self._memory.since is None else self._memory.since + 1
         self._set_since(since)
         if since in LOOKS and self._has_rows(since):
             publications += self._look(time_ns, since)
@@ -224,9 +221,9 @@ class Suspicion:
 
     def _set_since(self, since: int | None) -> None:
         """Set the number of rows since the first alarm; more rows are kept as long as looks follow."""
-        self._since = since
+        self._memory.since = since
         if since is None:
-            self._live, self._published, self._named_rows = None, {}, 0
+            self._live, self._memory.published, self._memory.named_rows = None, {}, 0
         usual = self._config.isolation_rows
         if since is not None and since <= LOOKS[-1]:
             usual = max(usual, min(usual, ROWS_BEFORE) + LOOKS[-1])
@@ -237,7 +234,7 @@ class Suspicion:
 
     def _is_early_look_useful(self, since: int) -> bool:
         """Return true if the last look named a cause, and enough rows have come since."""
-        return 0 < LEAST_GROWTH * self._named_rows <= since < LOOKS[-1]
+        return 0 < LEAST_GROWTH * self._memory.named_rows <= since < LOOKS[-1]
 
     def _has_rows(self, since: int) -> bool:
         """Return true if the rows for a look are known; late looks need rows that are not far apart."""
@@ -257,7 +254,7 @@ class Suspicion:
         suspects = isolation.suspects(self._rows_of_look(since), min(since, FEW_ROWS))
         publications = self._publish(time_ns, suspects, stopped=isolation.stopped)
         self._live = isolation.follow()
-        self._named_rows = since if suspects[0].cause != UNKNOWN else 0
+        self._memory.named_rows = since if suspects[0].cause != UNKNOWN else 0
         return publications
 
     def _follow_causes(
@@ -267,7 +264,7 @@ class Suspicion:
         if not live.update(time_ns / MINUTE_NS, inputs, measured):
             self._live = None
             return []
-        before, since = self._published, self._since or 0
+        before, since = self._memory.published, self._memory.since or 0
         may_look = self._is_early_look_useful(since)
         if not live.has_moved(WORTH_PUBLISHING - LEAST):  # suspects below `LEAST` are not published
             is_unknown = max(before, key=before.__getitem__, default="") == UNKNOWN
@@ -285,7 +282,7 @@ class Suspicion:
         return self._publish(time_ns, suspects)
 
     def _publish(self, time_ns: int, suspects: Sequence[Suspect], *, stopped: bool = False) -> list[Publication]:
-        self._published = {item.cause: item.probability for item in suspects if item.probability >= LEAST}
+        self._memory.published = {item.cause: item.probability for item in suspects if item.probability >= LEAST}
         causes = [self._suspected_cause(item) for item in suspects if item.probability >= LEAST]
         publications = self._board.set_suspects(time_ns, causes, stopped=stopped)
         self._follow(suspects[0])
@@ -322,16 +319,16 @@ class Suspicion:
         output = effect.output if isinstance(effect, SensorEffect) else ""
         if suspect.probability >= CONVINCED and output in self._config.outputs:
             self._reconstruct(output, suspect.cause, suspect.onset_min, self._split_rows())
-        elif self._cause != STUCK_SENSOR:
+        elif self._memory.cause != STUCK_SENSOR:
             self._reconstruction = None
 
     def _reconstruct(self, output: str, cause: str, onset_min: float, rows: Iterable[Row]) -> None:
         """Start to reconstruct the sensor of an output after these rows, unless that is done already."""
-        if self._reconstruction is None or (output, cause) != (self._output, self._cause):
+        if self._reconstruction is None or (output, cause) != (self._memory.output, self._memory.cause):
             model, noise = self._reference.equations, self._reference.plant_noise
             index = model.output_names.index(output)
             self._reconstruction = Reconstruction(model, noise, index, rows, onset_min)
-        self._output, self._cause = output, cause
+        self._memory.output, self._memory.cause = output, cause
 
     def _publish_reconstruction(
         self, time_ns: int, inputs: Sequence[float], measured: Sequence[float], values: list[float], units: list[str]
@@ -339,11 +336,11 @@ class Suspicion:
         if self._reconstruction is None:
             return []
         value, sd = self._reconstruction.update(time_ns / MINUTE_NS, inputs, measured)
-        index = self._config.outputs.index(self._output)
+        index = self._config.outputs.index(self._memory.output)
         message = ReconstructionMessage(
-            time_ns=time_ns, value=value, sd=sd, unit=units[index], measured=values[index], cause=self._cause
+            time_ns=time_ns, value=value, sd=sd, unit=units[index], measured=values[index], cause=self._memory.cause
         )
-        return [Publication(keys.key(self._config.plant, keys.RECONSTRUCTION, self._output), message)]
+        return [Publication(keys.key(self._config.plant, keys.RECONSTRUCTION, self._memory.output), message)]
 
     def _suspected_cause(self, suspect: Suspect) -> SuspectedCause:
         if suspect.cause == UNKNOWN:

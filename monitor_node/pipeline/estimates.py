@@ -4,9 +4,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import repeat
 from math import isfinite, nan
 
+from monitor_node.baseline.arx_reference import ArxReference
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.predictor import ArxPredictor
-from monitor_node.baseline.references import ArxReference, ProcessReference, Reference
+from monitor_node.baseline.process_reference import ProcessReference
+from monitor_node.baseline.references import Reference
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import MeasuredRow
 from reactorwatch.contract.codec import Publication

@@ -7,15 +7,13 @@ A reference that learns does so while nothing is wrong: otherwise it would learn
 from collections.abc import Sequence
 from math import isfinite, nan
 
+import msgspec
+
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.baseline.arx_reference import ArxReference
 from monitor_node.baseline.black_box_reference import BlackBoxReference, BlackBoxReferenceState
-from monitor_node.baseline.references import (
-    ArxReference,
-    ArxReferenceState,
-    ProcessReference,
-    ProcessReferenceState,
-    Reference,
-)
+from monitor_node.baseline.process_reference import ProcessReference, ProcessReferenceState
+from monitor_node.baseline.references import Reference
 from monitor_node.baseline.signal_range import possible_ranges, stated_ranges
 from monitor_node.baseline.training import NO_VALUE, TrainingResult
 from monitor_node.baseline.training_rows import TrainingRows
@@ -176,17 +174,17 @@ class Evaluation:
         self._quarantined, self.rows_watched = tuple(state.withheld), state.rows_watched
 
     def restore_reference(
-        self, state: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState, equations: ProcessModel | None
+        self, state: ProcessReferenceState | BlackBoxReferenceState | ArxReference, equations: ProcessModel | None
     ) -> Reference:
         """Reference of a state.
 
         Raises:
             ValueError: the state is of a plant with a process model, and there is none.
         """
-        if isinstance(state, ArxReferenceState):
+        if isinstance(state, ArxReference):
             if not self._models.judges:  # in a state of an earlier version, where the reference judged
                 self._models.start_judging()
-            return ArxReference(state)
+            return msgspec.structs.replace(state)
         if isinstance(state, BlackBoxReferenceState):
             return BlackBoxReference.from_state(state)
         if equations is None:

@@ -10,8 +10,9 @@ import numpy as np
 
 from monitor_node.baseline.arx_bank import ArxBank, ArxBankState
 from monitor_node.baseline.arx_fit import arx_structure
+from monitor_node.baseline.arx_reference import ArxReference
 from monitor_node.baseline.predictor import ArxPredictor, PredictorState
-from monitor_node.baseline.references import ArxReference, Reference
+from monitor_node.baseline.references import Reference
 from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import MeasuredRow

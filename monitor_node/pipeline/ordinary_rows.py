@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from monitor_node.baseline.black_box_reference import BlackBoxReference
-from monitor_node.baseline.references import ProcessReference, Reference
+from monitor_node.baseline.process_reference import ProcessReference
+from monitor_node.baseline.references import Reference
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.pipeline.row_frame import Records

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.commands import is_command
 from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
-from monitor_node.baseline.references import ProcessReference
+from monitor_node.baseline.process_reference import ProcessReference
 from monitor_node.baseline.signal_range import input_bounds
 from monitor_node.baseline.training import TrainingResult
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, equations_text

@@ -3,10 +3,11 @@
 import msgspec
 
 from monitor_node.baseline.arx_bank import ArxBankState
+from monitor_node.baseline.arx_reference import ArxReference
 from monitor_node.baseline.black_box_reference import BlackBoxReferenceState
 from monitor_node.baseline.predictor import PredictorState
+from monitor_node.baseline.process_reference import ProcessReferenceState
 from monitor_node.baseline.promise import PromiseState
-from monitor_node.baseline.references import ArxReferenceState, ProcessReferenceState
 from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.ingest.sampling import SamplingState
 from monitor_node.isolation.stage import SuspicionState
@@ -39,7 +40,7 @@ class TrainedState(StoredState, frozen=True):
         power: deviations that would be seen, a serialized `Promise`; empty: not stated.
     """
 
-    reference: ProcessReferenceState | BlackBoxReferenceState | ArxReferenceState
+    reference: ProcessReferenceState | BlackBoxReferenceState | ArxReference
     checks: list[tuple[str, str]]
     left_out: dict[str, str]
     whiteners: list[PrewhitenerState]

@@ -19,7 +19,8 @@ import numpy as np
 
 from monitor_node.baseline.black_box_reference import BlackBoxReference
 from monitor_node.baseline.predictor import ArxPredictor
-from monitor_node.baseline.references import ProcessReference, Reference, output_indices
+from monitor_node.baseline.process_reference import ProcessReference, output_indices
+from monitor_node.baseline.references import Reference
 from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals

@@ -43,7 +43,7 @@ class OtherSettingsError(InputError):
 
 
 class MonitorMemory(Memory, kw_only=True):
-    """What a monitor remembers beside its parts, while it runs and in its stored state.
+    """Memory of a monitor beside its parts, while it runs and in its stored state.
 
     Attributes:
         runs: sequence checks of the signals, the inputs first.

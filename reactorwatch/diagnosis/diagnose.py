@@ -19,12 +19,12 @@ from reactorwatch.diagnosis.experiment.constraints import check_limits
 from reactorwatch.diagnosis.experiment.design import propose_experiment
 from reactorwatch.diagnosis.extended import extended_model
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.high_frequency_noise import estimate_sensor_noise
 from reactorwatch.diagnosis.holdout import Errors, evaluate_holdout, is_near_noise
 from reactorwatch.diagnosis.integration_error import looks_like_integration
 from reactorwatch.diagnosis.lasting import LastingResult, prefer_lasting
 from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
 from reactorwatch.diagnosis.law.localise import NOISY_SHARE, Localised, UnknownSearch
-from reactorwatch.diagnosis.noise_spectrum import estimate_sensor_noise
 from reactorwatch.diagnosis.parameter_priors import add_priors
 from reactorwatch.diagnosis.practical_significance import exceeds_tolerance, residual_exceeds_tolerance, tolerances_of
 from reactorwatch.diagnosis.record_checks import make_run

@@ -16,8 +16,8 @@ from monitor_node.alarms.alarms import AlarmMemory
 from monitor_node.alarms.annunciator import Annunciator, AnnunciatorState
 from monitor_node.alarms.incidents import Incident
 from monitor_node.alarms.kpis import KpiState
+from monitor_node.baseline.process_reference import ProcessReferenceState
 from monitor_node.baseline.promise import NUMBERS, PromiseState
-from monitor_node.baseline.references import ProcessReferenceState
 from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -253,7 +253,8 @@ class Conversion:
         if self._looks:
             minutes = np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns])
             known = pack_numbers(np.column_stack([minutes, rows.values]))
-            looked = SuspicionState(known, rest.cause[0], None, None, rest.cause[1], rest.cause[2], None)
+            incident, output, cause = rest.cause
+            looked = SuspicionState(rows=known, incident=incident, output=output, cause=cause)
         outputs = range(len(self.config.outputs))
         whiteners = [Prewhitener(None, numbers["whiteners"][i : i + 1]).state for i in outputs]
         last_ns, inputs = int(numbers["last_ns"]), numbers["inputs"].tolist()

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.baseline.references import ProcessReference
+from monitor_node.baseline.process_reference import ProcessReference
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.packed.array import PlantArray

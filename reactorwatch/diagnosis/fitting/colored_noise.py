@@ -4,14 +4,14 @@ The coloured part is v <- phi v + white noise, with phi = exp(-h / tau) over a r
 autoregression from row to row, uncorrelated between rows far apart. The filter has it as one more state, initially
 zero, that is added to the sensor's output (Bryson & Johansen 1965, Linear filtering for time-varying systems using
 measurements containing colored noise, IEEE Trans. Automatic Control 10). Its standard deviation and time constant are
-estimated with the other noise levels, by maximum likelihood (`kalman.noise_estimation`).
+estimated here with the other noise levels, by maximum likelihood (`estimate_noise`).
 
 More states make a filter slower, so coloured noise is modelled only where the record calls for it. Model error and
 process noise have almost no power at high frequencies; white noise has the same power at all of them. So the power of
 the simulation's residual in the band `LOW` is compared with that in the band `HIGH`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from math import exp, sqrt
 
@@ -21,6 +21,8 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.process.model import ProcessModel, parameter, variable
 
 LOW, HIGH = (0.375, 0.625), (0.75, 1.0)
@@ -94,13 +96,8 @@ def detect_colored_noise(
     result = []
     for name, sd, column in zip(outputs, noise.measurement_sd, residual.T, strict=True):
         if _power_ratio(column) > SUSPICIOUS:
-            result.append(ColoredNoise(name, sd, _initial_tau_min(period_min), initial_driving_sd(sd, period_min), sd))
+            result.append(ColoredNoise(name, sd, _initial_tau_min(period_min), _initial_driving_sd(sd, period_min), sd))
     return tuple(result)
-
-
-def initial_driving_sd(sd: float, period_min: float) -> float:
-    """Initial driving noise of a coloured part with this standard deviation."""
-    return _driving_sd(sd, _initial_tau_min(period_min), period_min)
 
 
 def add_colored_noise(model: ProcessModel, colored: Sequence[ColoredNoise], period_min: float) -> ProcessModel:
@@ -122,27 +119,43 @@ def add_colored_noise(model: ProcessModel, colored: Sequence[ColoredNoise], peri
     return model
 
 
-def update_colored_noise(
-    colored: Sequence[ColoredNoise], driving_sd: Sequence[float], times: Mapping[str, float], period_min: float
-) -> tuple[ColoredNoise, ...]:
-    """Replace the estimates of the coloured parts.
+def estimate_noise(
+    model: ProcessModel,
+    record: FilterRecord,
+    noise: Noise,
+    smallest_sd: Sequence[float],
+    nearby: Sequence[NoiseLevels],
+    period_min: float,
+) -> Noise:
+    """Estimate all noise levels, those of coloured noise among them, by maximum likelihood.
 
     Args:
-        colored: the coloured parts.
-        driving_sd: new driving noise of each, see `ColoredNoise`.
-        times: new time constants as in `Noise.parameter_changes`.
+        model: model with the states that `add_colored_noise` has added.
+        record: rows as the filter takes them.
+        noise: noise with the coloured parts.
+        smallest_sd: least standard deviation of each sensor's noise.
+        nearby: levels that are further initial values.
         period_min: median sampling period.
     """
-    result = []
-    for item, rate in zip(colored, driving_sd, strict=True):
-        time_min = times[f"{item.output}.noise_min"]
+    times = noise.parameter_changes
+    # Start again from a short time constant: model error makes it seem long, and the search would stay there.
+    first_sd = {f"{item.output}.noise": _initial_driving_sd(item.scale, period_min) for item in noise.colored}
+    found = fit_noise(model, record, smallest_sd, tuple(times), first_sd, nearby, lacking=True)
+    levels, colored = found.levels, []
+    of_sensors = len(levels.process_sd) - len(noise.colored)
+    for item, rate in zip(noise.colored, levels.process_sd[of_sensors:], strict=True):
+        time_min = found.parameters[f"{item.output}.noise_min"]
         sd = rate / _driving_sd(1.0, time_min, period_min)
-        result.append(ColoredNoise(item.output, sd, time_min, rate, item.scale))
-    return tuple(result)
+        colored.append(ColoredNoise(item.output, sd, time_min, rate, item.scale))
+    return Noise(levels.measurement_sd, levels.process_sd[:of_sensors], tuple(colored))
 
 
 def _initial_tau_min(period_min: float) -> float:
     return max(FIRST_ROWS * period_min, SHORTEST_MIN)
+
+
+def _initial_driving_sd(sd: float, period_min: float) -> float:
+    return _driving_sd(sd, _initial_tau_min(period_min), period_min)
 
 
 def _driving_sd(sd: float, time_min: float, period_min: float) -> float:

@@ -13,12 +13,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.diagnosis.fitting.augmented_model import AugmentedModel, augment_model
-from reactorwatch.diagnosis.fitting.colored_noise import (
-    Noise,
-    add_colored_noise,
-    initial_driving_sd,
-    update_colored_noise,
-)
+from reactorwatch.diagnosis.fitting.colored_noise import Noise, add_colored_noise, estimate_noise
 from reactorwatch.diagnosis.fitting.measurement_delay import ShiftedRun, restore_rows, shift_measurements
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.run import Run, input_uncertainty_of
@@ -27,7 +22,6 @@ from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.kalman.innovations import FilterResult
-from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.kalman.resampling import ResampledRecord, count_pieces, insert_rows
 from reactorwatch.kalman.step_budget import STEPS_PER_EVALUATION, STEPS_PER_LINEARISATION, StepBudget
 from reactorwatch.process.effect import Effect
@@ -280,24 +274,11 @@ class FaultFilter:
         `nearby` levels are further initial values.
         """
         rows, _ = self._lay_out_rows(run, signals)
-        times = self._noise.parameter_changes
-        # Start again from a short time constant: model error makes it seem long, and the search would stay there.
-        first_sd = {
-            f"{item.output}.noise": initial_driving_sd(item.scale, self._period_min) for item in self._noise.colored
-        }
-        found = fit_noise(
-            self.model,
-            FilterRecord(rows.time_min, rows.inputs, rows.measured, uncertainty=rows.uncertainty),
-            smallest_sd,
-            tuple(times),
-            first_sd,
-            [self._all_levels(item) for item in nearby if not item.colored],
-            lacking=True,
-        )
-        levels, times = found.levels, found.parameters
-        of_sensors = len(levels.process_sd) - len(times)
-        colored = update_colored_noise(self._noise.colored, levels.process_sd[of_sensors:], times, self._period_min)
-        return Noise(levels.measurement_sd, levels.process_sd[: len(self._plant.states)], colored)
+        record = FilterRecord(rows.time_min, rows.inputs, rows.measured, uncertainty=rows.uncertainty)
+        starts = [self._all_levels(item) for item in nearby if not item.colored]
+        found = estimate_noise(self.model, record, self._noise, smallest_sd, starts, self._period_min)
+        of_plant = found.process_sd[: len(self._plant.states)]
+        return Noise(found.measurement_sd, of_plant, found.colored)
 
     def error_dynamics(self, run: Run, signals: Sequence[Signal], innovations: FilterResult) -> ErrorDynamics:
         """Error equations about a filter run, from the second row on, the first one that is predicted."""

@@ -16,11 +16,11 @@ from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import HUBER, FilterEvaluation
 from reactorwatch.diagnosis.fitting.hypothesis import Fit
+from reactorwatch.diagnosis.high_frequency_noise import estimate_sensor_noise
 from reactorwatch.diagnosis.law.fit import ShapeFit, ShapeFitter
 from reactorwatch.diagnosis.law.formula import FormulaSearch, law_shape
 from reactorwatch.diagnosis.law.path import Scale, scales_along, variables_along
 from reactorwatch.diagnosis.law.shapes import Shape, make_shape
-from reactorwatch.diagnosis.noise_spectrum import estimate_sensor_noise
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p
 from reactorwatch.process.law import ExtendedLaw

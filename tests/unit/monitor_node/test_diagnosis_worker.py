@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from monitor_node.__main__ import MonitorNode
-from monitor_node.baseline.references import ProcessReference
+from monitor_node.baseline.process_reference import ProcessReference
 from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, read_equations
 from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.diagnosis_worker import DiagnosisWorker, PlantFinding

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor_node.baseline.references import ProcessReference, input_reach
+from monitor_node.baseline.process_reference import ProcessReference, input_reach
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.ingest.sampling import missing_rows

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monitor_node.baseline.black_box_reference import BlackBoxReference
-from monitor_node.baseline.references import ProcessReference
+from monitor_node.baseline.process_reference import ProcessReference
 from monitor_node.baseline.signal_range import ANY, signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor

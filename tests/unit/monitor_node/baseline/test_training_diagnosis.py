@@ -5,7 +5,7 @@ from dataclasses import replace
 import msgspec
 import pytest
 
-from monitor_node.baseline.references import ProcessReference
+from monitor_node.baseline.process_reference import ProcessReference
 from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, equations_text, read_equations
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations

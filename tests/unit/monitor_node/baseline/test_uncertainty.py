@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
-from monitor_node.baseline.references import ProcessReference
+from monitor_node.baseline.process_reference import ProcessReference
 from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.baseline.uncertainty import Uncertain, describe_uncertain, find_uncertain
 from monitor_node.config import MonitorConfig

@@ -7,7 +7,7 @@ import pytest
 
 from monitor_node.alarms.alarms import SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.baseline.references import ProcessReference
+from monitor_node.baseline.process_reference import ProcessReference
 from monitor_node.config import MonitorConfig
 from monitor_node.isolation import stage
 from monitor_node.isolation.candidate import CandidateState, ProgressState

@@ -1,4 +1,4 @@
-"""Find and repair files left by a crashed recorder."""
+"""Crash recovery: find and repair recordings that a killed recorder has not finished."""
 
 from pathlib import Path
 
