@@ -32,6 +32,7 @@ but isolated far values are then what the signal has.
 
 from bisect import bisect_left, insort
 from collections.abc import Sequence
+from copy import deepcopy
 from math import ceil, isfinite, log, sqrt
 from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
@@ -301,12 +302,12 @@ class SpikeCheck(SignalCheck):
 
     @property
     def state(self) -> list[Spike | None]:
-        """The check of each output; None for an output without one; empty before the training ends."""
-        return self._spikes
+        """A copy of the check of each output; None for an output without one; empty before the training ends."""
+        return deepcopy(self._spikes)
 
     def restore(self, state: list[Spike | None]) -> None:
         """See `SignalCheck`."""
-        self._spikes = state
+        self._spikes = deepcopy(state)
         self._set_limits()
 
     def learn_rates(self, counts: Sequence[int], rows: int, period_ns: float, arl0: float) -> None:

@@ -1,10 +1,13 @@
 """A stuck sensor, a spike and a dead plant are told as what they are, at once, and as nothing else."""
 
+import msgspec
 import numpy as np
 import pytest
 
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from monitor_node.signal_checks.stage import SignalChecks
 from reactorwatch.contract.messages_pb2 import Alarm
 
 from ..samples import leaking_run, samples
@@ -102,3 +105,22 @@ def test_a_dead_plant_is_told_by_the_clock_of_receipt_while_nothing_comes() -> N
         ("silence/plant", "raised", minute_ns(10.0 + 0.5))
     ]
     assert not [item for item in monitor.on_tick(due_ns + 10**12) if isinstance(item.message, Alarm)]
+
+
+def test_rows_change_neither_a_state_that_was_taken_before_nor_one_that_was_restored() -> None:
+    """A kept baseline has such a state, and may be restored more than once."""
+    config, values, units = MonitorConfig(isolation=False), [0.1, 440.0], ["", ""]
+    checks = [SignalChecks(config, Annunciator(config)) for _ in range(2)]
+    rng = np.random.default_rng(5)
+    training = rng.normal(size=(2, 500)).tolist()
+    checks[0].start(training, training, 1e5)
+    state = checks[0].state
+    before = msgspec.msgpack.encode(state)
+    checks[1].restore(state, 0)
+    for check in checks:
+        for row in range(1, 30):
+            check.check_row(row * 10**9, (1.0, *values))
+            check.check_values(row * 10**9, values, units)
+            check.check_residuals(row * 10**9, [9.0 * (row % 3), 0.1], [1.0, 1.0], units, [])
+    assert checks[0].state.spikes != state.spikes
+    assert msgspec.msgpack.encode(state) == before
