@@ -26,7 +26,7 @@ class BufferState(StoredState, frozen=True):
     Attributes:
         structure: structure of the model.
         period_ns: None; stored states have it.
-        choice: all rows; stored states have it.
+        choice: rows that are fitted.
         outputs: output rows that the next regressor needs, newest first; fewer while the history fills.
         inputs: input rows that the next regressor needs, newest first.
         last_time_ns: time of the newest row; None before the first.
@@ -53,10 +53,11 @@ class RegressorBuffer:
 
     Args:
         structure: structure of the model.
+        choice: rows that are fitted; rows are counted from the first one.
     """
 
-    def __init__(self, structure: Structure) -> None:
-        self._structure = structure
+    def __init__(self, structure: Structure, choice: RowChoice = ALL_ROWS) -> None:
+        self._structure, self._choice = structure, choice
         # Flat lists, newest row first: a regressor is a dozen numbers, and slicing a list of a dozen takes a fraction
         # of the overhead of a NumPy call.
         self._outputs: list[float] = []
@@ -71,7 +72,7 @@ class RegressorBuffer:
         Raises:
             ValueError: the state does not fit its structure.
         """
-        buffer = cls(state.structure)
+        buffer = cls(state.structure, state.choice)
         filled = len(state.outputs)
         if len(state.inputs) != filled or filled > state.structure.history:
             raise ValueError(f"state must hold at most {state.structure.history} equal rows, got {filled}")
@@ -87,6 +88,7 @@ class RegressorBuffer:
         rows, count = len(self._outputs), self._structure.inputs
         return BufferState(
             self._structure,
+            choice=self._choice,
             outputs=tuple((value,) for value in self._outputs),
             inputs=tuple(tuple(self._inputs[row * count : (row + 1) * count]) for row in range(rows)),
             last_time_ns=self._last_time_ns,
@@ -119,7 +121,7 @@ class RegressorBuffer:
             outputs: shape (1,), NaN for what was not measured.
 
         Returns: The regressor of this row, from the rows before it, shape (parameters,). None for a row that cannot be
-            predicted (its history is incomplete) or has a missing value.
+            predicted (its history is incomplete), has a missing value, or is not chosen.
 
         Raises:
             ValueError: a time not after the last one's, or a wrong number of values; nothing is changed then.
@@ -133,7 +135,7 @@ class RegressorBuffer:
         if self._last_time_ns is not None and time_ns <= self._last_time_ns:
             raise ValueError(f"time_ns must increase, got {time_ns} after {self._last_time_ns}")
         complete = all(map(isfinite, new_inputs)) and all(map(isfinite, new_outputs))
-        regressor = self.upcoming if complete else None
+        regressor = self.upcoming if complete and self._choice.takes(self._row) else None
         if complete:
             self._outputs = new_outputs + self._outputs[: structure.history - 1]
             self._inputs = new_inputs + self._inputs[: (structure.history - 1) * structure.inputs]

@@ -116,6 +116,10 @@ class RowChoice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.every < 1:
             raise InputError(f"every must be at least 1, got {self.every}")
 
+    def takes(self, row: int) -> bool:
+        """True if the row of this index, from 0, is fitted."""
+        return row >= self.skip and (row - self.skip) % self.every == 0
+
 
 ALL_ROWS = RowChoice()
 REPORT_ROWS = RowChoice(skip=99, every=6)

@@ -238,7 +238,7 @@ class EventLoop:
             self._inbox.put(handle, (messages,), len(messages), sum(len(message.payload) for message in messages))
 
         def put_gap(handle: Callable[[Gap, int], list[Publication]], gap: Gap) -> None:
-            self._inbox.put(handle, (gap,))
+            self._inbox.put(handle, (gap,), 1)
 
         def end_history(on_end: Callable[[], None], _now_ns: int) -> list[Publication]:
             on_end()
@@ -272,9 +272,13 @@ class EventLoop:
             self._bus.subscribe_liveliness(expression, lambda key, is_alive: self._inbox.put(on_token, (key, is_alive)))
 
     def accept_commands(self, *key_expressions: str) -> None:
-        """Hand commands on these keys to `node.on_command`."""
+        """Hand commands on these keys to `node.on_command`; like messages they wait for room in the inbox."""
+
+        def put_request(request: Request) -> None:
+            self._inbox.put(self._answer, (request,), 1, len(request.question.payload))
+
         for expression in key_expressions:
-            self._bus.declare_queryable(expression, lambda request: self._inbox.put(self._answer, (request,)))
+            self._bus.declare_queryable(expression, put_request)
 
     def run(self) -> None:
         """Run to the end."""

@@ -5,7 +5,7 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.regressor import BufferState, RegressorBuffer, consecutive_rows, rows_of
-from reactorwatch.identification.structure import REPORT_ROWS, Structure
+from reactorwatch.identification.structure import REPORT_ROWS, RowChoice, Structure
 
 U = np.arange(10.0, 20.0)
 Y = np.arange(0.0, 10.0)
@@ -40,6 +40,9 @@ def test_the_report_row_choice_keeps_the_lags_of_the_fast_clock() -> None:
     rows = rows_of(Structure.of_order(1), u, y, choice=REPORT_ROWS)
     np.testing.assert_array_equal(rows.position + 1, [100, 106, 112, 118])
     np.testing.assert_array_equal(rows.regressors[:, 0], rows.outputs[:, 0] - 1.0)
+    buffer = RegressorBuffer(Structure.of_order(1), REPORT_ROWS)
+    recursive = [buffer.update(k, [u[k]], [y[k]]) for k in range(120)]
+    assert [k for k, row in enumerate(recursive) if row is not None] == rows.position.tolist()
 
 
 def test_records_that_do_not_fit_are_refused() -> None:
@@ -75,7 +78,7 @@ def test_a_row_that_cannot_be_is_refused_and_changes_nothing() -> None:
 
 def test_a_stored_buffer_goes_on_where_it_was() -> None:
     structure = Structure(3, 2, delay=2, inputs=2)
-    buffer = RegressorBuffer(structure)
+    buffer = RegressorBuffer(structure, RowChoice(1, 2))
     rng = np.random.default_rng(2)
     for k in range(12):
         resumed = RegressorBuffer.from_state(BufferState.from_bytes(buffer.state.to_bytes()))
