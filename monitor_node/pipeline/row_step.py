@@ -44,7 +44,7 @@ from monitor_node.signal_checks.timeout import update_timeout
 from monitor_node.stages.chart_alarms import alarm_names
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
-from reactorwatch.codegen.numba_kernel import Entry, call_at, jit
+from reactorwatch.codegen.numba_kernel import Entry, borrow, call_at, inline, jit
 from reactorwatch.identification.black_box.filter import JUDGED, filter_row
 from reactorwatch.kalman.ekf import fill_row
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, row_function
@@ -86,7 +86,7 @@ class FilterNumbers(NamedTuple):
     variances: Array
 
 
-@jit
+@inline
 def _predict(
     p: Any,
     belief: Array,
@@ -115,7 +115,7 @@ def _predict(
     return bool(work.outputs[work.outputs.size - 1] != 0.0)
 
 
-@jit
+@inline
 def _add_point(p: Any, point: Array, settings: Any, alarm: int) -> int:
     """Update the delay of an alarm that is not active with the point of its chart; returns the verdict."""
     is_out = point[4] > 0.0
@@ -126,7 +126,7 @@ def _add_point(p: Any, point: Array, settings: Any, alarm: int) -> int:
     return EVENT if raises(p.recent, settings.rules[alarm, 0], is_out) else VIOLATING
 
 
-@jit
+@inline
 def _lay_out(columns: Array, numbers: Array, e: Array) -> None:
     """Fill the columns of a bank: a new value for each chart."""
     for i in range(e.size):
@@ -135,7 +135,7 @@ def _lay_out(columns: Array, numbers: Array, e: Array) -> None:
             columns[SETTINGS + row, i] = numbers[row, i]
 
 
-@jit
+@inline
 def _take_points(p: Any, work: Any, numbers: Array, settings: Any, first: int) -> int:
     """Take over what a bank of charts has computed; returns the verdict."""
     columns, points, verdict = work.columns, work.points, ORDINARY
@@ -148,7 +148,7 @@ def _take_points(p: Any, work: Any, numbers: Array, settings: Any, first: int) -
     return verdict
 
 
-@jit
+@inline
 def _update_charts(p: Any, work: Any, settings: Any) -> int:
     """Update the charts with the prewhitened residuals; returns the verdict."""
     constants, columns, e, verdict = settings.constants[0], work.columns, work.e, ORDINARY
@@ -202,9 +202,11 @@ def step(
         time_min: the same in minutes.
         values: values of the row, the inputs first.
     """
-    scratch = scratch_at(frame, numbers.shape[1])
+    kept, belief, noise = borrow(numbers[plant]), borrow(beliefs[plant]), borrow(variances[plant])
+    values, parameters, after = borrow(values), borrow(parameters), borrow(after)
+    scratch = scratch_at(frame, kept.size)
     for i in range(scratch.size):
-        scratch[i] = numbers[plant, i]
+        scratch[i] = kept[i]
     p, work, settings = plant_at(frame), work_at(frame), settings_at(frame)
     head = p.head[0]
     spacing_ns = time_ns - head.last_ns
@@ -213,8 +215,7 @@ def step(
     for i in range(values.size):
         if not settings.ranges[i, 0] <= values[i] <= settings.ranges[i, 1]:
             return EVENT
-    belief = beliefs[plant]
-    if not _predict(p, belief, variances[plant], parameters, after, work, settings, time_min, values):
+    if not _predict(p, belief, noise, parameters, after, work, settings, time_min, values):
         return EVENT
     for i in range(p.timeouts.size):
         if update_timeout(p.timeouts[i], time_ns, True, settings.constants[0].silence_limit, -1)[0]:
@@ -239,7 +240,7 @@ def step(
     for i in range(belief.size):
         belief[i] = after[i]
     for i in range(scratch.size):
-        numbers[plant, i] = scratch[i]
+        kept[i] = scratch[i]
     return verdict
 
 

@@ -19,6 +19,9 @@ from numba.extending import intrinsic
 _log = logging.getLogger(__name__)
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
+Values = TypeVar("Values")
+
+_OPTIONS: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
 
 
 def jit(kernel: Kernel) -> Kernel:
@@ -28,11 +31,20 @@ def jit(kernel: Kernel) -> Kernel:
         kernel: a function of numbers and NumPy arrays, in the subset of Python that Numba compiles.
     """
     try:
-        compiled = numba.njit(cache=True, fastmath=False, error_model="numpy")(kernel)
+        compiled = numba.njit(cache=True, **_OPTIONS)(kernel)
     except RuntimeError:  # Numba: no locator available
-        return cast(Kernel, numba.njit(cache=False, fastmath=False, error_model="numpy")(kernel))
+        return cast(Kernel, numba.njit(cache=False, **_OPTIONS)(kernel))
     _tolerate_full_disk(compiled)
     return cast(Kernel, compiled)
+
+
+def inline(kernel: Kernel) -> Kernel:
+    """Compile a kernel as a part of each kernel that calls it, which has it in its cache; arguments as for `jit`.
+
+    For kernels that are given tuples of arrays: at each call Numba counts a reference to each array of a tuple, which
+    in the step of a plant's row took longer than the arithmetic. In one piece of code it sees what needs no count.
+    """
+    return cast(Kernel, numba.njit(forceinline=True, **_OPTIONS)(kernel))
 
 
 def _tolerate_full_disk(compiled: Any) -> None:
@@ -111,6 +123,21 @@ def _pointer_at(_typing: Any, address: Any) -> Any:
 
 pointer_at = cast(Callable[[int], Any], intrinsic(_pointer_at))
 """Pointer to an address, for `numba.carray` in a kernel: an array whose owner the caller keeps alive."""
+
+
+def _borrow(_typing: Any, array: Any) -> Any:
+    """Numba intrinsic: the type of the array, and the function that generates its IR."""
+
+    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        view = context.make_array(array)(context, builder, arguments[0])
+        view.meminfo = ir.Constant(view.meminfo.type, None)
+        return view._getvalue()
+
+    return array(array), generate
+
+
+borrow = cast(Callable[[Values], Values], intrinsic(_borrow))
+"""The same array without its owner, whose references Numba would count at each use; the caller keeps it alive."""
 
 carray: Any = numba.carray  # type: ignore[attr-defined]
 """Array at a pointer, of a shape and a type, without a copy."""

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reactorwatch.codegen.numba_kernel import Entry, jit
+from reactorwatch.codegen.numba_kernel import Entry, inline
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Shown, SignalChart, finite
 
@@ -24,7 +24,7 @@ from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judge
 X, PRESENT, STATISTIC, CENTRE, LOWER, UPPER, OUT, SETTINGS = range(8)
 
 
-@jit
+@inline
 def write_point(
     columns: Array, p: int, statistic: float, centre: float, lower: float, upper: float, out: float
 ) -> None:

@@ -4,7 +4,7 @@ from monitor_node.fleet.packed.record import Array, Bytes, Ints, Places, Records
 from monitor_node.fleet.packed.ring import add_row, fits
 from monitor_node.pipeline.row_frame import LAST_NS, Words
 from monitor_node.pipeline.row_step import EVENT, step
-from reactorwatch.codegen.numba_kernel import jit
+from reactorwatch.codegen.numba_kernel import borrow, jit
 from reactorwatch.records.record import MINUTE_NS
 
 ORDINARY, NEW_MINUTE, ODD = 0, 1, 2
@@ -56,9 +56,10 @@ def step_rows(
     is_kept = ring.shape[2] > 0
     for k in range(row_slots.size):
         slot, time_ns = row_slots[k], row_time_ns[k]
+        values, bits = borrow(row_values[k]), borrow(row_bits[k])
         p = plants[slot]
         spacing_ns = time_ns - numbers[slot, LAST_NS]
-        is_odd = p.odd or not fits(p, spacing_ns, row_bits[k], is_kept)
+        is_odd = p.odd or not fits(p, spacing_ns, bits, is_kept)
         if not is_odd:
             is_odd = (
                 step(
@@ -71,7 +72,7 @@ def step_rows(
                     slot,
                     time_ns,
                     row_time_min[k],
-                    row_values[k],
+                    values,
                 )
                 == EVENT
             )
@@ -81,7 +82,7 @@ def step_rows(
             continue
         p.spacing_ns = spacing_ns
         p.rows_watched += 1
-        add_row(p, times[slot], ring[slot], others[slot], spacing_ns, row_bits[k])
+        add_row(p, borrow(times[slot]), borrow(ring[slot]), borrow(others[slot]), spacing_ns, bits)
         minute = time_ns // _MINUTE_NS
         kinds[k] = ORDINARY if minute == p.kpi_minute else NEW_MINUTE
         p.kpi_minute = minute
