@@ -2,7 +2,8 @@
 
 The functions are low powers, products and hinges of the variables, scaled by the record's own means and spreads, so
 that coefficients of all places are of order one. The scales are parameters of the model, so that the machine code is
-the same for every record. A sensor may also remember: its functions include the direction in which the output moves.
+the same for every record. A sensor may also remember: its functions include the direction in which the output moves,
+unless a controller moves it in answer to the measurement (`feedback`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.law.feedback import Answers
 from reactorwatch.diagnosis.law.path import Scale, evaluate_along
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.process.effect import Effect, ParameterShift
@@ -73,15 +75,16 @@ class Shape:
         return self.unit_size * evaluate_along(self.model, functions, x, inputs, np.zeros(len(x)), self.scales).T
 
 
-def make_shape(model: ProcessModel, place: Place, scales: Mapping[str, Scale]) -> Shape:
+def make_shape(model: ProcessModel, place: Place, scales: Mapping[str, Scale], answers: Answers = frozenset()) -> Shape:
     """Add the corrections of a place to a model.
 
     Args:
         model: process model of the plant.
         place: one of its places.
         scales: scales of the variables by name; of an output's rate as `d(name)`.
+        answers: inputs that answer to measurements: no correction of that sensor depends on them.
     """
-    shape, scaled = _build(model, place.name)
+    shape, scaled = _build(model, place.name, answers)
     parts = (place, *([find_place(model, place.apart)] if place.apart else []))
     units = {f"law.{index}.unit": _typical(model, part, scales) for index, part in enumerate(parts)}
     values = {name: float(getattr(scales[of], what)) for name, (what, of) in scaled.items()}
@@ -89,19 +92,24 @@ def make_shape(model: ProcessModel, place: Place, scales: Mapping[str, Scale]) -
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
-def _build(model: ProcessModel, name: str) -> tuple[Shape, Mapping[str, tuple[str, str]]]:
+def _build(model: ProcessModel, name: str, answers: Answers) -> tuple[Shape, Mapping[str, tuple[str, str]]]:
     """Shape of a place without the scales of a record, built once with everything that is compiled from its model.
 
     Also, for each parameter of a scale, its kind, `mean` or `spread`, and the variable.
     """
     place = find_place(model, name)
+    if place.kind == SENSOR:
+        known = [
+            item for item in place.variables if not _answers(model, place, variable_expression(model, item), answers)
+        ]
+        place = replace(place, variables=tuple(known) or (place.of,))
     parameters: list[Parameter] = []
     coefficients: list[Parameter] = []
     scaled: dict[str, tuple[str, str]] = {}
     extended, terms, apart = model, list[ca.SX](), list[ca.SX]()
     lag = _constant("law.lag")
     for index, part in enumerate((place, *([find_place(model, place.apart)] if place.apart else []))):
-        arguments = _arguments(model, part, place.variables)
+        arguments = _arguments(model, part, place.variables, answers)
         z, symbols = {}, list(arguments.values())
         if place.lag_min:
             lag_min = place.lag_min * ca.exp(lag.symbol)
@@ -127,15 +135,21 @@ def _build(model: ProcessModel, name: str) -> tuple[Shape, Mapping[str, tuple[st
     return Shape(place, extended, names, 1.0, tuple(terms), tuple(apart)), scaled
 
 
-def _arguments(model: ProcessModel, place: Place, variables: Sequence[str]) -> dict[str, ca.SX]:
+def _arguments(model: ProcessModel, place: Place, variables: Sequence[str], answers: Answers) -> dict[str, ca.SX]:
     """Arguments of a correction by name; that of a sensor also depends on the output and its rate."""
     arguments = {name: variable_expression(model, name) for name in variables}
     if place.kind == SENSOR:
         (output,) = (item for item in model.outputs if item.name == place.of)
         arguments[place.of] = output.expression
         slope = ca.mtimes(ca.jacobian(output.expression, model.arguments()[0]), ca.vertcat(*model.rhs))
-        arguments[f"d({place.of})"] = slope
+        if not _answers(model, place, slope, answers):
+            arguments[f"d({place.of})"] = slope
     return arguments
+
+
+def _answers(model: ProcessModel, place: Place, expression: ca.SX, answers: Answers) -> bool:
+    """Return true if the expression depends on an input that answers to the measurement of the place's sensor."""
+    return any((place.of, item.name) in answers and ca.depends_on(expression, item.symbol) for item in model.inputs)
 
 
 def _functions(place: Place, z: Mapping[str, ca.SX], order: int) -> list[ca.SX]:

@@ -17,6 +17,7 @@ from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import HUBER, FilterEvaluation
 from reactorwatch.diagnosis.fitting.hypothesis import Fit
 from reactorwatch.diagnosis.high_frequency_noise import estimate_sensor_noise
+from reactorwatch.diagnosis.law.feedback import Answers, find_answers
 from reactorwatch.diagnosis.law.fit import ShapeFit, ShapeFitter
 from reactorwatch.diagnosis.law.formula import FormulaSearch, law_shape
 from reactorwatch.diagnosis.law.path import Scale, scales_along, variables_along
@@ -121,6 +122,7 @@ class StartedPlaces:
         fits: corrections, the best first.
         apart: places of corrections with a part in another place, not yet fitted.
         scales: scales of the variables.
+        answers: inputs that answer to measurements.
         free: noise levels of the fits.
         wide: noise levels of their first steps.
     """
@@ -128,6 +130,7 @@ class StartedPlaces:
     fits: list[ShapeFit]
     apart: list[Place]
     scales: Mapping[str, Scale]
+    answers: Answers
     free: Noise
     wide: Noise
 
@@ -156,8 +159,9 @@ def start_places(model: ProcessModel, run: Run, nominal: Fit, noise: Noise) -> S
     free = Noise(wide.measurement_sd, (0.0,) * own, noise.colored)
     alone, apart = ([place for place in places if bool(place.apart) is flag] for flag in (False, True))
     nominals: dict[tuple[str, ...], FilterEvaluation] = {}
-    started = [_start(make_shape(model, place, scales), run, wide, nominals) for place in alone]
-    return StartedPlaces(_fit_all(started, free), apart, scales, free, wide)
+    answers = find_answers(run, model.input_names, model.output_names)
+    started = [_start(make_shape(model, place, scales, answers), run, wide, nominals) for place in alone]
+    return StartedPlaces(_fit_all(started, free), apart, scales, answers, free, wide)
 
 
 def fit_places(model: ProcessModel, run: Run, started: StartedPlaces) -> Unknown:
@@ -170,7 +174,7 @@ def fit_places(model: ProcessModel, run: Run, started: StartedPlaces) -> Unknown
     """
     fits, wide, free = list(started.fits), started.wide, started.free
     if _log_p(fits[0], run) >= DOUBTFUL or any(item.location == fits[0].place.location for item in started.apart):
-        shapes = [make_shape(model, place, started.scales) for place in started.apart]
+        shapes = [make_shape(model, place, started.scales, started.answers) for place in started.apart]
         fits += _fit_all([_start(shape, run, wide, {}) for shape in shapes], free)
         fits.sort(key=_bic)
     levels = _likely_noise(model, run, fits[0], free, wide)
