@@ -45,6 +45,10 @@ IN_QUESTION, FAR_OUT = 100.0, 600.0
 """Thresholds in BIC: alternatives that are worse by more than the first are dropped, by more than the second at any
 other noise levels, too. A curve with twelve knots that needs only three costs ninety too much."""
 
+FIRST_MARGIN = 0.05
+"""Share of the best's gain in BIC within which the candidates of the first screen are fitted again: with the nominal
+model's process noise a cause with constants of its own may be better than the right one."""
+
 ROUGH = 1e-3
 """Minimum error of a predicted gain, as a fraction of it: the equations are not linear."""
 
@@ -172,7 +176,8 @@ class Search:
             best = min(best, item, key=lambda item: item.bic)
         least = max([LEAST_SCORE, *(_SHARE * item.score(self.run.values) for item in candidates[:1])])
         dynamic_candidates = self.select(dynamic_candidates, CANDIDATES, least, of_a_cause=1)
-        by_label = self._alternate(best, by_label, dynamic_candidates)
+        margin = max(IN_QUESTION, FIRST_MARGIN * (nominal.bic - best.bic))
+        by_label = self._alternate(best, by_label, dynamic_candidates, margin)
         return SearchResult(self.noise, nominal_noise, nominal, _in_order(by_label), tuple(dynamic_candidates))
 
     def search_from(self, best: FittedHypothesis, result: SearchResult) -> SearchResult:
@@ -183,9 +188,16 @@ class Search:
         )
 
     def _alternate(
-        self, best: FittedHypothesis, by_label: dict[Label, FittedHypothesis], dynamic_candidates: Sequence[Candidate]
+        self,
+        best: FittedHypothesis,
+        by_label: dict[Label, FittedHypothesis],
+        dynamic_candidates: Sequence[Candidate],
+        margin: float = IN_QUESTION,
     ) -> dict[Label, FittedHypothesis]:
-        """Estimate noise levels and search in turn; returns all that were fitted with the noise levels of the best."""
+        """Estimate noise levels and search in turn; returns all that were fitted with the noise levels of the best.
+
+        At first those are fitted again that are worse by less than the margin.
+        """
         searched: FittedHypothesis | None = None
         dropped = set[Label]()
         for _ in range(ROUNDS):
@@ -193,7 +205,8 @@ class Search:
                 break
             if best is not searched:
                 self.update_noise(best)
-            by_label = {item.label: self.refit(item) for item in by_label.values() if item.bic < best.bic + IN_QUESTION}
+            by_label = {item.label: self.refit(item) for item in by_label.values() if item.bic < best.bic + margin}
+            margin = IN_QUESTION
             by_label = {key: self.with_selected_knots(item) for key, item in by_label.items()}
             best = searched = by_label[best.label]
             candidates = self.screen.candidates(best.hypothesis, best.fit, replaced=(0,))
