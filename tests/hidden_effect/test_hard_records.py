@@ -116,3 +116,12 @@ def test_in_a_plant_that_is_out_a_wrong_reaction_is_not_claimed_to_be_something_
     quiet = draw(SEED, (), record)
     said = diagnose(quiet.record, cstr().with_values({"k0": 1.05 * 7.2e10, "K1": 1.05 * 1.44e13}))
     assert said.verdict == NOMINAL or names(said) & {"reaction_rate", "activation_energy", "reaction_order"}
+
+
+@pytest.mark.slow
+def test_a_bias_of_the_thermometer_is_named_though_a_side_reaction_seems_better_with_the_nominal_noise() -> None:
+    """Of a side reaction energy and heat are fitted, too: until the noise was estimated again it was better by 357."""
+    (bias,) = (effect for effect in named() if effect.name == "temperature_bias")
+    record = draw(11_400_006, (bias,), CASES["irregular"])
+    said = diagnose(record.record, cstr())
+    assert [(cause.cause, cause.profile) for cause in said.causes] == [("temperature_bias", "constant")]
