@@ -10,7 +10,7 @@ MOST = 8
 
 def is_compiled(function: ast.FunctionDef) -> bool:
     """True for a function whose machine code takes arrays and numbers, no objects."""
-    return any(isinstance(item, ast.Name) and item.id == "jit" for item in function.decorator_list)
+    return any(isinstance(item, ast.Name) and item.id in ("jit", "inline") for item in function.decorator_list)
 
 
 def parameters(function: ast.FunctionDef) -> list[str]:

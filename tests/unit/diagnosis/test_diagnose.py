@@ -64,6 +64,7 @@ def test_two_causes_are_named_together() -> None:
     assert sorted(cause.cause for cause in found.causes) == ["coolant_flow", "temperature_bias"]
 
 
+@pytest.mark.slow
 def test_what_no_cause_explains_is_unknown() -> None:
     record = record_of(rows=2000)
     T = record.columns["T"]
@@ -80,6 +81,7 @@ def test_a_tolerance_decides_what_matters_in_practice() -> None:
     assert (fine.practical, coarse.practical) == (True, False)
 
 
+@pytest.mark.slow
 def test_the_measured_record_differs_from_the_simulation_by_what_an_integrator_does(daisy_csv: Path) -> None:
     record = read_csv(daisy_csv)
     first = {name: values[:1000] for name, values in record.columns.items()}

@@ -58,6 +58,7 @@ def test_a_cause_that_did_set_in_later_is_kept() -> None:
     assert prefer_lasting(search, result, result.hypotheses[0], tanks(), {}) is None
 
 
+@pytest.mark.slow
 def test_terms_that_a_rig_lacks_together_are_named_together() -> None:
     """The upper tank overflows, and the flow of the lower outlet grows faster than the root of the level."""
     record = record_of(Rig(overflow_per_min=10.0, brim=9.0, outlet_power=0.65), seed=7, rows=700)

@@ -64,7 +64,13 @@ def test_a_model_of_ones_own_is_diagnosed_with_whatever_catalogue(
 
 @pytest.mark.parametrize(
     "names",
-    [(), ("valve_stiction",), ("jacket_lag", "temperature_lag"), ("concentration_delay",)],
+    [
+        ("valve_stiction",),
+        *(
+            pytest.param(names, marks=pytest.mark.slow)
+            for names in ((), ("jacket_lag", "temperature_lag"), ("concentration_delay",))
+        ),
+    ],
 )
 def test_what_a_small_catalogue_does_not_explain_is_unknown(names: tuple[str, ...]) -> None:
     record = record_of("coolant_flow:step:-0.05@30min", "temperature_bias:step:2@20min", rows=450)

@@ -69,6 +69,7 @@ def test_a_parameter_off_by_as_much_as_stated_is_no_finding_and_without_the_stat
     assert diagnose(record, adjusted).verdict == NOMINAL
 
 
+@pytest.mark.slow
 def test_a_cause_is_found_beside_parameters_that_are_off_and_its_interval_is_wider() -> None:
     record = record_of("heat_transfer:constant:0.02", "coolant_temperature:constant:1.5", rows=1500)
     exact, rough = (diagnose(record, cstr(), uncertain=item) for item in ({}, {"K3": 14.0, "Tf": 0.5}))

@@ -44,7 +44,7 @@ def found(courses: dict[str, Array], *without: str) -> Diagnosis:
 @pytest.mark.parametrize(
     ("cause", "size", "without", "places"),
     [
-        ("leak1", 0.1, ("leak1", "pump1"), {"tank1"}),
+        pytest.param("leak1", 0.1, ("leak1", "pump1"), {"tank1"}, marks=pytest.mark.slow),
         ("clog13", 0.3, ("clog13", "h1.bias"), {"tank1", "tank3"}),
     ],
 )

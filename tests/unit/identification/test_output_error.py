@@ -27,6 +27,7 @@ def test_a_plant_with_measurement_noise_is_found_where_arx_is_biased(noisy_plant
     assert oe.kind == "oe"
 
 
+@pytest.mark.slow
 def test_standard_deviations_are_the_scatter_over_many_records() -> None:
     """100 records with noise of their own: observed scatter of each parameter within 25 % (three sigma of it)."""
     found, told = [], []

@@ -24,7 +24,7 @@ def coarse(values: Rows, step: float) -> Rows:
 
 
 @pytest.mark.parametrize("step", [0.02, 0.1, 0.33, 0.5, 0.8, 1.2, 2.0])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_an_output_in_steps_is_watched_with_the_others(step: float, seed: int) -> None:
     """Steps of a fifteenth to seven times its noise: no false alarm, and a change of two steps is seen."""
     values = coarse(plant(3, ROWS, seed), step)

@@ -109,7 +109,7 @@ def test_restore_judges_by_what_was_learned_before_as_if_nothing_had_been_learne
     assert run.raised(CHANGE + 400)
 
 
-@pytest.mark.parametrize("reference", ["arx", "black-box"])
+@pytest.mark.parametrize("reference", ["arx", pytest.param("black-box", marks=pytest.mark.slow)])
 def test_a_replay_and_a_resumed_monitor_do_the_same_bit_for_bit(
     plant: tuple[Array, Array], reference: ReferenceName
 ) -> None:
