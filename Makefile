@@ -33,10 +33,10 @@ $(READY): pyproject.toml
 demo: $(READY) ## run a reactor with a fault, watch, record and draw it
 	@$(BIN)/reactorwatch demo
 
-test: $(READY) ## the tests, but for the slow ones: ten minutes
+test: $(READY) ## the tests, but for the slow ones: thirteen minutes on two cores
 	@$(PYTEST) -m "not slow"
 
-slow: $(READY) ## the slow tests: pages with many commands, whole fleets, kills and cuts, studies in small; eight minutes
+slow: $(READY) ## the slow tests: pages with many commands, whole fleets, kills and cuts, studies in small; twelve minutes
 	@$(PYTEST) -m slow
 
 lint: $(READY) ## style, types, and layers of imports
