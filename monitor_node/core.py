@@ -186,10 +186,11 @@ class Monitor:
         self, signal: str, time_ns: int, number: int, value: float, unit: str, publications: list[Publication]
     ) -> None:
         """Process an accepted sample."""
-        if unit != self.memory.units[signal] or signal not in self.memory.heard_from_ns:
-            self.memory.heard_from_ns.setdefault(signal, time_ns)
-            self.memory.units[signal] = unit
-            self._output_units = [self.memory.units[output] for output in self.config.outputs]
+        memory = self.memory
+        if unit != memory.units[signal] or signal not in memory.heard_from_ns:
+            memory.heard_from_ns.setdefault(signal, time_ns)
+            memory.units[signal] = unit
+            self._output_units = [memory.units[output] for output in self.config.outputs]
         for row in self._aligner.update(signal, time_ns, number, value):
             self._on_row(row, publications)
 
@@ -421,11 +422,9 @@ class Monitor:
     def promise(self) -> Promise | None:
         """Promise of false alarms, as it is now; None before the end of the training."""
         promise = self.pipeline.evaluation.promises.promise
-        return (
-            None
-            if promise is None
-            else promise.message(self.memory.last_ns or 0, self.pipeline.evaluation.rows_watched)
-        )
+        if promise is None:
+            return None
+        return promise.message(self.memory.last_ns or 0, self.pipeline.evaluation.rows_watched)
 
     @property
     def excluded_signals(self) -> dict[str, str]:
@@ -462,21 +461,22 @@ class Monitor:
         return publications
 
     def _on_row(self, row: Row, publications: list[Publication]) -> None:
-        time_ns, due_ns, before = row.time_ns, self.memory.snapshot_due_ns, len(publications)
-        if self.memory.first_ns is None or time_ns < self.memory.first_ns:
-            self.memory.first_ns = time_ns
-        if self.memory.last_ns is not None and not row.restarted:
-            self.span_ns += time_ns - self.memory.last_ns
-        self.memory.last_ns = time_ns
+        memory, time_ns, before = self.memory, row.time_ns, len(publications)
+        due_ns = memory.snapshot_due_ns
+        if memory.first_ns is None or time_ns < memory.first_ns:
+            memory.first_ns = time_ns
+        if memory.last_ns is not None and not row.restarted:
+            self.span_ns += time_ns - memory.last_ns
+        memory.last_ns = time_ns
         try:
             self.pipeline.update(row, self._output_units, publications)
             publications.extend(self.alarms.end_row(time_ns))
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
             self._contain("row", error)
-        if self.memory.watching_since_ns is None and self.pipeline.watching:
-            self.memory.watching_since_ns = time_ns
+        if memory.watching_since_ns is None and self.pipeline.watching:
+            memory.watching_since_ns = time_ns
         if due_ns is None or not 0 <= due_ns - time_ns <= self._snapshot_ns:
-            self.memory.snapshot_due_ns = time_ns + self._snapshot_ns
+            memory.snapshot_due_ns = time_ns + self._snapshot_ns
             if due_ns is not None:
                 publications.extend(self._guard("models", self.pipeline.snapshots, time_ns))
         if self.on_row_end is not None:

@@ -187,7 +187,7 @@ def rows_of(
     count, reach = len(y), structure.history
     run = consecutive_rows(np.concatenate([u, y], axis=1), time)
     wanted = np.arange(count)
-    position = wanted[(run > reach) & (wanted >= choice.skip) & ((wanted - choice.skip) % choice.every == 0)]
+    position = wanted[(run > reach) & choice.takes(wanted)]
     columns = [y[position - lag] for lag in range(1, structure.output_lags + 1)]
     columns += [u[position - structure.delay - lag] for lag in range(structure.input_lags)]
     if structure.offset:

@@ -120,7 +120,7 @@ def test_in_a_plant_that_is_out_a_wrong_reaction_is_not_claimed_to_be_something_
 
 @pytest.mark.slow
 def test_a_bias_of_the_thermometer_is_named_though_a_side_reaction_seems_better_with_the_nominal_noise() -> None:
-    """Of a side reaction energy and heat are fitted, too: until the noise was estimated again it was better by 357."""
+    """The side reaction, whose energy and heat are fitted, is better by 357 until the noise is estimated again."""
     (bias,) = (effect for effect in named() if effect.name == "temperature_bias")
     record = draw(11_400_006, (bias,), CASES["irregular"])
     said = diagnose(record.record, cstr())

@@ -6,13 +6,13 @@ input does in a row is independent of what is measured in that row, given the ro
 of Granger 1969, Investigating causal relations by econometric models and cross-spectral methods, Econometrica 37).
 """
 
-from collections.abc import Sequence
 from math import sqrt
 
 import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run
+from reactorwatch.process.model import ProcessModel
 
 ANSWERS = 6.0
 """Standard deviations by chance beyond which a correlation is an answer."""
@@ -24,13 +24,12 @@ Answers = frozenset[tuple[str, str]]
 """Pairs of an output and an input that answers to its measurement."""
 
 
-def find_answers(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> Answers:
+def find_answers(model: ProcessModel, run: Run) -> Answers:
     """Find the inputs that answer to a measurement in the same row.
 
     Args:
+        model: process model of the plant.
         run: the record.
-        inputs: names of the inputs.
-        outputs: names of the outputs.
     """
     rows = np.column_stack([run.inputs, run.measured])
     now, past = rows[LAGS:], np.hstack([rows[LAGS - lag : len(rows) - lag] for lag in range(1, LAGS + 1)])
@@ -40,11 +39,11 @@ def find_answers(run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> Ans
         return frozenset()
     scale = np.maximum(np.abs(past).max(axis=0), 1e-300)
     new = now[known] - past @ (np.linalg.lstsq(past / scale, now[known], rcond=None)[0] / scale[:, None])
-    count = len(inputs)
+    count = len(model.inputs)
     return frozenset(
         (output, name)
-        for output, measured in zip(outputs, new[:, count:].T, strict=True)
-        for name, moved in zip(inputs, new[:, :count].T, strict=True)
+        for output, measured in zip(model.output_names, new[:, count:].T, strict=True)
+        for name, moved in zip(model.input_names, new[:, :count].T, strict=True)
         if _correlation_in_sd(measured, moved) > ANSWERS
     )
 

@@ -84,8 +84,10 @@ def make_shape(model: ProcessModel, place: Place, scales: Mapping[str, Scale], a
         scales: scales of the variables by name; of an output's rate as `d(name)`.
         answers: inputs that answer to measurements: no correction of that sensor depends on them.
     """
-    shape, scaled = _build(model, place.name, answers)
     parts = (place, *([find_place(model, place.apart)] if place.apart else []))
+    sensors = {part.of for part in parts if part.kind == SENSOR}
+    # Places without a sensor that is answered have the shape, and its machine code, of a record in open loop.
+    shape, scaled = _build(model, place.name, frozenset(pair for pair in answers if pair[0] in sensors))
     units = {f"law.{index}.unit": _typical(model, part, scales) for index, part in enumerate(parts)}
     values = {name: float(getattr(scales[of], what)) for name, (what, of) in scaled.items()}
     return replace(shape, unit_size=_typical(model, place, scales), scales=units | values)

@@ -159,7 +159,7 @@ def start_places(model: ProcessModel, run: Run, nominal: Fit, noise: Noise) -> S
     free = Noise(wide.measurement_sd, (0.0,) * own, noise.colored)
     alone, apart = ([place for place in places if bool(place.apart) is flag] for flag in (False, True))
     nominals: dict[tuple[str, ...], FilterEvaluation] = {}
-    answers = find_answers(run, model.input_names, model.output_names)
+    answers = find_answers(model, run)
     started = [_start(make_shape(model, place, scales, answers), run, wide, nominals) for place in alone]
     return StartedPlaces(_fit_all(started, free), apart, scales, answers, free, wide)
 

@@ -31,7 +31,7 @@ def drifting(cause: str, loop: str, seed: int, span_min: float = 150.0) -> Hidde
 def test_the_coolant_answers_to_the_thermometer_in_closed_loop_alone(cause: str, loop: str) -> None:
     model = cstr()
     run = make_run(drifting(cause, loop, seed=3).record, model)
-    answers = find_answers(run, model.input_names, model.output_names)
+    answers = find_answers(model, run)
     assert answers == ({("T", "qc")} if loop == "closed" else set())
 
 
