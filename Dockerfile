@@ -15,13 +15,15 @@ COPY deploy/requirements.lock ./
 # The lock without rerun-sdk: its line, and those of its hashes.
 RUN sed '/^rerun-sdk==/,/[^\\]$/d' requirements.lock > nodes.lock
 RUN pip install --no-cache-dir --require-hashes -r nodes.lock
-COPY pyproject.toml README.md LICENSE ./
+COPY pyproject.toml hatch_build.py README.md LICENSE ./
 COPY reactorwatch ./reactorwatch
 COPY plant_node ./plant_node
 COPY monitor_node ./monitor_node
 COPY recorder ./recorder
 COPY diagnosis_node ./diagnosis_node
-RUN pip install --no-cache-dir --no-deps --no-build-isolation .
+# `--build-arg COMMIT=$(git rev-parse HEAD)`: the context has no .git, and recordings say which build made them.
+ARG COMMIT=unknown
+RUN COMMIT=${COMMIT} pip install --no-cache-dir --no-deps --no-build-isolation .
 
 USER reactorwatch
 WORKDIR /home/reactorwatch

@@ -1,6 +1,6 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow lint bench faults study kills cuts fuzz soak promise outside pictures docs examples protobuf lock dist clean
+.PHONY: help setup demo test slow lint bench faults study kills cuts fuzz soak promise outside reproduce pictures docs examples protobuf lock dist clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -73,8 +73,11 @@ promise: $(READY) ## false alarms beside the number promised, with equations and
 outside: $(READY) ## public benchmarks beside other methods (DATA=folder of their data, ONLY=words of titles); writes its tables into docs/outside.md
 	@$(BIN)/python -m benchmarks.outside --data $(DATA) $(if $(ONLY),--only "$(ONLY)") --write docs/outside.md
 
+reproduce: $(READY) ## the figures of the original report, and a page of them (OUT=build/study, DATA=folder of records of others)
+	@$(BIN)/python -m benchmarks.study_figures --out $(or $(OUT),build/study) $(if $(DATA),--data $(DATA))
+
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
-	@$(BIN)/python docs/pictures/make.py
+	@$(BIN)/python -m docs.pictures.make
 
 docs: $(DOCS_READY) ## the documentation site, in site/: links are checked, and it is readable without the network
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet

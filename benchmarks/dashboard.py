@@ -24,8 +24,9 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication, encode
 from reactorwatch.process.library.cstr.model import cstr
-from recorder.message import RecordedMessage
-from recorder.tools.mcap_file import RecordingWriter, read_messages
+from recorder import RecordedMessage
+from recorder.files.recording import read_messages
+from recorder.files.writer import RecordingWriter
 
 UNITS = cstr().units
 
@@ -87,7 +88,7 @@ def read_bare(path: Path) -> None:
 def draw(path: Path) -> None:
     """Draw a recording as `dashboard` does."""
     from recorder.columns.run_reader import read_segments
-    from recorder.dashboard.file import write_rrd
+    from recorder.view.file import write_rrd
 
     write_rrd(read_segments(read_messages(path)), path.with_suffix(".rrd"))
 

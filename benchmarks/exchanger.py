@@ -140,7 +140,7 @@ def watch(flow: Array, measured: Array, config: MonitorConfig, sizes: Sequence[f
             copies[k] = monitor.to_bytes()
         alarms += [f"{name}@{k}" for name in _take_row(monitor, k, values)]
     result = Result(
-        monitor.pipeline.reference, alarms, {}, {}, getattr(monitor.pipeline.evaluation.reference, "unjudged", 0)
+        monitor.pipeline.reference, alarms, {}, {}, getattr(monitor.pipeline.evaluation.reference, "unfamiliar_rows", 0)
     )
     for size in sizes:
         delays = result.delays[size] = []

@@ -1,6 +1,6 @@
 """Best model of the DaISy CSTR record by simulation of its held-out half, and the time of the search.
 
-ARX and output-error models of orders 1 to 3, and the neural predictor where its extra is installed, of C and T. The
+ARX and output-error models of orders 1 to 3, and the neural predictor where scikit-learn is installed, of C and T. The
 record is not part of the repository: name the folder that holds data/daisy_cstr.csv in REACTORWATCH_SHARED.
 """
 
@@ -11,8 +11,8 @@ from time import perf_counter
 
 import numpy as np
 
+from benchmarks.study_figures.neural import Neural
 from reactorwatch.identification.families import LINEAR_FAMILIES, Family
-from reactorwatch.identification.neural import Neural
 from reactorwatch.identification.selection import select
 from reactorwatch.identification.structure import Structure
 

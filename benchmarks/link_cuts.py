@@ -32,7 +32,7 @@ from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint, free_port
 from recorder.__main__ import record
 from recorder.config import RecorderConfig
-from recorder.tools.mcap_file import read_messages, recordings_in
+from recorder.files.recording import read_messages, recordings_in
 
 CUTS_S = (1.0, 5.0, 30.0)
 Manner = Literal["closed", "stalled"]

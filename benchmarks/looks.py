@@ -8,9 +8,6 @@ machine.
 
 Goal: a look within 0.25 s and a row within 50 ms, for any value, any distance of rows, and the first look too.
 
-Last, the bank of filters that follows the causes between looks: a filter and row of the compiled step, for 24 causes of
-10,000 plants, and a row of one plant with all that is done with it. Goal: the step of all these in 0.1 s.
-
     python benchmarks/looks.py [runs of bad values]
 """
 
@@ -21,17 +18,12 @@ from collections.abc import Iterable, Sequence
 from statistics import median
 from typing import NamedTuple
 
-import numpy as np
-
-from monitor_node.baseline.signal_range import signal_ranges
+from monitor_node.causes.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation, Suspect
+from monitor_node.causes.stage import FEW_ROWS, LOOKS, ROWS_BEFORE, preparation
+from monitor_node.causes.window import Row
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.isolation.bank_model import bank_model_of
-from monitor_node.isolation.causes import causes_of
-from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
-from monitor_node.isolation.stage import FEW_ROWS, LOOKS, ROWS_BEFORE, preparation
-from monitor_node.isolation.suspect import Suspect
-from monitor_node.isolation.window import Row
+from monitor_node.learn.signal_range import signal_ranges
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode
@@ -46,8 +38,7 @@ SIGNALS = CONFIG.signals
 TRAINED, ROWS = 240, 350
 FAULTS = ("coolant_flow:step:-0.05", "coolant_flow:step:-0.3", "heat_transfer:step:-0.8", "temperature_bias:step:30")
 PERIODS_MIN = (0.2, 0.5, 1.0, 5.0, 25.0)
-LOOK_S, ROW_S, BANK_S = 0.25, 0.05, 0.1
-FOLLOWED_CAUSES, FOLLOWED_PLANTS = 24, 10_000
+LOOK_S, ROW_S = 0.25, 0.05
 
 
 class Look(NamedTuple):
@@ -93,36 +84,6 @@ def look_at_faults(period_min: float = 0.1, looks: Sequence[int] = LOOKS) -> Non
         for after in looks:
             isolation = Isolation(cstr(), NoiseLevels((0.002, 0.3), (0.0, 0.0)))
             isolation.suspects(rows[600 - max(600 - after, ROWS_BEFORE) : 600 + after], since_rows=min(after, FEW_ROWS))
-
-
-def time_bank() -> tuple[float, int, float]:
-    """Seconds of the compiled step for all filters, their number, and seconds of a row of one plant."""
-    record = simulate_record(PlantConfig(seed=4, faults=(FAULTS[0] + "@60.0min",)), 1000)
-    columns = (record.time_min, record.columns["qc"], record.columns["C"], record.columns["T"])
-    rows = [(t, (u,), (c, T)) for t, u, c, T in zip(*(column.tolist() for column in columns), strict=True)]
-    isolation = Isolation(cstr(), NoiseLevels((0.002, 0.3), (0.0, 0.0)))
-    isolation.suspects(rows[:612], 10)
-    live = isolation.follow()
-    assert live is not None
-    began, taken = time.process_time(), 0
-    while taken < len(rows) - 612 and live.update(*rows[612 + taken]):
-        live.suspects()
-        taken += 1
-    of_plant = (time.process_time() - began) / taken
-    bank, count = bank_model_of(cstr(), causes_of(cstr())), FOLLOWED_CAUSES * FOLLOWED_PLANTS
-    n, n_u, n_y = bank.n_states, bank.inputs.size, len(cstr().outputs)
-    belief, new = np.zeros((count, n + n * n)), np.zeros((count, 2 * n_u + 3 + 2 * n_y))
-    belief[:, :n], new[:, 2 * n_u + 1 : 2 * n_u + 3] = (0.1, 438.5, 1.0), 0.05
-    belief[:, n :: n + 1] = (4e-6, 0.09, 0.01)
-    new[:, : bank.n_inputs] = new[:, n_u : n_u + bank.n_inputs] = 100.0
-    new[:, 2 * n_u + 3 : 2 * n_u + 3 + n_y], new[:, -n_y:] = (0.1, 438.5), np.inf
-    constants, results = bank.constants(NoiseLevels((0.002, 0.3), (0.0, 0.0))), bank.step.allocate_results(count)
-    seconds = []
-    for _ in range(5):
-        began = time.process_time()
-        bank.step.fill(count, [belief, new, constants], results)
-        seconds.append(time.process_time() - began)
-    return min(seconds), count, of_plant
 
 
 def watch_bad_values(runs: int, looks: list[Look], seed: int = 1) -> list[float]:
@@ -201,13 +162,8 @@ def main(runs: int) -> bool:
         )
     longest, row = max(item.seconds for found in kinds.values() for item in found), max(rows)
     print(f"longest row without a look      {1e3 * row:.1f} ms ({row / usual:.2f} times the peer's median look)")
-    step, filters, of_plant = time_bank()
-    print(
-        f"bank of filters                 {1e6 * step / filters:.2f} us a filter and row, {step:.3f} s for {filters:,}"
-    )
-    print(f"row of a plant with a bank      {1e6 * of_plant:.0f} us")
-    is_met = longest <= LOOK_S and row <= ROW_S and step <= BANK_S
-    goals = f"a look within {LOOK_S} s, a row within {1e3 * ROW_S:.0f} ms, the bank within {BANK_S} s"
+    is_met = longest <= LOOK_S and row <= ROW_S
+    goals = f"a look within {LOOK_S} s, a row within {1e3 * ROW_S:.0f} ms"
     print(f"goal: {goals}: {'met' if is_met else 'NOT met'}")
     return is_met
 

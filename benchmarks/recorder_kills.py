@@ -29,7 +29,7 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint
-from recorder.tools.mcap_file import read_messages, recordings_in
+from recorder.files.recording import read_messages, recordings_in
 
 KILLS = 50
 RATE_PER_S = 5_000

@@ -28,13 +28,15 @@ from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint
+from recorder import RecordedMessage
 from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
-from recorder.message import RecordedMessage
-from recorder.policy.rotation import Fsync
-from recorder.storage.part_file import PartFile
-from recorder.tools.mcap_file import RecordingWriter, read_messages, read_metadata, read_record
+from recorder.files.part_file import PartFile
+from recorder.files.recording import read_messages, read_metadata
+from recorder.files.writer import RecordingWriter
+from recorder.keep import Fsync
+from recorder.tools.convert import read_record
 
 RATE_PER_S = 20_000
 SECONDS = 5

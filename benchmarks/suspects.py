@@ -15,9 +15,10 @@ import numpy as np
 
 from benchmarks.faults.bank import AFTER_MIN, BANK, Case, cases
 from benchmarks.faults.runs import record_of
-from benchmarks.faults.watch import watch
+from benchmarks.faults.watch import newest_suspects, watch
 from benchmarks.promise.pool import share_interval
-from reactorwatch.runtime.parallel.jobs import Failed, choose_executor
+from reactorwatch.runtime.parallel import choose_executor
+from reactorwatch.runtime.parallel.jobs import Failed
 
 BUDGET_PER_30_DAYS = 30.0
 EARLIEST_MIN, SPAN_MIN = 200.0, 40.0
@@ -31,8 +32,9 @@ FIRST_SEED = 81_000_000
 
 def rank(case: Case) -> int:
     """Rank of the true cause at the end of a run, from 1; 0: it is no suspect."""
-    named = [message for message in watch(record_of(case), BUDGET_PER_30_DAYS).messages if message.suspects]
-    suspects = sorted(named[-1].suspects, key=lambda item: -item.probability) if named else []
+    watched = watch(record_of(case), BUDGET_PER_30_DAYS)
+    latest = max((message.incident for message in watched.messages), default=0)
+    suspects = sorted(newest_suspects(watched, latest), key=lambda item: -item.probability)
     return next((i for i, item in enumerate(suspects, start=1) if item.cause == case.fault.cause), 0)
 
 

@@ -26,7 +26,7 @@ from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode
-from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.contract.messages_pb2 import Incident
 from reactorwatch.records.record import Record
 from recorder.tools.player import samples_of
 
@@ -92,7 +92,7 @@ def watch_live(record: Record) -> tuple[str, float]:
     found, suspect = -1, ("", 0.0)
     for message in (encode(item) for item in samples_of(record, CONFIG.plant)):
         for item in monitor.on_message(message, 0):
-            if isinstance(item.message, Alarm) and item.message.suspects:
+            if isinstance(item.message, Incident) and item.message.suspects:
                 suspect = (item.message.suspects[0].cause, item.message.suspects[0].probability)
         if monitor.awaits_diagnosis and found < 0:
             found = monitor.rows + LATE_ROWS

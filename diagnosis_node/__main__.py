@@ -1,10 +1,171 @@
-"""The diagnosis node as a process: `python -m diagnosis_node [settings.toml]`."""
+"""The diagnosis node, `python -m diagnosis_node [settings.toml]`: diagnoses a plant's record after an alarm.
 
+The node subscribes to the same bus as the monitor and runs each diagnosis in a process of its own, so that neither its
+load nor its failure affects plant and monitor. Each diagnosis gets a folder, named after the plant and the time of the
+alarm, with the samples as a recording and the report of `reactorwatch diagnose`, so that it can be repeated by hand.
+"""
+
+import subprocess
 import sys
+import threading
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
 
-from diagnosis_node.node import run
-from diagnosis_node.trigger import DiagnosisConfig
+import msgspec
+import structlog
+
+from diagnosis_node.trigger import DiagnosisConfig, DiagnosisRequest, DiagnosisTrigger
+from reactorwatch.contract import keys
+from reactorwatch.errors import InputError
+from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.folder import make_folder
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import EventLoop, stop_on_signals
 from reactorwatch.runtime.node_main import main
+from reactorwatch.runtime.start import instance_name, join
+from recorder import RecordedMessage
+from recorder.files.writer import RecordingWriter
+
+log = structlog.get_logger()
+
+NODE = "diagnosis"
+RECORDING = "record.mcap"
+"""Name of the diagnosed recording in the folder of its report."""
+
+DRAIN_TIMEOUT_S = 0.5
+
+
+class Command:
+    """Runs `reactorwatch` as a process that can be terminated."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[str] | None = None
+        self._ended = False
+
+    def __call__(self, arguments: list[str]) -> tuple[int, str, str]:
+        """Run `reactorwatch` with arguments; returns exit code, standard output and standard error."""
+        command = [sys.executable, "-P", "-m", "reactorwatch", *arguments]
+        self._process = subprocess.Popen(  # noqa: S603 (our own command)
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        if self._ended:
+            self._process.terminate()
+        output, errors = self._process.communicate()
+        return self._process.returncode, output, errors or "it was stopped"
+
+    def end(self) -> None:
+        """Terminate the running process, if any, and every later one."""
+        self._ended = True
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+
+
+class DiagnosisRunner:
+    """Records samples and diagnoses them in a thread, one diagnosis at a time.
+
+    Args:
+        config: settings.
+        out: folder for the reports.
+        run: runs the command.
+    """
+
+    def __init__(self, config: DiagnosisConfig, out: Path, run: Command) -> None:
+        self._config, self._out, self._run = config, out, run
+        self._thread: threading.Thread | None = None
+
+    @property
+    def busy(self) -> bool:
+        """True while a diagnosis runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self, request: DiagnosisRequest) -> None:
+        """Start a diagnosis; see `DiagnosisTrigger`."""
+        self._thread = threading.Thread(target=self._diagnose, args=(request,), name="diagnosis")
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Wait for the end of a running diagnosis."""
+        if self._thread is not None:
+            self._thread.join()
+
+    def _diagnose(self, request: DiagnosisRequest) -> None:
+        try:
+            folder = self._write_record(request)
+            code, output, errors = self._run([*self._command(folder), "--json"])
+            if code != 0:
+                why = (errors.strip().splitlines() or ["no reason was given"])[-1]
+                log.warning("not diagnosed", alarm=request.alarm, why=why, folder=str(folder))
+                return
+            result = msgspec.json.decode(output)
+            log.info("diagnosed", alarm=request.alarm, **_summary(result), report=str(folder / "report.html"))
+        except (InputError, OSError, msgspec.DecodeError) as error:
+            log.warning("not diagnosed", alarm=request.alarm, why=str(error))
+
+    def _write_record(self, request: DiagnosisRequest) -> Path:
+        """Write the samples to a new folder, which is returned."""
+        folder = make_folder(self._free_folder(request.raised_ns), may_exist=False)
+        metadata = {"plant": self._config.plant, "alarm": request.alarm, "raised_ns": str(request.raised_ns)}
+        with atomic_write(folder / RECORDING) as temporary, RecordingWriter(temporary, metadata) as writer:
+            for time_ns, item in request.samples:
+                writer.write(
+                    RecordedMessage(item.key, item.payload, item.encoding, item.received_ns or time_ns, time_ns)
+                )
+        return folder
+
+    def _free_folder(self, raised_ns: int) -> Path:
+        moment = datetime.fromtimestamp(raised_ns // 10**9, UTC)
+        name = f"{self._config.plant}-{moment:%Y%m%dT%H%M%SZ}"
+        taken = sum(path.name == name or path.name.startswith(f"{name}-") for path in self._out.glob(f"{name}*"))
+        return self._out / (f"{name}-{taken + 1}" if taken else name)
+
+    def _command(self, folder: Path) -> list[str]:
+        command = ["diagnose", str(folder / RECORDING), "--plant", self._config.plant, "--out", str(folder)]
+        if self._config.process is not None:
+            command += ["--process", self._config.process]
+        if self._config.tolerance:
+            command += ["--tolerance", ",".join(f"{name}={value!r}" for name, value in self._config.tolerance.items())]
+        return command
+
+
+def run(config: DiagnosisConfig, bus_config: BusConfig) -> None:
+    """Diagnose after alarms until SIGINT or SIGTERM.
+
+    Raises:
+        InputError: the settings of the bus are invalid, or no folder is set.
+    """
+    if config.out is None:
+        raise InputError("settings [diagnosis]: out must be a folder for the reports")
+    command = Command()
+    diagnoses = DiagnosisRunner(config, Path(config.out), command)
+    node = DiagnosisTrigger(config, diagnoses.start, lambda: diagnoses.busy)
+    token = keys.instance_token(config.plant, NODE, instance_name())
+    with stop_on_signals() as stop, join(bus_config, NODE, stop, token) as bus:
+        if bus is None:
+            return
+        try:
+            log.info("diagnosing after alarms", plant=config.plant, after_min=config.after_min, out=config.out)
+            loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S)
+            loop.subscribe(*(keys.all_keys(config.plant, kind) for kind in (keys.SAMPLE, keys.ALARM)))
+            bus.declare_token(keys.key(config.plant, keys.ALIVE, NODE))
+            loop.run()
+        finally:
+            command.end()
+            diagnoses.wait()
+            if node.waiting is not None:
+                log.warning("not diagnosed", alarm=node.waiting, why="stopped before enough data came")
+
+
+def _summary(result: dict[str, Any]) -> dict[str, Any]:
+    """Log fields for the object that `diagnose --json` prints, without empty ones."""
+    causes = [
+        f"{item['label']} ({item['cause']}, {item['profile']}) {item['parameters']['size']['value']:.3g}"
+        for item in result["causes"]
+    ]
+    location = result["location"] if result["verdict"] == "unknown" else None
+    fields = {"causes": " with ".join(causes), "alternatives": len(result["alternatives"]), "location": location}
+    return {"verdict": result["verdict"]} | {name: value for name, value in fields.items() if value}
+
 
 if __name__ == "__main__":
     sys.exit(

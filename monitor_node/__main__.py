@@ -3,38 +3,37 @@
 python -m monitor_node [settings.toml]
 """
 
-import secrets
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import chain
 from math import inf
 from pathlib import Path
 
 import structlog
 
-from monitor_node.baseline.training_diagnosis import read_equations
+from monitor_node.causes import stage
+from monitor_node.charts import drift
 from monitor_node.config import MonitorConfig
 from monitor_node.core import COMMANDS, Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker
-from monitor_node.health.message import NODE
-from monitor_node.health.other_monitors import OtherMonitors, log_report
-from monitor_node.isolation import stage
-from monitor_node.stages import drift
-from monitor_node.storage.alarm_file import AlarmFile
-from monitor_node.storage.state_file import StateFile
+from monitor_node.health import NODE, OtherMonitors
+from monitor_node.learn.training_diagnosis import read_equations
+from monitor_node.storage.state_files import StateFile
 from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
+from reactorwatch.contract.alarm_text import state_word
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, Incident
 from reactorwatch.errors import InputError
-from reactorwatch.runtime import bus_zenoh
-from reactorwatch.runtime.bus import Bus
+from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, stop_on_signals
 from reactorwatch.runtime.metrics import Metrics, serve_metrics
 from reactorwatch.runtime.node_main import main
 from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
+from reactorwatch.runtime.start import instance_name, join, wait_ready
 
 log = structlog.get_logger()
 
@@ -58,17 +57,18 @@ class MonitorNode(Monitor):
     Args:
         config: settings of the monitor.
         start_ns: present time.
+        token: its instance token; empty: a new one.
 
     Raises:
         InputError: a file of the settings is unusable.
 
     Attributes:
         resumed: True if the monitor resumed from a stored state.
-        token: unique liveliness token of this monitor.
+        token: instance token of this monitor.
         preparation: steps that prepare the end of the training and the search for causes; None: there are none left.
     """
 
-    def __init__(self, config: MonitorConfig, start_ns: int) -> None:
+    def __init__(self, config: MonitorConfig, start_ns: int, token: str = "") -> None:
         config, model = load_process(config)
         super().__init__(config, start_ns, model=model)
         self._logged: dict[object, str] = {}
@@ -76,27 +76,16 @@ class MonitorNode(Monitor):
         self.preparation: Iterator[None] | None = None
         self._prepare_ns = self._look_ns = start_ns
         self._worker = DiagnosisWorker()
-        self.token = keys.monitor_token(config.plant, f"{start_ns:020d}-{secrets.token_hex(4)}")
+        self.token = token or keys.monitor_token(config.plant, instance_name())
         self._others = OtherMonitors(self.token, lambda: (config.plant,))
-        paths = [Path(name) for name in (config.alarm_state_file, config.state_file) if name is not None]
-        if len({path.resolve() for path in paths}) < len(paths):
-            raise InputError(f"state_file and alarm_state_file must be two files, got {paths[0]} for both")
-        self._alarm_file: AlarmFile | None = None
-        if config.alarm_state_file is not None:
-            self._alarm_file = AlarmFile(Path(config.alarm_state_file), self)
         self._file: StateFile | None = None
         if config.state_file is not None:
             self._file = StateFile(Path(config.state_file), self, config.state_every_s)
             log.info(self._file.load())
+            if self._file.claim.failure:
+                log.warning(self._file.claim.failure)
         self.resumed = self.rows > 0
         self._repeated = self.unconfirmed if self.resumed else []
-        if self._alarm_file is not None:
-            # The state's alarms belong to its rows; but the alarms of a state that was aside are older than the file.
-            line = self._alarm_file.load(
-                is_newest=not self.resumed or (self._file is not None and self._file.was_aside)
-            )
-            if line is not None:
-                log.warning(line)
 
     @property
     def tokens(self) -> tuple[str, ...]:
@@ -124,7 +113,7 @@ class MonitorNode(Monitor):
 
     def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
         """Log that another monitor of the plant, or a fleet with the plant, was noticed or has gone."""
-        log_report(self._others.on_token(token, is_alive=is_alive))
+        self._others.on_token(token, is_alive=is_alive)
         return []
 
     def on_tick(self, now_ns: int) -> list[Publication]:
@@ -161,6 +150,7 @@ class MonitorNode(Monitor):
         self.unconfirmed = []
         if self._file is not None:
             self._try(self._file.store)
+            self._file.claim.close()
         return super().on_stop(now_ns)
 
     def _pop_repeated(self) -> list[Publication]:
@@ -168,25 +158,28 @@ class MonitorNode(Monitor):
         return repeated
 
     def _keep(self, publications: list[Publication], now_ns: int) -> None:
+        """Store and log what is published next.
+
+        Raises:
+            InputError: another monitor has claimed the state, and publishes these alarms.
+        """
+        if self._file is not None and any(isinstance(item.message, Alarm) for item in publications):
+            self._file.claim.check()
         self.unconfirmed = [item for item in publications if not isinstance(item.message, Health)] or self.unconfirmed
         for publication in publications:
-            alarm = publication.message
-            if isinstance(alarm, Alarm):
-                likely = [f"{item.cause} {item.probability:.2f}" for item in alarm.suspects]
-                log.info(
-                    "alarm",
-                    alarm=alarm.alarm,
-                    change=alarm.event,
-                    by=alarm.by,
-                    text=alarm.text,
-                    suspects=", ".join(likely),
-                )
+            message = publication.message
+            if isinstance(message, Health):
+                message.waiting_for = next(iter(self._logged.values()), "")
+            if isinstance(message, Alarm):
+                log.info("alarm", alarm=message.alarm, change=message.event, by=message.by, text=message.text)
+            if isinstance(message, Incident):
+                likely = ", ".join(f"{item.cause} {item.probability:.2f}" for item in message.suspects)
+                state = state_word(message.state)
+                log.info("incident", number=message.number, state=state, suspects=likely, text=message.text)
         while self.notes:
             log.warning(self.notes.pop(0))
         while self.failures.tracebacks:
             log.debug("traceback", traceback=self.failures.tracebacks.pop(0))
-        if self._alarm_file is not None:
-            self._try(self._alarm_file.store)
         if self._file is not None and self._file.is_due(now_ns):
             self._try(self._file.store)
 
@@ -202,16 +195,11 @@ class MonitorNode(Monitor):
             self._logged.pop(store, None)
 
 
-def declare_tokens(node: MonitorNode, bus: Bus) -> None:
-    """Declare the liveliness tokens of the plant's monitor."""
-    bus.declare_token(keys.key(node.config.plant, keys.ALIVE, NODE))
-    bus.declare_token(node.token)
-
-
 def run(
     config: MonitorConfig,
     bus_config: BusConfig,
     metrics_config: MetricsConfig = MetricsConfig(),  # noqa: B008 (it is frozen)
+    state: Path | None = None,
 ) -> None:
     """Run the monitor until SIGINT or SIGTERM.
 
@@ -219,34 +207,51 @@ def run(
         config: settings of the monitor.
         bus_config: settings of the bus.
         metrics_config: settings of the metrics.
+        state: folder of its files, which is made if it does not exist; None: it is there.
 
     Raises:
         InputError: the settings are inconsistent, or a file of the settings is unusable.
     """
-    node = MonitorNode(config, time.time_ns())
-    config = node.config
-    node.preparation = chain(drift.preparation(config, wanted=True), stage.preparation(config, node.equations))
-    page = Metrics(NODE, {config.plant: node.alarms.all_alarms})
-    with serve_metrics(metrics_config, page) as metrics, stop_on_signals() as stop:
-        bus = bus_zenoh.connect(bus_config, NODE, stop)
-        if bus is None:
+
+    def start() -> MonitorNode:
+        if state is not None:
+            make_folder(state, "--state")
+        return MonitorNode(config, time.time_ns(), token)
+
+    load_process(config)  # errors in the settings are raised before waiting for a router
+    token = keys.monitor_token(config.plant, instance_name())
+    page = Metrics(NODE, {config.plant: lambda: node.alarms.all_alarms()})
+    with (
+        serve_metrics(metrics_config, page) as metrics,
+        stop_on_signals() as stop,
+        join(bus_config, NODE, stop, token) as bus,
+    ):
+        # Its files are read once no other monitor writes them.
+        started = None if bus is None else wait_ready(start, bus, NODE, config.plant, stop)
+        if bus is None or started is None:
             return
-        try:
-            length = config.training_length
-            log.info("listening", plant=config.plant, training_min=length.minutes, training_rows=length.rows or None)
-            on_publish = metrics.on_publish if metrics is not None else None
-            loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
-            # All samples published since the state was stored, however long ago; the node skips those it knows.
-            history_s = inf if node.resumed else 0.0
-            loop.subscribe(
-                keys.all_keys(config.plant, keys.SAMPLE), history_s=history_s, on_history_end=node.on_history_end
-            )
-            loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
-            loop.accept_commands(*(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS))
-            declare_tokens(node, bus)
-            loop.run()
-        finally:
-            bus.close()
+        node, config = started, started.config  # with what its process states
+        node.preparation = chain(drift.preparation(config, wanted=True), stage.preparation(config, node.equations))
+        length = config.training_length
+        log.info("listening", plant=config.plant, training_min=length.minutes, training_rows=length.rows or None)
+        on_publish = metrics.on_publish if metrics is not None else None
+        loop = EventLoop(
+            node,
+            bus,
+            stop,
+            drain_timeout_s=DRAIN_TIMEOUT_S,
+            on_publish=on_publish,
+            on_backlog=partial(setattr, node, "is_behind"),
+        )
+        # All samples published since the state was stored, however long ago; the node skips those it knows.
+        history_s = inf if node.resumed else 0.0
+        loop.subscribe(
+            keys.all_keys(config.plant, keys.SAMPLE), history_s=history_s, on_history_end=node.on_history_end
+        )
+        loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
+        loop.accept_commands(*(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS))
+        bus.declare_token(keys.key(config.plant, keys.ALIVE, NODE))
+        loop.run()
 
 
 if __name__ == "__main__":

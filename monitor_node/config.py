@@ -1,6 +1,7 @@
 """The monitor's settings."""
 
 from collections.abc import Callable, Mapping
+from math import ceil
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias
 
@@ -12,7 +13,7 @@ from reactorwatch.runtime.setting_rules import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart
 from reactorwatch.spc.m_of_n import check_rule
-from reactorwatch.spc.value_chart import FEWEST_SIGNALS
+from reactorwatch.spc.value_chart import FEWEST_SIGNALS, ValueChart
 
 CHART_SETTINGS = [setting for chart in CHARTS for setting in chart.settings if isinstance(setting, Setting)]
 CHART_SIGNALS = [setting for chart in CHARTS for setting in chart.settings if isinstance(setting, SignalSetting)]
@@ -77,25 +78,26 @@ DEFAULT_PRIORITIES: dict[str, PriorityName] = msgspec.convert(DEFAULT.watch.prio
 """Priorities where none are stated; the same object, so that it is recognised."""
 
 
+PERIOD_ERROR = 0.01
+"""Rows by which a training may be short of its minutes, since a sampling period is rounded to nanoseconds."""
+
+
 class TrainingLength(NamedTuple):
     """Duration of a training.
 
     Attributes:
-        minutes: duration in minutes of the plant; None: it is stated in rows.
+        minutes: duration in minutes of rows, one sampling period a row; None: it is stated in rows.
         rows: duration in rows.
     """
 
     minutes: float | None
     rows: int = 0
 
-    def share(self, minutes: float, rows: int) -> float:
-        """Share of the training that is done, at most 1.
-
-        Args:
-            minutes: time since its first row.
-            rows: number of its rows.
-        """
-        return min(minutes / self.minutes if self.minutes is not None else rows / self.rows, 1.0)
+    def count_rows(self, period_min: float) -> int:
+        """Number of rows of the training at a sampling period."""
+        if self.minutes is None:
+            return self.rows
+        return max(1, ceil(self.minutes / period_min - PERIOD_ERROR))
 
 
 class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
@@ -120,7 +122,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         order: order of the ARX models.
         delay: delay of the input in samples; with 1 it acts on the next sample.
         forgetting: forgetting factor of the adaptive model, in [0.5, 1]; with 1 it forgets nothing.
-        training_min: duration of the training, in minutes of the plant; None: see `training_length`.
+        training_min: duration of the training, in minutes of rows, one sampling period a row; time without rows does
+            not count. None: see `training_length`.
         training_rows: duration of the training in rows, instead of `training_min`.
         diagnose_training: true to diagnose the training, beside the watch, and to judge the plant by the equations with
             the deviations that it had from the start.
@@ -143,7 +146,6 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         dead_band: a point is normal within (1 - dead_band) of the limit; in [0, 0.9].
         incident_min: minutes of the plant after the last change of an incident in which an alarm still belongs to it.
         longest_shelf_min: longest time for which an alarm may be shelved, in minutes of the plant.
-        alarm_state_file: file of the alarms' state, for a restart; None: it is not stored.
         state_file: file of the monitor's full state, for a restart; None: it is not stored.
         state_every_s: storage interval in seconds; after a change of an alarm the state is stored at once.
         reorder_rows: number of newer rows that may start before an incomplete row is emitted.
@@ -184,7 +186,6 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     dead_band: Annotated[float, msgspec.Meta(ge=0.0, le=0.9)] = 0.1
     incident_min: Annotated[float, msgspec.Meta(ge=0.0, le=1e6)] = 60.0
     longest_shelf_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] = 480.0
-    alarm_state_file: str | None = None
     state_file: str | None = None
     state_every_s: Annotated[float, msgspec.Meta(ge=0.1, le=3600.0)] = 5.0
     reorder_rows: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 8
@@ -194,9 +195,14 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     priorities: dict[str, PriorityName] = msgspec.field(default_factory=lambda: DEFAULT_PRIORITIES)
 
     older_keys: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = MappingProxyType(
-        {"input": ("inputs", lambda name: [name]), "model": ("process", lambda name: name)}
+        {
+            "input": ("inputs", lambda name: [name]),
+            "model": ("process", lambda name: name),
+            "alarm_state_file": ("", str),  # the state has the alarms
+        }
     )
-    """Older names of keys, each with the present one and the function from a value of the older to one of it."""
+    """Older names of keys, each with the present one and the function from a value of the older to one of it; a key
+    without a present one has no effect."""
 
     def __post_init__(self) -> None:
         check_plant(self.plant)
@@ -231,7 +237,10 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"startup_modes are by mode, {self.modes}, got {signal!r}")
         for signal, (lower, upper) in self.bounds.items():
             if signal not in self.signals:
-                raise ValueError(f"bounds are by input and output, {self.signals}, got {signal!r}")
+                raise ValueError(
+                    f"bounds are by input and output, {self.signals}, got {signal!r}; name the plant's process, or its "
+                    "inputs and outputs"
+                )
             if not lower < upper:
                 raise ValueError(f"bounds of {signal} must be a lower and a higher number, got {lower:g} and {upper:g}")
         for signal, step in self.resolution.items():
@@ -281,6 +290,11 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     def carried_signals(self) -> tuple[str, ...]:
         """Signals beside the rows that go with an alarm: set points, then modes."""
         return (*self.setpoints, *self.modes)
+
+    @property
+    def has_values_only(self) -> bool:
+        """True if all charts of the settings are of values, so that there may be none after a training."""
+        return all(issubclass(chart(name), ValueChart) for name in self.charts)
 
     @property
     def chart_settings(self) -> dict[str, float]:

@@ -14,36 +14,46 @@ from typing import Any, cast
 import msgspec
 from google.protobuf.message import Message
 
-from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.alarms.annunciator import Annunciator, AnnunciatorMemory
 from monitor_node.alarms.commands import COMMANDS as ALARM_COMMANDS
 from monitor_node.alarms.commands import execute_command
-from monitor_node.baseline.commands import BASELINE, LIST
-from monitor_node.baseline.model_update import ScheduledChange
-from monitor_node.baseline.training import NO_VALUE
-from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
+from monitor_node.checks.silence import SilenceCheck
 from monitor_node.config import MonitorConfig
-from monitor_node.health.failures import Failures
-from monitor_node.health.message import NODE, complete_health
+from monitor_node.health import HEARD_AGAIN_NS, NODE, STALL_NS, Failures, ReceiveStats, health_message
 from monitor_node.ingest.alignment import Aligner, Row
-from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, ReceiveStats
-from monitor_node.ingest.rejects import RejectCounter
-from monitor_node.ingest.replay_filter import ReplayFilter
-from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, reject_reason
-from monitor_node.ingest.sample_units import SampleUnits
-from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
-from monitor_node.pipeline.pipeline import PlantPipeline
-from monitor_node.pipeline.promise_stage import PromiseStage
-from monitor_node.pipeline.training_check import check_training
-from monitor_node.signal_checks.timeout import SilenceCheck
-from monitor_node.state.monitor_state import MonitorMemory, MonitorState, learning_settings, open_state, seal_state
+from monitor_node.ingest.samples import (
+    LARGEST_NUMBER,
+    LARGEST_SAMPLE,
+    LARGEST_VALUE,
+    USABLE,
+    RejectCounter,
+    SampleUnits,
+    reject_reason,
+)
+from monitor_node.ingest.sequence_check import HeldSample, ReplayFilter, SequenceCheck
+from monitor_node.learn.model_update import BASELINE, LIST, ScheduledChange
+from monitor_node.learn.training import NO_VALUE
+from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding
+from monitor_node.monitor_state import (
+    MonitorMemory,
+    MonitorState,
+    OtherSettingsError,
+    learning_settings,
+    open_state,
+    seal_state,
+)
+from monitor_node.watch.pipeline import PlantPipeline
+from monitor_node.watch.promise import PromiseStage
+from monitor_node.watch.training_check import check_training
 from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode, encode
+from reactorwatch.contract.codec import OTHER_VERSION, Body, DecodeError, Encoded, Publication, decode, encode
 from reactorwatch.contract.commands import decode_command
-from reactorwatch.contract.messages_pb2 import Alarm, Baseline, BaselineCommand, CommandReply, Health, Promise, Sample
+from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply, Promise, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.stored_state import copy_of
 
 COMMANDS: Mapping[str, type[Message]] = {**ALARM_COMMANDS, BASELINE: BaselineCommand}
 """Message type by command."""
@@ -75,6 +85,7 @@ class Monitor:
         unconfirmed: the newest publications, which a kill may keep from leaving the process; the caller sets them. They
             are stored with the state.
         stats: statistics by receive time, which a restart resets.
+        is_behind: True while messages wait to be processed, as the caller states before a tick.
     """
 
     def __init__(
@@ -103,6 +114,7 @@ class Monitor:
         self._indices = {signal: place for place, signal in enumerate(self._signals)}
         self._aligner = Aligner(self._signals, config.reorder_rows)
         self._replay_filter: ReplayFilter | None = None
+        self._alarms_with_other_settings: AnnunciatorMemory | None = None
         self.alarms = Annunciator(config)
         self.pipeline = self._new_pipeline(self.alarms)
         judged_by = self.pipeline.model
@@ -113,6 +125,7 @@ class Monitor:
         self.stats = ReceiveStats(start_ns, start_ns)
         self.on_row_end: Callable[[int, list[Publication]], None] | None = None
         self.unconfirmed: list[Publication] = []
+        self.is_behind = False
         self._snapshot_ns = int(config.snapshot_min * MINUTE_NS)
 
     # --- event loop ------------------------------------------------------------------------------------------
@@ -133,7 +146,10 @@ class Monitor:
         try:
             sample = decode(message.payload, message.encoding)
         except DecodeError as error:
-            self.rejects.add(error.reason, f"{message.key}: {error}")
+            if error.reason == OTHER_VERSION:
+                self._refuse(signal, error.reason, str(error))
+            else:
+                self.rejects.add(error.reason, f"{message.key}: {error}")
             return []
         if not isinstance(sample, Sample):
             self.rejects.add("encoding", f"{message.key}: a Sample was expected, got {message.encoding}")
@@ -144,20 +160,20 @@ class Monitor:
         """Process a sample of one of the plant's signals; returns publications."""
         quality, value, unit = sample.quality, sample.value, sample.unit  # each access costs as much as a line here
         if quality not in USABLE or not abs(value) < LARGEST_VALUE:
-            self.rejects.add(*reject_reason(signal, sample))
+            self._refuse(signal, *reject_reason(signal, sample))
             return []
         if unit != self._plain_units.get(signal):
             try:
                 value, unit = self._sample_units.convert(signal, unit, value)
             except InputError as error:
-                self.rejects.add("unit", str(error))
+                self._refuse(signal, "unit", str(error))
                 return []
         index = self._indices.get(signal)
         if index is None:
             self.pipeline.operation.on_sample(signal, sample.time_ns, value)
             return []
         if self._replay_filter is not None and self._replay_filter.is_duplicate(index, sample.time_ns, sample.sequence):
-            self._aligner.state.counts.duplicated += 1
+            self._aligner.memory.counts.duplicated += 1
             return []
         publications: list[Publication] = []
         time_ns, number = sample.time_ns, sample.sequence
@@ -182,11 +198,19 @@ class Monitor:
         self.memory.published += len(publications)
         return publications
 
+    def _refuse(self, signal: str, reason: str, text: str) -> None:
+        """Count a sample of one of the plant's signals that cannot be used."""
+        self.rejects.add(reason, text)
+        if signal in self._indices and reason != "payload":
+            self.memory.unusable.add(signal, text)
+
     def _accept(
         self, signal: str, time_ns: int, number: int, value: float, unit: str, publications: list[Publication]
     ) -> None:
         """Process an accepted sample."""
         memory = self.memory
+        if memory.unusable.reasons:
+            memory.unusable.clear(signal)
         if unit != memory.units[signal] or signal not in memory.heard_from_ns:
             memory.heard_from_ns.setdefault(signal, time_ns)
             memory.units[signal] = unit
@@ -230,7 +254,9 @@ class Monitor:
         if self.stats.ticked and now_ns - self.next_tick_ns() > STALL_NS:
             self.stats.stalls += 1
         self.stats.ticked = True
-        publications = self._guard("silence", self.silence.check, now_ns)
+        if self.is_behind:
+            self.silence.postpone(now_ns)
+        publications = self._guard("silence", self.pipeline.evaluation.signals.check_silence, now_ns)
         if self._republishes_baseline and self.baseline is not None:
             publications.append(Publication(keys.key(self.config.plant, keys.BASELINE, NODE), self.baseline))
         self._republishes_baseline = False
@@ -264,13 +290,22 @@ class Monitor:
         """Resume from what `to_bytes` of a monitor with the same settings returned.
 
         Until `on_history_end`, samples that were processed before are counted as duplicated and dropped (see
-        `replay_filter`).
+        `ReplayFilter`).
 
         Raises:
             InputError: the bytes are no state; nothing has changed.
-            OtherSettingsError: the state is of a monitor with other settings; nothing has changed.
+            OtherSettingsError: the state is of a monitor with other settings. The first such state gives its alarms,
+                which are newer than those of a state that fits afterwards.
         """
-        self.restore(open_state(data, self._learning_settings))
+        try:
+            self.restore(open_state(data, self._learning_settings))
+        except OtherSettingsError as error:
+            if self._alarms_with_other_settings is None:
+                self._alarms_with_other_settings = error.alarms
+                self._restore_alarms(error.alarms)
+            raise
+        if self._alarms_with_other_settings is not None:
+            self._restore_alarms(self._alarms_with_other_settings)
 
     @property
     def state(self) -> MonitorState:
@@ -278,8 +313,8 @@ class Monitor:
         return MonitorState(
             **msgspec.structs.asdict(self.memory),
             settings={},
-            alignment=self._aligner.state,
-            board=self.alarms.to_bytes(),
+            alignment=self._aligner.memory,
+            board=self.alarms.memory,
             watch=self.pipeline.state,
             unconfirmed=[encode(item)[:3] for item in self.unconfirmed],
         )
@@ -293,7 +328,7 @@ class Monitor:
         board = Annunciator(self.config)
         try:
             pipeline = self._new_pipeline(board)
-            board.from_bytes(state.board)
+            board.restore(state.board)
             pipeline.restore(state.watch, self.stats.start_ns)
             unconfirmed = [
                 Publication(key, cast(Body, decode(payload, encoding))) for key, payload, encoding in state.unconfirmed
@@ -304,7 +339,8 @@ class Monitor:
         self._republishes_baseline = True  # it may not have been published before the stop
         self.memory = memory = msgspec.convert(state, MonitorMemory, from_attributes=True)
         self.rejects.by_reason, self.failures.by_stage = memory.refused, memory.failures
-        self._aligner.state, self._replay_filter = state.alignment, ReplayFilter(state.alignment)
+        self._aligner.memory, self._replay_filter = state.alignment, ReplayFilter(state.alignment)
+        self.silence.unusable = memory.unusable
         self._output_units = [memory.units[output] for output in self.config.outputs]
         self.unconfirmed = unconfirmed
 
@@ -312,33 +348,22 @@ class Monitor:
     def _learning_settings(self) -> dict[str, Any]:
         return learning_settings(self.config, self.pipeline.model, points=self._points)
 
-    def count_duplicate(self) -> None:
-        """Count a sample that was processed before."""
-        self.memory.received += 1
-        self._aligner.state.counts.duplicated += 1
-
     def on_history_end(self) -> None:
         """End the history query: from now on no sample is one that was processed before a restart."""
         self._replay_filter = None
 
-    def restore_alarms(self, data: bytes) -> None:
-        """Restore the alarms alone from what `Annunciator.to_bytes` returned.
+    @property
+    def awaits_samples(self) -> bool:
+        """True if no sample has come since it resumed from a state."""
+        return self._replay_filter is not None and not self._replay_filter.has_begun
+
+    def _restore_alarms(self, memory: AnnunciatorMemory) -> None:
+        """Restore the alarms alone from a copy of their memory.
 
         Raises:
-            InputError: see `Annunciator.from_bytes`; nothing has changed.
+            InputError: see `Annunciator.restore`; nothing has changed.
         """
-        self.alarms.from_bytes(data)
-        self.pipeline.resume_from_alarms()
-
-    def resume_from_alarms(self, alarms: Iterable[Alarm]) -> None:
-        """Resume from the alarms that another monitor of the plant published last, without its state.
-
-        The plant is trained again. Active alarms stay active until their condition is found to be over.
-
-        Args:
-            alarms: the newest message of each alarm.
-        """
-        self.alarms.resume_from(alarms)
+        self.alarms.restore(copy_of(memory))
         self.pipeline.resume_from_alarms()
 
     @property
@@ -382,11 +407,11 @@ class Monitor:
         return "watching" if self.pipeline.watching or not self.pipeline.is_judged else "training"
 
     @property
-    def is_normal(self) -> bool:
+    def is_ordinary(self) -> bool:
         """True if rows are evaluated and nothing happens: no command or change of a unit, no history, no event."""
         pipeline, history = self.pipeline, self._replay_filter
-        is_quiet = not (pipeline.model_update.commands or self._sample_units.converted)
-        return is_quiet and pipeline.watching and pipeline.is_normal and (history is None or history.is_done)
+        is_quiet = not (pipeline.model_update.commands or self._sample_units.converted or self.memory.unusable.reasons)
+        return is_quiet and pipeline.watching and pipeline.is_ordinary and (history is None or history.is_done)
 
     @property
     def model(self) -> ProcessModel | None:
@@ -401,17 +426,12 @@ class Monitor:
     @property
     def rows(self) -> int:
         """Number of rows so far, including incomplete rows."""
-        return self._aligner.state.counts.rows
-
-    @property
-    def has_pending_rows(self) -> bool:
-        """True while a row waits for samples."""
-        return bool(self._aligner.state.pending)
+        return self._aligner.memory.counts.rows
 
     @property
     def restarts(self) -> int:
         """Number of restarts of the plant, or of its clock, so far."""
-        return self._aligner.state.counts.restarts
+        return self._aligner.memory.counts.restarts
 
     @property
     def silence(self) -> SilenceCheck:
@@ -485,7 +505,7 @@ class Monitor:
     # --- after an error of this software ---------------------------------------------------------------------
 
     def _new_pipeline(self, board: Annunciator) -> PlantPipeline:
-        return PlantPipeline(
+        pipeline = PlantPipeline(
             self.config,
             board,
             points=self._points,
@@ -497,6 +517,8 @@ class Monitor:
                 self.config, board, self.failures, check=check_training, states_power=self._power, points=self._points
             ),
         )
+        pipeline.evaluation.signals.silence.unusable = self.memory.unusable
+        return pipeline
 
     def _guard(self, stage: str, step: Callable[[int], list[Publication]], time_ns: int) -> list[Publication]:
         """Publications of a step at a time; none after an error, which is contained."""
@@ -512,24 +534,27 @@ class Monitor:
         The alarms stay; an active one is cleared when its condition is found to be over.
         """
         self.failures.add(stage, error, "the plant is learned again, its alarms stay")
-        alarms = self.alarms.all_alarms()
         self._changes = deque(item for item in self._changes if item.at_ns is not None)  # findings on its training
-        notes, receipts_ns = self.pipeline.evaluation.notes, self.silence.of_plant.receipts_ns
+        notes, before = self.pipeline.evaluation.notes, self.silence.of_plant
         self.pipeline = self._new_pipeline(self.alarms)
-        self.pipeline.evaluation.notes, self.silence.of_plant.receipts_ns = notes, receipts_ns
+        self.pipeline.evaluation.notes, timeout = notes, self.silence.of_plant
+        timeout.received_ns, timeout.counted_ns = before.received_ns, before.counted_ns
         self.memory.watching_since_ns = None
-        self.resume_from_alarms(alarms)
+        self.pipeline.resume_from_alarms()
 
     def _health(self, now_ns: int, phase: str) -> Publication:
-        health = Health(
+        health = health_message(
+            now_ns,
+            self.stats,
+            self._aligner.memory.counts,
+            self.rejects.by_reason,
             phase=phase,
             received=self.memory.received,
             published=self.memory.published,
             failures=self.failures.by_stage,
             heard_from_ns=self.memory.heard_from_ns,
             reference=self.pipeline.reference,
-            training=self.pipeline.trained_share(self.memory.last_ns),
+            training=self.pipeline.trained_share,
         )
-        complete_health(health, now_ns, self.stats, self._aligner.state.counts, self.rejects.by_reason)
         self.stats.lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, TypeVar
 
-from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, Finding, diagnose_training
+from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding, diagnose_training
+from reactorwatch.limits import limits
 from reactorwatch.runtime.parallel.jobs import Executor, Failed, one_line, run_job
 from reactorwatch.runtime.parallel.process_pool import ProcessExecutor
 
@@ -24,7 +25,7 @@ class PlantFinding(NamedTuple):
 
 def find_deviations(job: DiagnosisJob) -> Finding:
     """Diagnose a training in this process; a failure is a finding, too."""
-    return _finding(job, run_job(diagnose_training, job))
+    return _finding(job, run_job(diagnose_training, job, limits()))
 
 
 def diagnose_beside(job: DiagnosisJob) -> Finding:

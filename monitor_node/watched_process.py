@@ -51,6 +51,8 @@ def load_process(config: MonitorConfig, zero_ns: int = 0, rows: int | None = Non
 def watch_process(config: MonitorConfig, process: Process, rows: int | None = None) -> WatchedProcess:
     """Settings for a process: its signals, where the settings have the default ones, and its equations.
 
+    Bounds and resolutions that the settings state go before those of the process.
+
     Args:
         config: settings of a monitor.
         process: the process, its clock that of the bus.
@@ -63,10 +65,12 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
         process.require_model()
     described = signal_settings(process)
     named = {key: getattr(config, key) for key, names in DEFAULT_SIGNALS.items() if getattr(config, key) != names}
-    changed: dict[str, object] = {"units": process.units} | _restrict(described, described | named)
-    for signal in (name for names in named.values() for name in names):
+    stated = {key: getattr(config, key) for key in ("bounds", "resolution")}
+    for signal in (name for names in (*named.values(), *stated.values()) for name in names):
         if signal not in (*process.inputs, *process.outputs):
             raise InputError(describe_unknown("signal", signal, (*process.inputs, *process.outputs)))
+    described |= {key: described[key] | values for key, values in stated.items()}
+    changed: dict[str, object] = {"units": process.units} | _restrict(described, described | named)
     if process.model is None:
         changed["process"] = WITHOUT_EQUATIONS
     if process.name != DEFAULT.name:
@@ -77,7 +81,10 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
         if not _states_training(config):
             minutes = process.watch.training_min
             changed |= {"training_rows": DEFAULT_TRAINING_ROWS} if minutes is None else {"training_min": minutes}
-    changed_config = msgspec.structs.replace(config, **changed)
+    try:
+        changed_config = msgspec.structs.replace(config, **changed)
+    except ValueError as error:  # what could not be checked without the signals
+        raise InputError(f"settings [monitor]: {error}") from error
     return WatchedProcess(limit_training(changed_config, rows, is_stated=_states_training(config)), process.model)
 
 
@@ -89,7 +96,8 @@ def signal_settings(process: Process) -> dict[str, Any]:
     """
     model = process.model
     inputs, outputs = (process.inputs, process.outputs) if model is None else (model.input_names, model.output_names)
-    judged = {signal.name: signal for signal in process.signals if signal.name in (*inputs, *outputs)}
+    names = {*inputs, *outputs}
+    judged = {signal.name: signal for signal in process.signals if signal.name in names}
     bounds, resolution = {}, {}
     for name, signal in judged.items():
         scale, offset = _to_judged_unit(signal, {} if model is None else model.units)
@@ -127,7 +135,8 @@ def order_inputs(config: MonitorConfig, model: ProcessModel | None) -> MonitorCo
 def _restrict(described: dict[str, Any], chosen: dict[str, Any]) -> dict[str, Any]:
     """Settings of the signals of a process, for the inputs and outputs that are watched."""
     inputs, outputs = chosen["inputs"], chosen["outputs"]
-    others = [name for key in ("inputs", "outputs") for name in described[key] if name not in (*inputs, *outputs)]
+    names = {*inputs, *outputs}
+    others = [name for key in ("inputs", "outputs") for name in described[key] if name not in names]
     return {
         "inputs": inputs,
         "outputs": outputs,

@@ -14,12 +14,12 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.description.process import Process
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.bus import Bus
-from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.liveliness import wait_alive
 from reactorwatch.runtime.metrics import Metrics, serve_metrics
 from reactorwatch.runtime.node_main import main
+from reactorwatch.runtime.start import instance_name, join
 
 log = structlog.get_logger()
 
@@ -45,20 +45,15 @@ def run(
     """
     plant = plant_from(config, process, driver)
     log.info("plant", seed=config.seed, settings=msgspec.to_builtins(config))
-    with serve_metrics(metrics_config, Metrics(NODE, {config.name: None})) as metrics, stop_on_signals() as stop:
-        bus = connect(bus_config, NODE, stop)
-        if bus is None:
-            return
-        try:
-            serve_plant(
-                PlantNode(plant, config, log.info),
-                config,
-                bus,
-                stop,
-                metrics.on_publish if metrics is not None else None,
-            )
-        finally:
-            bus.close()
+    token = keys.instance_token(config.name, NODE, instance_name())
+    with (
+        serve_metrics(metrics_config, Metrics(NODE, {config.name: None})) as metrics,
+        stop_on_signals() as stop,
+        join(bus_config, NODE, stop, token) as bus,
+    ):
+        if bus is not None:
+            node = PlantNode(plant, config, log.info)
+            serve_plant(node, config, bus, stop, metrics.on_publish if metrics is not None else None)
 
 
 def serve_plant(

@@ -17,13 +17,9 @@ from typing import Literal
 
 import numpy as np
 
-from plant_node.config import PlantConfig
-from plant_node.controllers import ControlLoop, check_controller, check_set_point, close_loops
-from plant_node.disturbances import process_noise
-from plant_node.initial_state import complete_state, start_state
-from plant_node.process_settings import ProcessSettings, to_model_unit
+from plant_node.config import PlantConfig, ProcessSettings, to_model_unit
+from plant_node.instruments import ControlLoop, Sensor, check_controller, check_set_point, close_loops, process_noise
 from plant_node.scenario import Scenario, seed_of_input
-from plant_node.sensors import Sensor
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.description.process import Process
@@ -32,6 +28,7 @@ from reactorwatch.process.effect import TIMING
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.process.integrate import SimulationError, Stepper
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.steady_state import complete_state, start_state
 from reactorwatch.records.record import to_minutes, to_time_ns
 
 MAX_FAULTS = 32
@@ -155,8 +152,7 @@ class Plant:
 
     def next_row(self) -> Row:
         """Measure a row, and integrate to the next."""
-        time_min, inputs = self.time_min, self._inputs()
-        self._advance_loops()
+        time_min, inputs = self.time_min, self._inputs(advance=True)
         self._x, self._held = self._stepper.start_row(self._x, inputs, self._p, time_min), inputs
         row = Row(
             number=self._number,
@@ -265,24 +261,19 @@ class Plant:
         self._cleared += [FaultChange(item.specification, item.onset_min, False) for item in cleared if item.announced]
         return tuple(item.specification for item in cleared)
 
-    def _inputs(self) -> Array:
-        """Inputs of the next row, limited by their actuators."""
-        measured = self._measured_outputs()
-        return np.array(
-            [
-                loop.command(measured[loop.controller.output], self.time_min, self._dither(index))
-                if (loop := self._loops.get(name)) is not None
-                else self._actuators[name].limit(self._manual.get(name, self._level(index)))
-                for index, name in enumerate(self._base.input_names)
-            ]
-        )
-
-    def _advance_loops(self) -> None:
-        measured = self._measured_outputs()
+    def _inputs(self, *, advance: bool = False) -> Array:
+        """Inputs of the next row, limited by their actuators; `advance` takes the control loops to the row after it."""
+        measured, commands = self._measured_outputs(), list[float]()
         for index, name in enumerate(self._base.input_names):
-            if (loop := self._loops.get(name)) is not None:
-                value = measured[loop.controller.output]
-                self._loops[name] = loop.advance(value, self.time_min, self._dither(index), self._config.period_min)
+            loop = self._loops.get(name)
+            if loop is None:
+                commands.append(self._actuators[name].limit(self._manual.get(name, self._level(index))))
+                continue
+            now = measured[loop.controller.output], self.time_min, self._dither(index)
+            commands.append(loop.command(*now))
+            if advance:
+                self._loops[name] = loop.advance(*now, self._config.period_min)
+        return np.array(commands)
 
     def _measured_outputs(self) -> dict[str, float]:
         """Readings of the next row on which controllers act, by output; empty without controllers."""

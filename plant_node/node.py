@@ -10,7 +10,6 @@ from math import isinf
 
 from plant_node.config import PlantConfig
 from plant_node.core import FaultChange, Plant, Row
-from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication
 from reactorwatch.contract.commands import decode_command
@@ -26,6 +25,7 @@ from reactorwatch.contract.messages_pb2 import (
 )
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
+from reactorwatch.version import version
 
 NODE = "plant"
 COMMANDS: dict[str, type[SetInput | InjectFault | ClearFault]] = {
@@ -165,7 +165,7 @@ class PlantNode:
         health = Health(
             time_ns=now_ns,
             node=NODE,
-            version=__version__,
+            version=version(),
             phase=phase,
             uptime_s=(now_ns - started_ns) / 1e9,
             received=self._received,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from reactorwatch.process.model import ProcessModel
     from reactorwatch.spc.charts import catalogue as charts
 
-__version__ = "0.1.0"
+    __version__: str
 
 _MODULES = {
     "InputError": "reactorwatch.errors",
@@ -57,6 +57,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return importlib.import_module("reactorwatch.version").version()
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = importlib.import_module(_MODULES[name])

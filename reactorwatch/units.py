@@ -19,6 +19,9 @@ _NAMES = {"C": "degC", "°C": "degC", "Celsius": "degC", "°F": "degF", "°K": "
 
 _NORMAL_VOLUME = re.compile(r"\bNm(?=3|³|\^3)")
 
+_MAYBE_OFFSET = re.compile(r"deg|°|^C$|celsius|fahrenheit|reaumur", re.IGNORECASE)
+"""Units that may be temperatures with a zero of their own; no other needs Pint."""
+
 _NAME = re.compile(r"°?[^\W\d]+")
 
 _POWER = re.compile(r"(?<=[A-Za-z])(-?\d+)(?![A-Za-z\d])")
@@ -61,6 +64,21 @@ def conversion(unit: str, wanted: str, name: str) -> tuple[float, float]:
         why = str(error) or "it is no unit"
         raise UnknownUnitError(f"{name}: unit must convert to {wanted!r}, got {unit!r}: {why}") from error
     return one - offset, offset
+
+
+def absolute(value: float, unit: str) -> float | None:
+    """A value counted from absolute zero, in steps of its unit; None if the unit's zero is the absolute one.
+
+    >>> absolute(20.0, "degC"), absolute(20.0, "K"), absolute(20.0, "K/min")
+    (293.15, None, None)
+    """
+    if not _MAYBE_OFFSET.search(unit):
+        return None
+    try:
+        scale, offset = conversion(unit, "K", unit)
+    except InputError:  # another quantity
+        return None
+    return value + offset / scale if offset else None
 
 
 def is_unit(text: str) -> bool:

@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Collection
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -11,26 +12,21 @@ import tomli_w
 
 from reactorwatch.contract import keys
 from reactorwatch.description.plants import PlantProcesses
+from reactorwatch.errors import InputError, is_passing
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.metrics import Metrics, serve_metrics
 from reactorwatch.runtime.node_main import main
+from reactorwatch.runtime.start import instance_name, join, wait_ready
 from recorder.config import RecorderConfig
-from recorder.core import NODE, Recorder
-from recorder.files import RecordingFiles
+from recorder.core import COMMANDS, NODE, PRIORITIES, Recorder
+from recorder.files.ages import BootClock, read_boot_clock
+from recorder.files.part_file import PartFile
+from recorder.keep import DAY_NS, BlackBox, ChannelBudget, FileNames, FlushAndRotation, LatchedMessages, Limits
 from recorder.node import Policies, RecorderNode
-from recorder.policy.black_box import BlackBox
-from recorder.policy.channel_budget import ChannelBudget
-from recorder.policy.file_names import FileNames
-from recorder.policy.latched import LatchedMessages
-from recorder.policy.own_alarms import COMMANDS, PRIORITIES
-from recorder.policy.retention import DAY_NS, Limits
-from recorder.policy.rotation import FlushAndRotation
-from recorder.storage.ages import BootClock, read_boot_clock
-from recorder.storage.part_file import PartFile
+from recorder.recording_files import RecordingFiles, free_bytes
 
 HISTORY_MARGIN_NS = 10_000_000_000
 """Largest delay from publication, which dates a message on the bus, to receipt, which dates it in a file."""
@@ -71,31 +67,33 @@ def record(
     Raises:
         InputError: as `run`.
     """
-    # errors in the settings are raised before waiting for a router
-    names = file_names(config)
-    if names.dated and not names.folder.suffix[1:].isalpha():  # run.csv is a file of another kind, not a folder's name
-        make_folder(names.folder, "--out")
-    files = open_files(config)
-    page = Metrics(NODE, {config.plant: lambda: node.alarms()}, files.free_bytes)
-    with serve_metrics(metrics_config, page) as metrics:
-        bus = bus_zenoh.connect(bus_config, NODE, stop)
-        if bus is None:
+    history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
+
+    def start() -> tuple[RecordingFiles, RecorderNode]:
+        files, start_ns = open_files(config), time.time_ns()
+        fingerprints = files.fingerprints_since(start_ns - history_ns)
+        return files, start_node(config, files, start_ns, fingerprints, fingerprints_until_ns=start_ns + history_ns)
+
+    try:  # errors in the settings are raised before waiting for a router
+        open_files(config)
+    except (InputError, OSError) as error:
+        if not is_passing(error):
+            raise
+    page = Metrics(NODE, {config.plant: lambda: node.alarms()}, partial(free_bytes, file_names(config).folder))
+    token = keys.instance_token(config.plant, NODE, instance_name())
+    with serve_metrics(metrics_config, page) as metrics, join(bus_config, NODE, stop, token) as bus:
+        started = None if bus is None else wait_ready(start, bus, NODE, config.plant, stop)
+        if bus is None or started is None:
             return None
-        try:
-            start_ns = time.time_ns()
-            with files:
-                history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
-                fingerprints = files.fingerprints_since(start_ns - history_ns)
-                node = start_node(config, files, start_ns, fingerprints, fingerprints_until_ns=start_ns + history_ns)
-                on_publish = metrics.on_publish if metrics is not None else None
-                loop = EventLoop(node, bus, stop, drain_timeout_s=config.linger_s, on_publish=on_publish)
-                loop.subscribe(config.key_expression, history_s=bus_config.history_s, on_gap=node.on_gap)
-                loop.accept_commands(*(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS))
-                bus.declare_token(keys.key(config.plant, keys.ALIVE, NODE))
-                loop.run()
-                return files.path
-        finally:
-            bus.close()
+        files, node = started
+        with files:
+            on_publish = metrics.on_publish if metrics is not None else None
+            loop = EventLoop(node, bus, stop, drain_timeout_s=config.linger_s, on_publish=on_publish)
+            loop.subscribe(config.key_expression, history_s=bus_config.history_s, on_gap=node.on_gap)
+            loop.accept_commands(*(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS))
+            bus.declare_token(keys.key(config.plant, keys.ALIVE, NODE))
+            loop.run()
+            return files.path
 
 
 def open_files(
@@ -103,7 +101,7 @@ def open_files(
     open_part: Callable[[Path], PartFile] = PartFile,
     read_clock: Callable[[], BootClock] = read_boot_clock,
 ) -> RecordingFiles:
-    """Recording files of the settings.
+    """Recording files of the settings, whose folder is made if it does not exist.
 
     Args:
         config: the settings.
@@ -113,6 +111,9 @@ def open_files(
     Raises:
         InputError: as `run`.
     """
+    names = file_names(config)
+    if names.dated and not names.folder.suffix[1:].isalpha():  # run.csv is a file of another kind, not a folder's name
+        make_folder(names.folder, "--out")
     metadata = {
         "plant": config.plant,
         "key_expression": config.key_expression,
@@ -122,7 +123,7 @@ def open_files(
     limits = Limits(config.keep_mb * _MB, config.keep_days * DAY_NS, config.keep_files)
     synced = config.fsync != "never"
     return RecordingFiles(
-        file_names(config),
+        names,
         metadata,
         limits,
         synced=synced,
@@ -161,7 +162,7 @@ def start_node(
         files,
         health_period_ns=round(config.health_period_s * 1e9),
         start_ns=start_ns,
-        has_room=lambda: files.free_bytes() >= config.resume_mb * _MB,
+        has_room=lambda: free_bytes(file_names(config).folder) >= config.resume_mb * _MB,
     )
 
 

@@ -8,8 +8,7 @@ import msgspec
 from reactorwatch.contract import keys
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.runtime.setting_rules import check_bounds
-from recorder.policy.channel_budget import MAX_KEYS
-from recorder.policy.rotation import Fsync
+from recorder.keep import MAX_KEYS, Fsync
 
 MAX_FLUSH_S = 1.0
 MIN_KEYS = 100

@@ -2,27 +2,47 @@
 
 Every message is recorded, unreadable ones too: a recording serves to find out what went wrong. An unreadable message
 is recorded without a schema, so that it stops no reader, and is counted as refused.
+
+The recorder has alarms of its own: it cannot write (`recording/disk`), or a file has no free key (`recording/keys`).
+Their states follow the table of every alarm. There is no command to shelve or suppress one: an incomplete recording
+must stay visible.
 """
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import structlog
 from google.protobuf.message import Message
 
-from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.alarm_states import CODES, Event, State, next_state
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.commands import check_signature, decode_command
+from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms
+from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.columns.sequence_counter import SequenceCounter
-from recorder.message import RecordedMessage
-from recorder.policy.channel_budget import Channel
-from recorder.policy.own_alarms import DISK_ALARM, KEYS_ALARM, OwnAlarms
+from reactorwatch.version import version
+from recorder import RecordedMessage
+from recorder.columns.samples import SequenceCounter
+from recorder.keep import Channel
 
 log = structlog.get_logger()
+
+DISK_ALARM = f"{keys.RECORDING}/disk"
+KEYS_ALARM = f"{keys.RECORDING}/keys"
+PRIORITIES: Mapping[str, messages.Priority] = {
+    DISK_ALARM: messages.PRIORITY_CRITICAL,
+    KEYS_ALARM: messages.PRIORITY_HIGH,
+}
+"""Priority by alarm."""
+COMMANDS: Mapping[str, type[Message]] = {
+    keys.LIST_RECORDER_ALARMS: ListAlarms,
+    keys.ACKNOWLEDGE_RECORDER: AlarmCommand,
+}
+"""Message type by command."""
 
 NODE = "recorder"
 MAX_COUNTERS = 60_000
@@ -204,7 +224,8 @@ class Recorder:
         """Raise the alarm that no file can be written."""
         self.is_stopped = True
         text = f"recording stopped: {why}; it resumes when a file can be written"
-        return [self.alarms.raise_alarm(DISK_ALARM, text, now_ns), self.health(now_ns)]
+        raised = [] if self.alarms.is_active(DISK_ALARM) else [self.alarms.raise_alarm(DISK_ALARM, text, now_ns)]
+        return [*raised, self.health(now_ns)]
 
     def resume_recording(self, now_ns: int) -> list[Publication]:
         """Clear the alarm that no file can be written."""
@@ -225,7 +246,7 @@ class Recorder:
         health = messages.Health(
             time_ns=now_ns,
             node=NODE,
-            version=__version__,
+            version=version(),
             phase=phase,
             uptime_s=(now_ns - self._start_ns) / 1e9,
             received=self._received,
@@ -239,3 +260,63 @@ class Recorder:
         )
         self._longest_lag_ns = 0
         return Publication(keys.key(self._plant, keys.HEALTH, NODE), health)
+
+
+class OwnAlarms:
+    """States of the recorder's alarms.
+
+    Args:
+        plant: plant that the alarms are published under.
+    """
+
+    def __init__(self, plant: str) -> None:
+        self._plant = plant
+        self._states = dict.fromkeys(PRIORITIES, State.NORMAL)
+        self._now = {
+            name: messages.Alarm(alarm=name, state=CODES[State.NORMAL], priority=priority)
+            for name, priority in PRIORITIES.items()
+        }
+
+    @property
+    def now(self) -> list[messages.Alarm]:
+        """Alarms in their present state."""
+        return list(self._now.values())
+
+    def is_active(self, name: str) -> bool:
+        """True from raised to cleared."""
+        return self._states[name] in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED)
+
+    def raise_alarm(self, name: str, text: str, now_ns: int) -> Publication:
+        """Raise an alarm that is not active."""
+        return self._change(name, Event.RAISED, now_ns, raised_ns=now_ns, cleared_ns=0, text=text, by="", comment="")
+
+    def clear(self, name: str, text: str, now_ns: int) -> Publication:
+        """Clear an active alarm."""
+        return self._change(name, Event.CLEARED, now_ns, cleared_ns=now_ns, text=text)
+
+    def execute(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
+        """Execute a command: list the alarms or acknowledge one. A refusal is a reply with the reason."""
+        try:
+            _, command = decode_command(question, COMMANDS)
+            if not isinstance(command, AlarmCommand):
+                return CommandReply(accepted=True, text=f"{len(self._now)} alarms", alarms=self.now), []
+            by, comment = check_signature(command.by, command.comment)
+            change = self._change(command.alarm, Event.ACKNOWLEDGE, now_ns, by=by, comment=comment)
+        except (InputError, DecodeError) as error:
+            return CommandReply(accepted=False, text=str(error)), []
+        text = f"alarm {command.alarm}: acknowledge"
+        return CommandReply(accepted=True, text=text, alarms=[self._now[command.alarm]]), [change]
+
+    def _change(self, name: str, event: Event, now_ns: int, **values: Any) -> Publication:
+        if name not in self._now:
+            raise InputError(f"no alarm {name!r} of the recorder (there are: {', '.join(self._now)})")
+        try:
+            state = self._states[name] = next_state(self._states[name], event, active=event is Event.RAISED)
+        except InputError as error:
+            raise InputError(f"alarm {name} {error}") from error
+        alarm = self._now[name]
+        for field, value in {"time_ns": now_ns, "event": event.value, "state": CODES[state], **values}.items():
+            setattr(alarm, field, value)
+        published = messages.Alarm()
+        published.CopyFrom(alarm)
+        return Publication(keys.key(self._plant, keys.ALARM, name), published)

@@ -8,12 +8,9 @@ from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.core import ReceivedMessage, Recorder
-from recorder.files import RecordingFiles
-from recorder.policy.black_box import AlarmInterval, BlackBox
-from recorder.policy.channel_budget import ChannelBudget
-from recorder.policy.latched import STATES, LatchedMessages
-from recorder.policy.rotation import FlushAndRotation
-from recorder.storage.mcap_writer import WriteError
+from recorder.files.writer import WriteError
+from recorder.keep import STATES, AlarmInterval, BlackBox, ChannelBudget, FlushAndRotation, LatchedMessages
+from recorder.recording_files import RecordingFiles
 
 RETRY_NS = 2_000_000_000
 """Time between two attempts to resume on a full disk."""

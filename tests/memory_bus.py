@@ -121,6 +121,11 @@ class MemoryBus:
             self._exchange.tokens.remove((self, key))
             self._notify(key, alive=False)
 
+    def query_tokens(self, key_expression: str) -> list[str]:
+        """See `Bus`."""
+        with self._exchange.lock:
+            return sorted(key for _, key in self._exchange.tokens if matches(key_expression, key))
+
     def subscribe_liveliness(self, key_expression: str, handler: Callable[[str, bool], None]) -> None:
         """See `Bus`."""
         with self._exchange.lock:

@@ -58,8 +58,6 @@ PEOPLE = re.compile(
 )
 
 EXCEPTIONS = {
-    "monitor_node/alarms/annunciator.py::AnnunciatorState: people, told": "a field of the stored state",
-    "monitor_node/baseline/predictor.py::PredictorState: people, told": "a field of the stored state",
     "reactorwatch/api/diagnosis.py::DiagnosisResult.extended: participle": "a public name",
     "reactorwatch/cli/alarm.py::By: people, who": "an operator is a person",
 }

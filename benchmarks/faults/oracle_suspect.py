@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.faults.bank import BANK, Case
 from benchmarks.faults.runs import NOISE_SD, SIGNAL, Truth, measurements_of, profile_changes, simulator_of
-from monitor_node.isolation.causes import causes_of
+from monitor_node.causes.isolation import causes_of
 from reactorwatch.arrays import Array
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.integrate import SimulationError

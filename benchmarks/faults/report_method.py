@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from benchmarks.faults.bank import PERIOD_MIN, TRAINING_MIN
 from benchmarks.faults.runs import OUTPUTS, SIGNAL
 from benchmarks.faults.score import Interval
+from benchmarks.study_figures.report_scheme import ORDER
 from reactorwatch.arrays import Array
 from reactorwatch.identification.batch import fit_arx
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.output_error import fit_oe
-from reactorwatch.identification.report_scheme import ORDER
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record
 

@@ -8,13 +8,13 @@ from scipy.signal import lfilter
 
 from benchmarks.faults.bank import PERIOD_MIN, Case
 from plant_node.config import PlantConfig
-from plant_node.initial_state import start_state
 from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps
 from reactorwatch.arrays import Array
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
+from reactorwatch.process.steady_state import start_state
 from reactorwatch.records.record import Record
 
 SIGNAL = "qc"

@@ -13,7 +13,7 @@ from benchmarks.faults.report_method import METHODS, TRAINING_ROWS, alarms_of, c
 from benchmarks.faults.runs import NOISE_SD, fault_free, measurements_of, record_of, truth_of
 from benchmarks.faults.score import Outcome, Rate, outcome_of, rows_to_false_alarm
 from benchmarks.faults.watch import Suspicion, incidents_of, intervals_of, suspicion, watch
-from reactorwatch.identification.report_scheme import WIDTH
+from benchmarks.study_figures.report_scheme import WIDTH
 
 SOON_MIN = 10.0
 """Minutes from the first alarm to the first evaluation of the suspects."""
@@ -101,8 +101,8 @@ def run_case(case: Case, budgets: tuple[float, ...], widths: Widths) -> CaseResu
             for name, method, width in _charts(widths, budget)
         }
         detected_min = case.onset_min + monitor.delay_min
-        soon[budget] = suspicion(watched.messages, case.fault.cause, detected_min, detected_min + SOON_MIN)
-        late[budget] = suspicion(watched.messages, case.fault.cause, detected_min, end_min)
+        soon[budget] = suspicion(watched, case.fault.cause, detected_min, detected_min + SOON_MIN)
+        late[budget] = suspicion(watched, case.fault.cause, detected_min, end_min)
     return CaseResult(case, truth.left_branch, oracle_suspect(case, record, truth), outcomes, soon, late)
 
 

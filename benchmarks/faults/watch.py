@@ -1,6 +1,6 @@
 """The monitor over a record: intervals of its alarms, and its suspects."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import inf
 
@@ -9,7 +9,7 @@ from benchmarks.faults.score import Interval
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from reactorwatch.contract.codec import encode
-from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.contract.messages_pb2 import Alarm, Incident, Suspect
 from reactorwatch.records.record import Record, to_minutes
 from recorder.tools.player import samples_of
 
@@ -23,11 +23,13 @@ class Watched:
 
     Attributes:
         messages: every change of an alarm, in order.
+        incidents: every change of an incident, in order.
         watching_since_min: time of the first evaluated row; inf if there was none.
         last_min: time of the last row.
     """
 
     messages: list[Alarm]
+    incidents: list[Incident]
     watching_since_min: float
     last_min: float
 
@@ -59,6 +61,7 @@ def watch(record: Record, false_alarms_per_30_days: float) -> Watched:
     since = result.watching_since_ns
     return Watched(
         messages=result.alarm_messages,
+        incidents=result.incident_messages,
         watching_since_min=inf if since is None else to_minutes(since),
         last_min=to_minutes(result.last_ns),
     )
@@ -81,28 +84,33 @@ def incidents_of(messages: Iterable[Alarm]) -> int:
     return len({message.incident for message in messages if message.event == "raised"})
 
 
-def suspicion(messages: Sequence[Alarm], cause: str, detected_min: float, until_min: float) -> Suspicion:
+def newest_suspects(watched: Watched, incident: int, until_min: float = inf) -> list[Suspect]:
+    """Suspects of an incident at a time in minutes, as an operator has them; empty without any."""
+    own = [(item.time_ns, item.suspects) for item in watched.messages if item.names_cause and item.incident == incident]
+    shared = [(item.time_ns, item.suspects) for item in watched.incidents if item.number == incident]
+    found = [(at, suspects) for at, suspects in (*own, *shared) if suspects and to_minutes(at) <= until_min]
+    return list(max(found, key=lambda item: item[0])[1]) if found else []
+
+
+def suspicion(watched: Watched, cause: str, detected_min: float, until_min: float) -> Suspicion:
     """Suspicion of the monitor at a time.
 
-    The newest message of the incident with suspects counts: the operator sees it then.
+    The newest suspects of the incident count, or those of an alarm of it that names its cause itself.
 
     Args:
-        messages: every change of an alarm, in order.
+        watched: messages of the monitor.
         cause: the true cause.
         detected_min: time when the detecting alarm was raised; inf if there was none.
         until_min: the time in minutes.
     """
-    detecting = [item for item in messages if item.event == "raised" and to_minutes(item.raised_ns) == detected_min]
+    raised = (item for item in watched.messages if item.event == "raised")
+    detecting = [item for item in raised if to_minutes(item.raised_ns) == detected_min]
     if not detecting:
         return Suspicion()
-    with_suspects = [
-        item
-        for item in messages
-        if item.incident == detecting[0].incident and item.suspects and to_minutes(item.time_ns) <= until_min
-    ]
-    if not with_suspects:
+    newest = newest_suspects(watched, detecting[0].incident, until_min)
+    if not newest:
         return Suspicion()
-    suspects = sorted(with_suspects[-1].suspects, key=lambda item: -item.probability)
+    suspects = sorted(newest, key=lambda item: -item.probability)
     return Suspicion(
         first=suspects[0].cause == cause,
         likely=any(item.cause == cause and item.probability >= LIKELY for item in suspects),

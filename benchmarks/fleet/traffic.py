@@ -30,9 +30,17 @@ OUT_EVERY = 50  # plants that are out in a row of the fleet, but at least one
 FLEET = "reactor/*"
 
 
+def plant_name(number: int) -> str:
+    """Name of a plant; all names have the same length, so that a state can be renamed."""
+    return f"p{number:05d}"
+
+
 def record() -> list[Encoded]:
     """Messages of a plant."""
-    return [encode(item) for item in samples_of(simulate_record(PlantConfig(seed=1), LEARNED_ROWS + MOST_ROWS), "p0")]
+    return [
+        encode(item)
+        for item in samples_of(simulate_record(PlantConfig(seed=1), LEARNED_ROWS + MOST_ROWS), plant_name(0))
+    ]
 
 
 def alone_on_a_core(core: int) -> None:
@@ -50,8 +58,8 @@ def route(endpoint: str) -> None:
     del hub
 
 
-def publish(endpoint: str, plants: int, rows: int, per_s: float, first: int) -> None:
-    """Publish rows of plants from a number on, as fast as it goes or at a pace, some of them far out in that case."""
+def publish(endpoint: str, plants: int, rows: int, per_s: float) -> None:
+    """Publish rows of plants, as fast as it goes or at a pace, some of them far out in that case."""
     alone_on_a_core(1)
     bus = connect(BusConfig(endpoint=endpoint), "publisher", StopSignal())
     assert bus is not None
@@ -62,7 +70,7 @@ def publish(endpoint: str, plants: int, rows: int, per_s: float, first: int) -> 
     publishers = [
         [
             buses[number // SHARING]._session.declare_publisher(  # type: ignore[union-attr]
-                keys.key(f"p{first + number}", keys.SAMPLE, signal),
+                keys.key(plant_name(number), keys.SAMPLE, signal),
                 encoding=encoding,
                 congestion_control=zenoh.CongestionControl.BLOCK,
             )
@@ -104,10 +112,8 @@ def publish(endpoint: str, plants: int, rows: int, per_s: float, first: int) -> 
                     time.sleep(wait_s)
                 which = far if far and number in out else payload
                 if which is far:
-                    sent[f"p{first + number}", time_ns] = time.perf_counter()
-                publishers[number][place].put(
-                    which, attachment=numbered.pack(first + number + 1, SIGNALS * row + place)
-                )
+                    sent[plant_name(number), time_ns] = time.perf_counter()
+                publishers[number][place].put(which, attachment=numbered.pack(number + 1, SIGNALS * row + place))
                 count += 1
     deadline = time.perf_counter() + WITHIN_S
     while len(arrived) < len(sent) and time.perf_counter() < deadline:

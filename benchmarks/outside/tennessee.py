@@ -33,6 +33,13 @@ PLACES = {
 }
 """Faults whose place Russell, Chiang and Braatz (2000) describe, with the signals next to it."""
 
+RECORDS = (
+    "Each column of a fault is one record; the mean is over one record of each fault but 3, 9 and 15, and its interval "
+    "over blocks of these records, not over other records. Over seven fresh seeds of the original simulator "
+    "`reactorwatch` detects fault 15 in 0.04 of the rows."
+)
+"""Records that the numbers of `measure` are from; the seeds were simulated apart from this benchmark."""
+
 _BLOCK = 40
 _WEIGHT = 0.3
 
@@ -149,6 +156,6 @@ def _score(method: str, limits: str, names: list[str], out: list[Flags], seed: i
         "mean detection": f"{np.mean([shares[name] for name in seen]):.3f}",
         "95 % interval": "{:.3f} to {:.3f}".format(*bootstrap_interval(blocks, rng)),
         "rows in alarm while sound": f"{100 * before.mean():.2f} %",
-        **{f"fault {int(name)}": f"{share:.2f}" for name, share in shares.items()},
+        **{f"fault {int(name)}, one record": f"{share:.2f}" for name, share in shares.items()},
     }
     return Row(method, limits, cells)

@@ -21,6 +21,7 @@ from benchmarks.outside.table import Row
 TRAINING = 400
 WINDOW_S = 60.0
 LEVEL = 0.999
+RECORDS = "Over all records of the folder; the intervals are over records."
 _LABELS = ("anomaly", "changepoint")
 
 

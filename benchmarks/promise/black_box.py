@@ -15,14 +15,15 @@ import numpy as np
 from benchmarks.promise.pool import poisson_interval, run_jobs
 from monitor_node.config import MonitorConfig, ReferenceName
 from monitor_node.core import Monitor
-from plant_node.initial_state import start_state
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
+from reactorwatch.process.steady_state import start_state
 from reactorwatch.records.record import Record
-from reactorwatch.runtime.parallel.jobs import Executor, choose_executor
+from reactorwatch.runtime.parallel import choose_executor
+from reactorwatch.runtime.parallel.jobs import Executor
 from recorder.tools.player import samples_of
 
 PERIOD_MIN, TRAINING_MIN, SPAN_MIN, PROMISE_PER_30_DAYS = 0.1, 100.0, 1500.0, 30.0
@@ -116,7 +117,7 @@ def watch(job: Job) -> Result:
         alarms,
         monitor.pipeline.expected_false_alarms,
         rows,
-        rows - getattr(monitor.pipeline.evaluation.reference, "unjudged", 0),
+        rows - getattr(monitor.pipeline.evaluation.reference, "unfamiliar_rows", 0),
         kept,
     )
 

@@ -1,6 +1,6 @@
 """Soak test: a fleet keeps its promises over a long run, under all disturbances.
 
-A router, two monitors that share the fleet and keep its states in a folder, two processes of plants and a source of
+A router, two monitors with a shard of the fleet and a folder of states each, two processes of plants and a source of
 garbage run for minutes. From a seed: a quarter of the plants get a large fault each, at a time of its own;
 monitors and the router are killed and started again, links are cut for seconds, floods come. In the end every sample is
 accounted for, every fault was alarmed once, and memory is level: see `findings`.

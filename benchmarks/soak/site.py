@@ -1,6 +1,6 @@
 """The processes of a soak, and the disturbances of them.
 
-A router, two monitors that share the fleet and the folder of its states, two processes of plants, a source of garbage.
+A router, two monitors with a shard of the fleet each, two processes of plants, a source of garbage.
 The links of both monitors and of the second half of the plants go through proxies.
 """
 
@@ -81,7 +81,6 @@ class Site:
 
     def __init__(self, plan: Plan, folder: Path, zero_ns: int) -> None:
         self._plan, self._folder, self._zero_ns = plan, folder, zero_ns
-        (folder / "states").mkdir()
         endpoint = free_endpoint()
         self.bus = BusConfig(endpoint=endpoint, cache_messages=round(KEPT_S * plan.rows_per_s), history_s=KEPT_S)
         self.router = Router(endpoint)
@@ -169,7 +168,8 @@ class Site:
         return msgspec.structs.replace(self.bus, endpoint=self._proxies[proxy].endpoint)
 
     def _monitor(self, number: int) -> "subprocess.Popen[bytes]":
-        fleet = FleetConfig(plants=FLEET, shard=f"{number + 1}/{MONITORS}", state=str(self._folder / "states"))
+        states = self._folder / f"states{number + 1}"
+        fleet = FleetConfig(plants=FLEET, shard=f"{number + 1}/{MONITORS}", state=str(states))
         settings = self._folder / f"monitor{number + 1}.toml"
         write_settings(settings, {"bus": self._via(number), "monitor": self._plan.monitor, "fleet": fleet})
         command = [sys.executable, "-m", "reactorwatch", "monitor", "--config", str(settings)]

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from benchmarks.link_cuts import connect_client
 from benchmarks.soak.site import FLEET, PATIENCE_S
-from monitor_node.health.message import NODE
+from monitor_node.health import NODE
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Health

@@ -9,9 +9,9 @@ import numpy as np
 
 from benchmarks.study_figures.canvas import BLUE, ORANGE, PURPLE, label, panels
 from benchmarks.study_figures.figure import Finding, Verdict
+from benchmarks.study_figures.neural import Neural
 from benchmarks.study_figures.study import ORDERS, OUTPUTS, Study
 from reactorwatch.identification.families import LINEAR_FAMILIES, Family
-from reactorwatch.identification.neural import Neural
 from reactorwatch.identification.selection import EQUAL_PERCENT, Candidate, Selection, select
 from reactorwatch.records.record import Record
 

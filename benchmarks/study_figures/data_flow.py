@@ -42,7 +42,7 @@ def draw(_study: Study, drawing: Drawing) -> Finding:
         "The report's appendix has seven block diagrams: for ARX of orders 1 and 2 and for output-error models of "
         "orders 1 to 3 the identification, and for ARX the simulation. They differ in the number of delays alone, and "
         "are one "
-        "chain. The option `--scheme report` of `identify` and `backtest` runs it on any record; the "
+        "chain. It is computed by `benchmarks/study_figures/report_scheme.py`; the "
         "monitor's own chain is drawn below it."
     )
     return Finding(text)

@@ -12,6 +12,7 @@ import numpy as np
 
 from benchmarks.study_figures.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILION, label, legend_below, panels
 from benchmarks.study_figures.figure import Finding, Verdict
+from benchmarks.study_figures.report_scheme import WIDTH, ReportChart, chart_output
 from benchmarks.study_figures.study import NAMES, OUTPUTS, TRAINING_ROWS, Study
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
@@ -19,7 +20,6 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import encode
-from reactorwatch.identification.report_scheme import WIDTH, ReportChart, chart_output
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.library.cstr.operation import NOISE_SD, ONSET_MIN, OPERATION
 from reactorwatch.process.operation import Preset

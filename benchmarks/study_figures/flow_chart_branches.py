@@ -9,11 +9,11 @@ import numpy as np
 from benchmarks.study_figures.canvas import GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, panels
 from benchmarks.study_figures.figure import Finding, Verdict
 from benchmarks.study_figures.flow_chart import Conclusion, follow
+from benchmarks.study_figures.report_scheme import ORDER
 from benchmarks.study_figures.study import FAST_PERIOD_MIN, TRAINING_ROWS, Study, levels, row_times
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps
-from reactorwatch.identification.report_scheme import ORDER
 from reactorwatch.identification.structure import Structure
 from reactorwatch.process.library.cstr.operation import OPERATION
 from reactorwatch.records.record import Record

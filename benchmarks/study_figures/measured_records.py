@@ -19,10 +19,10 @@ import numpy as np
 import reactorwatch as rw
 from benchmarks.study_figures.canvas import BLACK, BLUE, ORANGE, VERMILION, label, legend_below, panels
 from benchmarks.study_figures.figure import Figure, Finding, Verdict
+from benchmarks.study_figures.report_scheme import chart_output
 from benchmarks.study_figures.study import Study
 from reactorwatch.arrays import Array
 from reactorwatch.description.find import find_process
-from reactorwatch.identification.report_scheme import chart_output
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

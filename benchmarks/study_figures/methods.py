@@ -20,7 +20,7 @@ METHODS = (
     (
         "Shewhart limits, mean +- 3 sigma",
         "one point at a time",
-        "chart `shewhart`; option `--scheme report` of `backtest`",
+        "chart `shewhart`",
     ),
     ("multivariate control charts", "outputs judged together, with their correlation", "charts `t2` and `mewma`"),
     (
@@ -39,7 +39,11 @@ METHODS = (
         "one model for each regime",
         "none yet: a mode has a reference of its own instead",
     ),
-    ("neural network (recommended)", "nonlinear predictor", "`identify --compare --neural`"),
+    (
+        "neural network (recommended)",
+        "nonlinear predictor",
+        "none: no product, only a figure of this study (`benchmarks/study_figures/neural.py`)",
+    ),
 )
 
 

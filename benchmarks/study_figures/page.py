@@ -16,7 +16,7 @@ its figures 3 to 27 is here under the number of its caption (in the report's tex
 claim in our words, our figure, what was found, and the verdict. Its figures 1 and 2 are a block diagram and a
 drawing of the reactor. Claims of sections without a figure follow, then the methods of its literature review.
 
-All numbers and pictures on this page were computed by one run of `reactorwatch reproduce -o DIR --seed {seed}`.
+All numbers and pictures on this page were computed by one run of `make reproduce`, with seed {seed}.
 {source}
 """
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from benchmarks.study_figures.canvas import BLACK, BLUE, ORANGE, VERMILION, label, legend_below, panels
 from benchmarks.study_figures.figure import Finding, Verdict, verdict
+from benchmarks.study_figures.report_scheme import ORDER
 from benchmarks.study_figures.study import NAMES, OUTPUTS, Study, holdout_half
 from reactorwatch.identification.batch import SINGULAR_CONDITION
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
-from reactorwatch.identification.report_scheme import ORDER
 from reactorwatch.identification.structure import REPORT_ROWS, Structure
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""`reproduce`: draws the figures that are asked for and writes the page."""
+"""Draws the figures that are asked for and writes the page."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -49,7 +49,6 @@ def reproduce(
     *,
     data: Path | None = None,
     processes: int | None = 1,
-    scheduler: str | None = None,
 ) -> str:
     """Write `out`/study.md and its pictures.
 
@@ -60,7 +59,6 @@ def reproduce(
         measured: a record that figures 5, 6 and 11 to 16 identify their models from.
         data: folder of records of others, for the entry of measured records; None: the page has no such entry.
         processes: number of processes; None: one a core.
-        scheduler: address of a cluster that draws them, or None.
 
     Returns:
         What was written, for people.
@@ -77,7 +75,7 @@ def reproduce(
     with fill_folder(out) as folder:
         pictures = make_folder(folder / FOLDER).absolute()
         jobs = [Job(figure.key, pictures / figure.file_name, seed, measured, data) for figure in figures]
-        with results_in_order(draw, jobs, "reproducing", processes, scheduler) as findings:
+        with results_in_order(draw, jobs, "reproducing", processes, None) as findings:
             for figure, finding in zip(figures, findings, strict=True):
                 if isinstance(finding, Failed):
                     raise (RuntimeError if finding.is_internal else InputError)(f"{figure.heading}: {finding.reason}")

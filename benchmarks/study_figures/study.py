@@ -10,11 +10,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from benchmarks.study_figures import report_scheme
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import Scenario
 from reactorwatch.arrays import Array
-from reactorwatch.identification import report_scheme
 from reactorwatch.identification.families import LINEAR_FAMILIES, Model
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.structure import Structure

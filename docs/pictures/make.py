@@ -10,6 +10,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from docs.pictures.picture import render_tabs
+
 FOLDER = Path(__file__).parent
 COLOURS = 255
 """Of a picture, rare ones kept: a dashboard has few, and the file becomes a third."""
@@ -17,19 +19,20 @@ COLOURS = 255
 
 def main() -> int:
     """Make the study, run the demonstration and draw it; returns an exit code."""
-    command = str(Path(sys.executable).with_name("reactorwatch"))
+    command = [str(Path(sys.executable).with_name("reactorwatch"))]
+    study = [sys.executable, "-m", "benchmarks.study_figures"]
     with tempfile.TemporaryDirectory() as temporary:
         run, tabs = Path(temporary) / "run", Path(temporary) / "tabs"
         recording, diagnosis = run / "demo.mcap", run / "diagnosis"
-        for arguments in (
-            ("reproduce", "-o", FOLDER.parent),
-            ("demo", "--out", run),
-            ("dashboard", recording, "-o", run / "demo.rrd", "--diagnosis", diagnosis, "--png", tabs),
+        for program, *arguments in (
+            (study, "--out", FOLDER.parent),
+            (command, "demo", "--out", run),
+            (command, "dashboard", recording, "-o", run / "demo.rrd", "--diagnosis", diagnosis),
         ):
-            done = subprocess.run([command, *map(str, arguments)], check=False)  # noqa: S603 (our own command)
+            done = subprocess.run([*program, *map(str, arguments)], check=False)  # noqa: S603 (our own command)
             if done.returncode:
                 return done.returncode
-        for picture in sorted(tabs.iterdir()):
+        for picture in sorted(render_tabs(run / "demo.rrd", tabs)):
             with Image.open(picture) as image:
                 image.convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE).save(
                     FOLDER / picture.name, optimize=True

@@ -1,24 +1,38 @@
-"""One alarm: its chart, the rule that raises and clears it, and the state that the operator sees."""
+"""One alarm: its chart, the rule that raises and clears it, and the state that the operator sees.
 
-from collections.abc import Mapping, Sequence
+The rule is an on-delay and an off-delay (ISA-18.2), m out of n.
+
+One point beyond 3 sigma comes by chance every 370 samples: at ten samples a minute, every 37 minutes. No operator could
+work with that. So an alarm is raised by `raise_count` violating points among the last `window` (on-delay), and cleared
+by `clear_count` ordinary points in a row (off-delay). With a dead band a point near the limit is neither violating nor
+ordinary, so that a value near its limit gives one alarm and not many. The remaining rate of false alarms is
+`spc.m_of_n.false_alarm_rate`.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, NamedTuple, TypeAlias
 
 import msgspec
+import numpy as np
 
-from monitor_node.alarms.incidents import Count
-from monitor_node.alarms.on_off_delay import IS_NORMAL, OnOffDelay, OnOffDelayState
-from monitor_node.alarms.states import Event, State, next_state
+from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.contract import keys
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, ChartPoint, Contribution, Priority, Suspect
+from reactorwatch.contract.alarm_states import CODES, Event, State, next_state
+from reactorwatch.contract.messages_pb2 import Alarm, Contribution, Priority, Suspect
 from reactorwatch.spc.charts.base import Judgement
+from reactorwatch.spc.m_of_n import check_rule
+from reactorwatch.stored_state import Memory
 
 PRIORITIES: Mapping[str, Priority] = {
     name: getattr(Priority, f"PRIORITY_{name.upper()}") for name in ("low", "medium", "high", "critical")
 }
-STATES: Mapping[State, AlarmState] = {state: getattr(AlarmState, f"ALARM_STATE_{state.name}") for state in State}
 
 STUCK_SENSOR = "stuck_sensor"
 """The cause named by the check for stuck values."""
+
+
+Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+"""A count that fits into a message."""
 
 LAST_NS = 2**63 - 1
 TimeNs: TypeAlias = Annotated[int, msgspec.Meta(ge=-(2**63), le=LAST_NS)]
@@ -40,12 +54,131 @@ class SuspectedCause(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     text: str = ""
 
 
-class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
-    """The state of an alarm.
+class Incident(msgspec.Struct, forbid_unknown_fields=True):
+    """Memory of an incident.
+
+    Attributes:
+        number: number of the incident from 1.
+        since_ns: activation of its first alarm.
+        changed_ns: time when an alarm of the incident was last raised or cleared.
+        alarms: names of its alarms in the order of their activation; the first is the first-out alarm.
+        suspects: its possible causes, the likeliest first; empty before a search.
+        text: what limits the suspects; empty: nothing.
+        published: its newest message without the time, serialized.
+    """
+
+    number: Count
+    since_ns: TimeNs = 0
+    changed_ns: TimeNs = 0
+    alarms: list[str] = msgspec.field(default_factory=list)
+    suspects: list[SuspectedCause] = msgspec.field(default_factory=list)
+    text: str = ""
+    published: bytes = b""
+
+
+class Condition(Memory):
+    """Memory of an alarm's condition.
+
+    Attributes:
+        recent: last points, newest in the lowest bit (1: violating).
+        in_a_row: number of ordinary points in a row.
+        standing: True if the condition is active.
+    """
+
+    recent: int = 0
+    in_a_row: int = 0
+    standing: bool = False
+
+
+DELAY = np.dtype([("recent", "i4"), ("in_a_row", "i4"), ("above", "i4")], align=True)
+"""Numbers of an alarm that is not active: last points, ordinary points in a row, 1 if its last limit was the upper."""
+
+
+@jit
+def add_point(recent: int, in_a_row: int, mask: int, violating: bool, ordinary: bool) -> tuple[int, int]:
+    """Last points and number of ordinary points in a row, with the next point."""
+    return ((recent << 1) | (1 if violating else 0)) & mask, in_a_row + 1 if ordinary else 0
+
+
+@jit
+def raises(recent: int, raise_count: int, violating: bool) -> bool:
+    """True if the last points raise an alarm that is not active."""
+    count = 0
+    while recent:
+        count += recent & 1
+        recent >>= 1
+    return violating and count >= raise_count
+
+
+@jit
+def is_ordinary(statistic: float, centre: float, lower: float, upper: float, above: bool, reach: float) -> bool:
+    """True if a point is within the limit that was crossed, by the dead band.
+
+    Args:
+        statistic: statistic of the point.
+        centre: centre of the chart.
+        lower: lower limit.
+        upper: upper limit.
+        above: True if the upper limit was crossed.
+        reach: share of the way from the centre to the limit that is ordinary.
+    """
+    deviation = statistic - centre
+    return deviation <= reach * (upper - centre) if above else deviation >= reach * (lower - centre)
+
+
+_ADD_POINT, _RAISES, _IS_ORDINARY = Entry(add_point), Entry(raises), Entry(is_ordinary)
+
+
+class OnOffDelay:
+    """Delays of one alarm.
+
+    Args:
+        raise_count: number of violating points among the last `window` that raises the alarm.
+        window: number of points in the window.
+        clear_count: number of ordinary points in a row that clears the alarm.
+
+    Raises:
+        ValueError: the numbers make no rule.
+    """
+
+    def __init__(self, raise_count: int, window: int, clear_count: int) -> None:
+        check_rule(raise_count, window, clear_count)
+        self._raise_count, self._clear_count = raise_count, clear_count
+        self._mask = (1 << window) - 1
+
+    def update(self, condition: Condition, violating: bool, ordinary: bool | None = None) -> bool | None:
+        """Update a condition with the next point.
+
+        Args:
+            condition: the condition, which is changed.
+            violating: True if the point is beyond a limit.
+            ordinary: True if the point is within the limits by the dead band; None: if it is not violating.
+
+        Returns:
+            True if the alarm is raised, False if it is cleared, None if nothing changes.
+        """
+        if ordinary is None:
+            ordinary = not violating
+        condition.recent, condition.in_a_row = _ADD_POINT.call(
+            condition.recent, condition.in_a_row, self._mask, violating, ordinary
+        )
+        if condition.standing:
+            if condition.in_a_row >= self._clear_count:
+                condition.standing, condition.recent = False, 0
+                return False
+        elif _RAISES.call(condition.recent, self._raise_count, violating):
+            condition.standing = True
+            return True
+        return None
+
+
+class AlarmMemory(Memory):
+    """Memory of an alarm.
 
     Attributes:
         state: state that the operator sees.
         rule: recent points, and the alarm's condition.
+        is_active: True if the alarm was raised, and not cleared since; `rule` is ahead of it within a row.
         raised_ns: time of the sample that raised the alarm last; 0 before the first.
         cleared_ns: time of the sample that cleared the alarm; 0 while it is active.
         value: statistic of the chart when the alarm was last raised or cleared.
@@ -64,7 +197,8 @@ class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
     """
 
     state: State = State.NORMAL
-    rule: OnOffDelayState = msgspec.field(default_factory=OnOffDelayState)
+    rule: Condition = msgspec.field(default_factory=Condition)
+    is_active: bool = False
     raised_ns: TimeNs = 0
     cleared_ns: TimeNs = 0
     value: float = 0.0
@@ -89,23 +223,6 @@ SHARED = (
 """Fields that the state of an alarm and its message have in common."""
 
 
-def memory_from_message(alarm: Alarm) -> AlarmMemory:
-    """Reconstruct the state of an alarm from a message, as far as the message has it."""
-    active = alarm.raised_ns != 0 and alarm.cleared_ns == 0
-    return AlarmMemory(
-        state=next((state for state, code in STATES.items() if code == alarm.state), State.NORMAL),
-        rule=OnOffDelayState(standing=active),
-        above=alarm.limit > 0.0,
-        contributions={item.signal: item.share for item in alarm.contributions},
-        suspects=[
-            SuspectedCause(**{field: getattr(item, field) for field in SuspectedCause.__struct_fields__})
-            for item in alarm.suspects
-        ],
-        shelved_ns=alarm.time_ns if alarm.shelved_until_ns else 0,
-        **{field: getattr(alarm, field) for field in SHARED},
-    )
-
-
 class Explanation(NamedTuple):
     """Text and causes of an alarm when it is raised.
 
@@ -113,11 +230,13 @@ class Explanation(NamedTuple):
         text: the deviation in one sentence.
         contributions: share of the deviation by signal.
         suspects: causes, if the alarm names its cause itself.
+        entries: causes of the whole incident, if the chart finds them.
     """
 
     text: str
     contributions: dict[str, float]
     suspects: Sequence[SuspectedCause] = ()
+    entries: Sequence[SuspectedCause] = ()
 
 
 class ChartAlarm:
@@ -128,14 +247,17 @@ class ChartAlarm:
         signal: name of the signal, or another word in the alarm's key.
         priority: a key of `PRIORITIES`.
         rule: on-delay and off-delay.
-        dead_band: a point is normal within (1 - dead_band) of the way from the centre to the limit that was crossed.
+        dead_band: a point is ordinary within (1 - dead_band) of the way from the centre to the limit that was crossed.
         names_cause: True if the alarm names its cause itself.
+        is_transient: True if the alarm is for a single value. While an alarm without a known cause is active, it joins
+            the latest incident, so that it removes no suspects.
 
     Attributes:
         name: name as in the key: `shewhart/T`.
         priority: priority as in messages.
         names_cause: as given.
-        memory: state; replace it by `restore`.
+        is_transient: as given.
+        memory: memory of the alarm; another one may be put in its place.
     """
 
     def __init__(
@@ -147,17 +269,14 @@ class ChartAlarm:
         dead_band: float,
         *,
         names_cause: bool = False,
+        is_transient: bool = False,
     ) -> None:
         self.name = keys.chart_name(chart, signal)
         self.priority = PRIORITIES[priority]
-        self.names_cause = names_cause
+        self.names_cause, self.is_transient = names_cause, is_transient
         self._rule = rule
         self._reach = 1 - dead_band
-        self.memory = AlarmMemory(rule=rule.state)
-
-    def restore(self, memory: AlarmMemory) -> None:
-        """Resume from a state."""
-        self.memory, self._rule.state = memory, memory.rule
+        self.memory = AlarmMemory()
 
     @property
     def is_idle(self) -> bool:
@@ -169,22 +288,18 @@ class ChartAlarm:
         """Update the alarm's condition with a point of the chart.
 
         Returns:
-            True if the alarm is raised, False if it is cleared, which `record` has to follow; None if nothing changes.
+            True if the alarm is raised, False if it is cleared, which the annunciator's `apply` has to follow; None if
+            nothing changes.
         """
         out = bool(judgement.out)
-        return self._rule.update(out, not out and IS_NORMAL.call(*judgement[:4], self.memory.above, self._reach))
+        return self._rule.update(
+            self.memory.rule, out, not out and _IS_ORDINARY.call(*judgement[:4], self.memory.above, self._reach)
+        )
 
-    def record(self, time_ns: int, judgement: Judgement, unit: str, explanation: Explanation | None) -> Event:
-        """Record the change of the condition that `update` returned; returns the event, which is applied.
-
-        Args:
-            time_ns: time of the sample.
-            judgement: point of the chart.
-            unit: unit of the statistic.
-            explanation: explanation of an alarm that is raised; None: it is cleared.
-        """
-        memory = self.memory
-        memory.value, memory.unit = judgement.statistic, unit
+    def record(self, time_ns: int, change: "AlarmChange") -> Event:
+        """Record a change of the condition at a time; returns the event, which is applied."""
+        memory, judgement, explanation = self.memory, change.judgement, change.explanation
+        memory.value, memory.unit, memory.is_active = judgement.statistic, change.unit, explanation is not None
         if explanation is None:
             memory.cleared_ns = time_ns
             memory.text = f"{self.name} is back within its limits"
@@ -223,22 +338,34 @@ class ChartAlarm:
         return Alarm(
             time_ns=time_ns,
             alarm=self.name,
-            state=STATES[memory.state],
+            state=CODES[memory.state],
             priority=self.priority,
             contributions=[Contribution(signal=name, share=share) for name, share in memory.contributions.items()],
-            suspects=[Suspect(**msgspec.structs.asdict(item)) for item in memory.suspects],
+            suspects=suspect_messages(memory.suspects),
             event=event,
+            names_cause=self.names_cause,
             **{field: getattr(memory, field) for field in SHARED},
         )
 
 
-def chart_point(time_ns: int, judgement: Judgement) -> ChartPoint:
-    """Message of a point on a chart."""
-    return ChartPoint(
-        time_ns=time_ns,
-        statistic=judgement.statistic,
-        centre=judgement.centre,
-        lower_limit=judgement.lower_limit,
-        upper_limit=judgement.upper_limit,
-        out=judgement.out,
-    )
+class AlarmChange(NamedTuple):
+    """Change of an alarm's condition, as the stages of a row return it.
+
+    Attributes:
+        alarm: the alarm, whose `update` found the change.
+        judgement: point of the chart.
+        unit: unit of the statistic.
+        explanation: explanation of an alarm that is raised; None: it is cleared.
+        time_ns: time of the change; None: that of the row.
+    """
+
+    alarm: ChartAlarm
+    judgement: Judgement
+    unit: str
+    explanation: Explanation | None
+    time_ns: int | None = None
+
+
+def suspect_messages(suspects: Iterable[SuspectedCause]) -> list[Suspect]:
+    """Possible causes as messages."""
+    return [Suspect(**msgspec.structs.asdict(item)) for item in suspects]

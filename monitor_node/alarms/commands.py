@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from google.protobuf.message import Message
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.alarms.states import Event
+from reactorwatch.contract.alarm_states import Event
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.commands import check_signature, decode_command
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, CommandReply, ListAlarms, ShelveAlarm

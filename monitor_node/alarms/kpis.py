@@ -7,16 +7,16 @@ small. One that has been active for more than a day is *stale*: it calls for no 
 An alarm is counted when it becomes unacknowledged. All times are plant time.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
 import msgspec
 
-from monitor_node.alarms.alarms import PRIORITIES, ChartAlarm
-from monitor_node.alarms.incidents import Count
-from monitor_node.alarms.states import State
-from reactorwatch.contract.messages_pb2 import AlarmKpis, Priority, PriorityCount
+from monitor_node.alarms.alarms import PRIORITIES, ChartAlarm, Count
+from reactorwatch.contract.alarm_states import State
+from reactorwatch.contract.messages_pb2 import AlarmKpis, PriorityCount
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.stored_state import Memory
 
 RATE_WINDOW_NS = 10 * MINUTE_NS
 FLOOD = 10  # alarms in the window; more are a flood
@@ -46,8 +46,8 @@ class Activation(NamedTuple):
     alarm: str
 
 
-class KpiState(msgspec.Struct, forbid_unknown_fields=True):
-    """State of the counter.
+class KpiCounter(Memory):
+    """Counter of activations.
 
     Attributes:
         recent: activations within the last ten minutes, the oldest first.
@@ -57,18 +57,12 @@ class KpiState(msgspec.Struct, forbid_unknown_fields=True):
     recent: list[Activation] = msgspec.field(default_factory=list)
     raised: dict[int, Count] = msgspec.field(default_factory=dict)
 
-
-class KpiCounter:
-    """Counter of activations."""
-
-    def __init__(self) -> None:
-        self.state = KpiState()
-
-    def count(self, time_ns: int, alarm: str, priority: Priority) -> None:
-        """Count an activation."""
-        self._evict(time_ns)
-        self.state.recent.append(Activation(time_ns, alarm))
-        self.state.raised[priority] = self.state.raised.get(priority, 0) + 1
+    def count(self, activated: Iterable[tuple[int, ChartAlarm]]) -> None:
+        """Count activations: time and alarm of each."""
+        for time_ns, alarm in activated:
+            self._evict(time_ns)
+            self.recent.append(Activation(time_ns, alarm.name))
+            self.raised[alarm.priority] = self.raised.get(alarm.priority, 0) + 1
 
     def compute(self, time_ns: int, alarms: Collection[ChartAlarm], incidents: int) -> AlarmKpis:
         """Compute the KPIs.
@@ -79,7 +73,7 @@ class KpiCounter:
             incidents: number of incidents so far.
         """
         self._evict(time_ns)
-        recent = self.state.recent
+        recent = self.recent
         states = [alarm.memory.state for alarm in alarms]
         active = [alarm for alarm in alarms if alarm.memory.state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED)]
         return AlarmKpis(
@@ -92,7 +86,7 @@ class KpiCounter:
             priorities=[
                 PriorityCount(
                     priority=priority,
-                    raised=self.state.raised.get(priority, 0),
+                    raised=self.raised.get(priority, 0),
                     standing=sum(alarm.priority == priority for alarm in active),
                 )
                 for priority in sorted(PRIORITIES.values(), reverse=True)
@@ -106,10 +100,10 @@ class KpiCounter:
 
     def _evict(self, time_ns: int) -> None:
         """Evict activations older than ten minutes, and those in the future, from before the clock was set back."""
-        self.state.recent = [item for item in self.state.recent if 0 <= time_ns - item.time_ns < RATE_WINDOW_NS]
+        self.recent = [item for item in self.recent if 0 <= time_ns - item.time_ns < RATE_WINDOW_NS]
 
     def _chatters(self, alarm: str) -> bool:
-        times = [item.time_ns for item in self.state.recent if item.alarm == alarm]
+        times = [item.time_ns for item in self.recent if item.alarm == alarm]
         return any(
             last - first <= CHATTER_WITHIN_NS for first, last in zip(times, times[CHATTER_TIMES - 1 :], strict=False)
         )

@@ -1,15 +1,73 @@
-"""Settings of a fleet."""
+"""Settings of a fleet, and its division into shards.
 
-from typing import Annotated
+Each monitor of a divided fleet has one shard: `2/5` is the second of five. A plant's shard follows from a digest of its
+name, the same on every machine and in every version, and never changes.
+"""
+
+import re
+from hashlib import blake2b
+from typing import Annotated, NamedTuple
 
 import msgspec
 
 from monitor_node.config import LARGEST_FALSE_ALARMS, LEAST_FALSE_ALARMS, MonitorConfig
-from monitor_node.fleet import sharding
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.setting_rules import check_bounds
 from reactorwatch.spc.false_alarm_budget import DAYS
+
+MOST_SHARDS = 1000
+
+
+class Shard(NamedTuple):
+    """A shard of a fleet.
+
+    Attributes:
+        number: number of the shard, from 1.
+        of: number of shards.
+    """
+
+    number: int
+    of: int
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.of}"
+
+    def has(self, plant: str) -> bool:
+        """True if a plant is in the shard."""
+        return self.of == 1 or shard_of(plant, self.of) == self.number
+
+
+WHOLE = Shard(1, 1)
+
+
+def parse_shard(text: str) -> Shard:
+    """Parse a shard.
+
+    >>> parse_shard("2/5")
+    Shard(number=2, of=5)
+
+    Raises:
+        InputError: the text is no shard.
+    """
+    match = re.fullmatch(r"(\d{1,4})/(\d{1,4})", text)
+    shard = Shard(int(match[1]), int(match[2])) if match is not None else Shard(0, 0)
+    if not 1 <= shard.number <= shard.of <= MOST_SHARDS:
+        raise InputError(f"shard must be like 2/5, the second of five, with at most {MOST_SHARDS}, got {text!r}")
+    return shard
+
+
+def shard_of(plant: str, of: int) -> int:
+    """Number of a plant's shard, from 1.
+
+    >>> [shard_of(plant, 3) for plant in ("a", "b", "c", "d")]
+    [3, 3, 1, 3]
+
+    Args:
+        plant: name of the plant.
+        of: number of shards.
+    """
+    return int.from_bytes(blake2b(plant.encode(), digest_size=8).digest(), "big") % of + 1
 
 
 class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -17,16 +75,15 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         plants: key expression of the plants, such as `reactor/*`; None: one plant, that of the monitor's settings.
-        shard: own shard, such as `2/5`: its plants, and those of shards whose monitors are gone.
+        shard: own shard, such as `2/5`.
         processes: process by plant, a name in the catalogue or a file; a key may be a pattern of plants such as
             `north_*`, and a plant's own entry goes before patterns. Other plants have that of the monitor's settings.
-        state: folder of the plants' states, stored as often as the monitor's settings say. A restarted monitor, and one
-            that takes a plant over with the same folder, resumes from it. None: nothing is stored.
+        state: folder of the plants' states, stored as often as the monitor's settings say, from which a restarted
+            monitor resumes. Only one monitor at a time uses a folder. None: nothing is stored.
         false_alarms_per_day: number of false alarms a day of all plants together; each plant has the same share, so it
             holds however the plants depend on each other. None: only each plant's own number is promised.
         most_plants: largest number of plants among which it is divided.
-        points: True to publish estimates, chart points and models for every row; each plant then costs as much as in a
-            monitor of its own.
+        points: True to publish estimates, chart points and models for every row.
     """
 
     plants: str | None = None
@@ -41,7 +98,7 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.plants is not None:
             keys.check_plants(self.plants)
         try:
-            sharding.parse_shard(self.shard)
+            parse_shard(self.shard)
         except InputError as error:
             raise ValueError(str(error)) from error
         check_bounds(FleetConfig, msgspec.structs.asdict(self))

@@ -12,13 +12,16 @@ The policy uses sample times alone, so that a replay reproduces the live run exa
   explain means a restart of the publisher: pending rows are emitted, and a new run starts.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import nan
 from typing import NamedTuple
+
+from msgspec import field
 
 from monitor_node.ingest.sampling import Interval
 from reactorwatch.contract.codec import Publication
 from reactorwatch.runtime.delivery.gap_tracker import GapTracker
+from reactorwatch.stored_state import Memory
 
 MOST_LOST = 2**62  # more than any plant publishes; corrupt sequence numbers must not overflow the count in a message
 REMEMBERED = 4  # times the reordering: emitted rows kept to detect duplicates; step back that means a restart
@@ -61,8 +64,7 @@ class MeasuredRow:
     publications: list[Publication]
 
 
-@dataclass
-class Counts:
+class Counts(Memory):
     """Counts of samples and rows by what happened to them."""
 
     rows: int = 0
@@ -74,8 +76,7 @@ class Counts:
     restarts: int = 0
 
 
-@dataclass(slots=True)
-class PendingRow:
+class PendingRow(Memory):
     """A row that is not emitted yet.
 
     Attributes:
@@ -89,14 +90,13 @@ class PendingRow:
     missing: int
 
 
-@dataclass
-class AlignmentState:
-    """State of an aligner.
+class AlignmentMemory(Memory):
+    """Memory of an aligner.
 
     Attributes:
         pending: pending rows by time.
-        left: sequence numbers of the rows emitted last, by time, oldest first; None where a sample was missing.
-        newest_left_ns: time of the row emitted last; None before the first.
+        emitted: sequence numbers of the rows emitted last, by time, oldest first; None where a sample was missing.
+        newest_emitted_ns: time of the row emitted last; None before the first.
         newest_numbers: sequence numbers of that row, extrapolated where missing; None before the first.
         sequences: position in the run of each signal.
         restarted: True if the next row is the first of a new run.
@@ -104,8 +104,8 @@ class AlignmentState:
     """
 
     pending: dict[int, PendingRow] = field(default_factory=dict)
-    left: dict[int, list[int | None]] = field(default_factory=dict)
-    newest_left_ns: int | None = None
+    emitted: dict[int, list[int | None]] = field(default_factory=dict)
+    newest_emitted_ns: int | None = None
     newest_numbers: list[int | None] = field(default_factory=list)
     sequences: list[GapTracker] = field(default_factory=list)
     restarted: bool = True
@@ -129,7 +129,7 @@ class Aligner:
         self._index = {signal: index for index, signal in enumerate(signals)}
         self._count = len(signals)
         self._reorder_rows = reorder_rows
-        self.state = AlignmentState()
+        self.memory = AlignmentMemory()
         self._start_run()
 
     def update(self, signal: str, time_ns: int, sequence: int, value: float) -> list[Row]:
@@ -142,19 +142,19 @@ class Aligner:
             value: finite value.
         """
         rows: list[Row] = []
-        index, state = self._index[signal], self.state
-        position = state.sequences[index]
+        index, memory = self._index[signal], self.memory
+        position = memory.sequences[index]
         if not position.accept_next(sequence, time_ns):
             rows = self._restart(index, time_ns, sequence)
             if self._is_duplicate(index, time_ns):
-                state.counts.duplicated += 1
+                memory.counts.duplicated += 1
                 return rows
-            self._count_sequence(state.sequences[index], time_ns, sequence)
-        pending = state.pending
+            self._count_sequence(memory.sequences[index], time_ns, sequence)
+        pending = memory.pending
         waiting = pending.get(time_ns)
         if waiting is None:
-            if state.newest_left_ns is not None and time_ns <= state.newest_left_ns:
-                state.counts.late += 1
+            if memory.newest_emitted_ns is not None and time_ns <= memory.newest_emitted_ns:
+                memory.counts.late += 1
                 return rows
             count = self._count
             waiting = pending[time_ns] = PendingRow([nan] * count, [None] * count, count)
@@ -169,16 +169,16 @@ class Aligner:
 
     def flush(self) -> list[Row]:
         """Emit all pending rows, as at the end of a record."""
-        return [self._emit(time_ns) for time_ns in sorted(self.state.pending)]
+        return [self._emit(time_ns) for time_ns in sorted(self.memory.pending)]
 
     def _is_duplicate(self, index: int, time_ns: int) -> bool:
         """True if a sample of that signal and time was received before."""
-        waiting = self.state.pending.get(time_ns)
-        numbers = waiting.numbers if waiting is not None else self.state.left.get(time_ns)
+        waiting = self.memory.pending.get(time_ns)
+        numbers = waiting.numbers if waiting is not None else self.memory.emitted.get(time_ns)
         return numbers is not None and numbers[index] is not None
 
     def _release(self) -> list[Row]:
-        pending = self.state.pending
+        pending = self.memory.pending
         rows: list[Row] = []
         times = sorted(pending)
         for position, time_ns in enumerate(times):
@@ -192,31 +192,31 @@ class Aligner:
         """True if a row is complete, and follows the row emitted last by any of its sequence numbers."""
         if waiting.missing:
             return False
-        for before, number in zip(self.state.newest_numbers, waiting.numbers, strict=True):
+        for before, number in zip(self.memory.newest_numbers, waiting.numbers, strict=True):
             if before is None or number == before + 1:
                 return True
         return False
 
     def _emit(self, time_ns: int) -> Row:
-        state = self.state
-        waiting = state.pending.pop(time_ns)
-        numbers, left = waiting.numbers, state.left
-        left[time_ns] = numbers
-        if len(left) > REMEMBERED * self._reorder_rows:
-            del left[next(iter(left))]
+        memory = self.memory
+        waiting = memory.pending.pop(time_ns)
+        numbers, emitted = waiting.numbers, memory.emitted
+        emitted[time_ns] = numbers
+        if len(emitted) > REMEMBERED * self._reorder_rows:
+            del emitted[next(iter(emitted))]
         if waiting.missing:
-            state.counts.incomplete_rows += 1
-            pairs = zip(state.newest_numbers, numbers, strict=True)
+            memory.counts.incomplete_rows += 1
+            pairs = zip(memory.newest_numbers, numbers, strict=True)
             numbers = [before + 1 if number is None and before is not None else number for before, number in pairs]
-        state.newest_left_ns, state.newest_numbers = time_ns, numbers
-        state.counts.rows += 1
-        row = Row(time_ns, tuple(waiting.values), state.restarted)
-        state.restarted = False
+        memory.newest_emitted_ns, memory.newest_numbers = time_ns, numbers
+        memory.counts.rows += 1
+        row = Row(time_ns, tuple(waiting.values), memory.restarted)
+        memory.restarted = False
         return row
 
     def _restart(self, index: int, time_ns: int, sequence: int) -> list[Row]:
         """Start a new run if the publisher was restarted; returns the rows that were pending."""
-        position = self.state.sequences[index]
+        position = self.memory.sequences[index]
         if position.expected is None:
             return []
         ahead = sequence >= position.expected
@@ -226,18 +226,18 @@ class Aligner:
         if not (set_back or fell_back or from_zero):
             return []
         rows = self.flush()
-        self.state.counts.restarts += 1
+        self.memory.counts.restarts += 1
         self._start_run()
         return rows
 
     def _start_run(self) -> None:
         """Start a new run of the publisher."""
-        state = self.state
-        state.left, state.newest_left_ns, state.newest_numbers = {}, None, [None] * self._count
-        state.sequences, state.restarted = [GapTracker() for _ in range(self._count)], True
+        memory = self.memory
+        memory.emitted, memory.newest_emitted_ns, memory.newest_numbers = {}, None, [None] * self._count
+        memory.sequences, memory.restarted = [GapTracker() for _ in range(self._count)], True
 
     def _count_sequence(self, position: GapTracker, time_ns: int, sequence: int) -> None:
-        counts = self.state.counts
+        counts = self.memory.counts
         if position.expected is None or sequence >= position.expected:
             counts.lost = min(counts.lost + position.advance(sequence, time_ns), MOST_LOST)
         elif time_ns < position.newest_ns:

@@ -1,20 +1,90 @@
-"""Back-test: run the monitor's core over a recording at full speed."""
+"""Back-test: run the monitor's core over a recording at full speed, after checks of the record that it learns from."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from monitor_node.alarms.states import Event
+import numpy as np
+
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
-from monitor_node.pipeline.pipeline_state import PipelineState
-from monitor_node.replay.row_log import RowLog
+from monitor_node.learn.arx_fit import arx_structure, fewest_rows
+from monitor_node.learn.training import FEWEST_ROWS
+from monitor_node.watch.pipeline_state import PipelineState
 from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
+from reactorwatch.contract.alarm_states import Event
+from reactorwatch.contract.alarm_text import set_suspects
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Promise
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Incident, Promise
+from reactorwatch.errors import UnfitRecordError
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import Record
+
+
+class LoggedRow(NamedTuple):
+    """A row and its alarms.
+
+    Attributes:
+        time_ns: time of the row.
+        in_alarm: True if an alarm is active after the row, acknowledged or not.
+        raised: True if an alarm was raised by the row.
+    """
+
+    time_ns: int
+    in_alarm: bool
+    raised: bool
+
+
+class RowLog:
+    """Follows the alarms from row to row."""
+
+    def __init__(self) -> None:
+        self.rows: list[LoggedRow] = []
+        self._active: set[str] = set()
+
+    def add(self, time_ns: int, publications: Sequence[Publication], *, judged: bool) -> None:
+        """Add a row.
+
+        Args:
+            time_ns: time of the row.
+            publications: publications because of the row.
+            judged: False for a row of the training, which is logged without alarms.
+        """
+        raised = False
+        for publication in publications:
+            message = publication.message
+            if not isinstance(message, Alarm):
+                continue
+            if message.event == Event.RAISED.value:
+                self._active.add(message.alarm)
+                raised = True
+            elif message.event == Event.CLEARED.value or message.cleared_ns:
+                self._active.discard(message.alarm)
+        self.rows.append(LoggedRow(time_ns, judged and bool(self._active), judged and raised))
+
+
+def rows_of_file(logged: Sequence[LoggedRow], times_ns: Sequence[int]) -> list[LoggedRow]:
+    """Rows of a file with their alarms.
+
+    Args:
+        logged: the rows that were watched, in the order of the file.
+        times_ns: times of the file's rows; one without any value was not watched, and its alarms are those before it.
+
+    Returns:
+        One row for each time.
+    """
+    rows: list[LoggedRow] = []
+    index = 0
+    for time_ns in times_ns:
+        if index < len(logged) and logged[index].time_ns == time_ns:
+            rows.append(logged[index])
+            index += 1
+        else:
+            rows.append(LoggedRow(time_ns, bool(rows) and rows[-1].in_alarm, raised=False))
+    return rows
+
 
 RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
 
@@ -51,12 +121,12 @@ class Backtest:
         refused: number of rejected messages by reason.
         notes: notes on the training.
         left_out: signals that are not monitored, with the reason.
-        refused_trainings: number of refused trainings.
         reference: kind of the reference, `equations` or `arx`; None if no row was evaluated.
         noise_levels: standard deviations of the equations' filter: of each sensor in its unit (`sensors`), of each
             state in its unit per square root of a minute (`states`); None with another reference.
         training_rows: number of rows of the training; 0 if no row was evaluated.
         promise: promise of false alarms for the evaluated rows; None if no row was evaluated.
+        not_watched: reason why no row could be judged; empty if one was.
         baseline: change of the model after the diagnosis of the training; None: rows were evaluated by the equations as
             given.
     """
@@ -71,21 +141,23 @@ class Backtest:
     watching_since_ns: int | None
     expected_false_alarms: float
     alarm_messages: list[Alarm]
+    incident_messages: list[Incident]
     refused: dict[str, int]
     notes: list[str]
     left_out: dict[str, str]
-    refused_trainings: int
     reference: str | None = None
     noise_levels: dict[str, dict[str, float]] | None = None
     baseline: Baseline | None = None
     training_rows: int = 0
     promise: Promise | None = None
+    not_watched: str = ""
 
     @property
     def raised_alarms(self) -> list[tuple[Alarm, int | None]]:
         """Each alarm as raised, with its newest suspects, and the time when it was cleared (None: it is active)."""
         alarms: list[tuple[Alarm, int | None]] = []
         last: dict[str, int] = {}
+        newest = {message.number: message.suspects for message in self.incident_messages}
         for message in self.alarm_messages:
             if message.event == RAISED:
                 last[message.alarm] = len(alarms)
@@ -95,11 +167,13 @@ class Backtest:
             elif message.alarm in last:
                 alarm, cleared_ns = alarms[last[message.alarm]]
                 if message.raised_ns == alarm.raised_ns and message.suspects:
-                    del alarm.suspects[:]
-                    alarm.suspects.extend(message.suspects)
+                    set_suspects(alarm, message.suspects)
                 if cleared_ns is None and (message.cleared_ns or message.event == CLEARED):
                     cleared_ns = message.cleared_ns
                 alarms[last[message.alarm]] = (alarm, cleared_ns)
+        for alarm, cleared_ns in alarms:
+            if cleared_ns is None and not alarm.names_cause:
+                set_suspects(alarm, newest.get(alarm.incident, ()))
         return alarms
 
 
@@ -148,7 +222,7 @@ def run(
     if trained is not None:
         monitor.pipeline.restore(trained.state, 0)
         monitor.pipeline.start_run()
-    alarms: list[Alarm] = []
+    alarms, incidents = list[Alarm](), list[Incident]()
     first_ns: int | None = None
     if log is not None:
         rows = log  # the same log for the checker of types
@@ -160,6 +234,7 @@ def run(
 
     def keep(publications: list[Publication]) -> None:
         alarms.extend(item.message for item in publications if isinstance(item.message, Alarm))
+        incidents.extend(item.message for item in publications if isinstance(item.message, Incident))
 
     prefix = keys.key(config.plant, keys.SAMPLE, "")
     for message in messages:
@@ -179,19 +254,99 @@ def run(
         watching_since_ns=monitor.memory.watching_since_ns,
         expected_false_alarms=monitor.pipeline.expected_false_alarms,
         alarm_messages=alarms,
+        incident_messages=incidents,
         refused=dict(monitor.rejects.by_reason),
         notes=[*(trained.notes if trained is not None else ()), *monitor.notes],
         left_out=monitor.excluded_signals,
-        refused_trainings=monitor.pipeline.refused_trainings,
         reference=monitor.pipeline.newest_reference or None,
         noise_levels=monitor.pipeline.noise_levels,
         baseline=monitor.baseline,
         training_rows=monitor.pipeline.training_rows if trained is None else trained.rows,
         promise=monitor.promise,
+        not_watched=_describe_obstacle(monitor),
     )
+
+
+def _describe_obstacle(monitor: Monitor) -> str:
+    """Reason why no row could be judged; empty if one was."""
+    pipeline = monitor.pipeline
+    if pipeline.evaluation.has_judged:
+        return ""
+    if not pipeline.is_judged:
+        return "the training has seen no row in the plant's mode of operation; train on rows in it"
+    if pipeline.watching:
+        return (
+            "no row could be predicted: rows must come one by one period, that of the training, with values of the "
+            "inputs that it has seen; train on rows like these"
+        )
+    if refused := pipeline.refused_training:
+        return f"no training was fit to learn from: {refused}"
+    return "too short: all of it went into the training; make it shorter with --training or --training-rows"
 
 
 def _make_monitor(config: MonitorConfig, zero_ns: int, model: ProcessModel | None) -> Monitor:
     if model is None:
         config, model = load_process(config, zero_ns)
     return Monitor(config, start_ns=0, points=False, model=model, diagnose=find_deviations, power=True)
+
+
+def check_training_record(record: Record, config: MonitorConfig, model: ProcessModel | None) -> dict[str, str]:
+    """Check that a monitor can learn from a record.
+
+    Args:
+        record: the record, with the signals of the settings.
+        config: settings of the monitor.
+        model: equations; None: models are identified.
+
+    Returns:
+        Inputs that never move, with the reason why they explain nothing.
+
+    Raises:
+        InputError: there are too few rows, or no output ever changes.
+    """
+    constant = {name: value for name in config.signals if (value := _only_value(record, name)) is not None}
+    still = [name for name in config.outputs if name in constant and not config.smallest_sd.get(name)]
+    if len(still) == len(config.outputs):
+        readings = ", ".join(f"{name} reads {constant[name]:g}" for name in still)
+        raise UnfitRecordError(
+            f"{record.name}: at least one output must change, got {readings} in all {record.rows} rows; "
+            "name outputs that do, or a record in which they do"
+        )
+    structure = arx_structure(config)
+    needed = FEWEST_ROWS if model is not None else fewest_rows(structure)
+    if record.rows <= needed:
+        of_what = "the noise of the sensors" if model is not None else f"{structure.parameters} parameters an output"
+        raise UnfitRecordError(
+            f"{record.name}: must have more than {needed} rows to learn {of_what} from, got {record.rows}; "
+            "record for longer, or learn from another record (--train)"
+        )
+    return {
+        name: f"it never moves: it reads {constant[name]:g} in all rows" for name in config.inputs if name in constant
+    }
+
+
+def check_watched(name: object, result: Backtest) -> None:
+    """Check that there was something to watch.
+
+    Args:
+        name: name of the record.
+        result: result of its back-test.
+
+    Raises:
+        InputError: it has no usable row, or no output that can be watched.
+    """
+    if not result.rows:
+        why = ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items()))
+        raise UnfitRecordError(f"{name}: holds no sample that can be used{f'; refused: {why}' if why else ''}")
+    if set(result.outputs) <= result.left_out.keys():
+        reasons = "; ".join(f"{output}: {result.left_out[output]}" for output in result.outputs)
+        raise UnfitRecordError(f"{name}: there is no output to watch ({reasons})")
+
+
+def _only_value(record: Record, name: str) -> float | None:
+    """Value that a signal has in all rows; None if it varies."""
+    values = record.columns.get(name)
+    if values is None or not np.isfinite(values).any():
+        return None
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    return low if low == high else None

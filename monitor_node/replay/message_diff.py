@@ -15,6 +15,7 @@ from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decod
 MAX_DIFFERENCES = 100
 """Differences that are listed; the others are counted."""
 
+UNKNOWN = "unknown fields"
 NOT_RECORDED, NOT_REPLAYED = "not recorded", "not said again"
 
 
@@ -24,7 +25,7 @@ class Difference(NamedTuple):
     Attributes:
         key: key of the message.
         time_ns: sample time of the message.
-        what: name of the field; or `NOT_RECORDED`, or `NOT_REPLAYED`.
+        what: name of the field; or `UNKNOWN`, for those of a later schema; `NOT_RECORDED`, or `NOT_REPLAYED`.
         recorded: recorded value of the field; empty without a recorded message.
         again: replayed value of the field; empty without a replayed message.
     """
@@ -105,6 +106,15 @@ class MessageDiff:
             replayed.clear()
         self.differences.sort(key=lambda item: item.time_ns)
 
+    def add(self, other: "MessageDiff") -> None:
+        """Add the differences of another run."""
+        for kind, count in other.counts.items():
+            own = self.counts.setdefault(kind, MatchCount())
+            own.recorded, own.equal = own.recorded + count.recorded, own.equal + count.equal
+        self.differences = sorted([*self.differences, *other.differences], key=lambda item: item.time_ns)
+        del self.differences[MAX_DIFFERENCES:]
+        self.differing, self.unrecorded = self.differing + other.differing, self.unrecorded + other.unrecorded
+
     def _pair(self, key: str) -> None:
         recorded, replayed = self._recorded.get(key), self._replayed.get(key)
         while recorded and replayed:
@@ -156,11 +166,23 @@ def _differing_fields(recorded: Message, again: Message) -> list[tuple[str, str,
         return [("message", recorded.DESCRIPTOR.full_name, again.DESCRIPTOR.full_name)]
     fields = []
     for item in recorded.DESCRIPTOR.fields:
-        before, after = (_format(getattr(message, item.name)) for message in (recorded, again))
+        before, after = (_exact_text(getattr(message, item.name)) for message in (recorded, again))
         if before != after:
             fields.append((item.name, before, after))
+    before_bytes, after_bytes = _unknown_bytes(recorded), _unknown_bytes(again)
+    if not fields and (before_bytes or after_bytes):
+        fields.append((UNKNOWN, f"{before_bytes} bytes", f"{after_bytes} bytes"))
     return fields
 
 
-def _format(value: Any) -> str:
-    return repr(value) if isinstance(value, str | int | float) else " ".join(str(value).split())
+def _unknown_bytes(message: Message) -> int:
+    """Bytes of fields that this version of the schema does not have."""
+    known = type(message)()
+    known.CopyFrom(message)
+    known.DiscardUnknownFields()
+    return message.ByteSize() - known.ByteSize()
+
+
+def _exact_text(value: Any) -> str:
+    """Text of a value on one line, which no other value has: spaces within texts are kept."""
+    return repr(value) if isinstance(value, str | int | float) else " ".join(map(str.strip, str(value).splitlines()))

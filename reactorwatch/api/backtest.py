@@ -7,17 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from monitor_node.replay.backtest import check_training_record, check_watched
 from monitor_node.replay.backtest import run as run_backtest
-from monitor_node.replay.record_checks import check_training_record
 from monitor_node.watched_process import WatchedProcess, limit_training, watch_process
-from reactorwatch.api.backtest_report import backtest_object, backtest_text
+from reactorwatch.api.backtest_report import backtest_headline, backtest_object, backtest_text
 from reactorwatch.api.monitor import Suspect, monitor_settings
 from reactorwatch.api.page import write_page
 from reactorwatch.api.record_view import signal_panels, time_title
 from reactorwatch.api.records import ProcessLike
 from reactorwatch.contract.codec import encode
 from reactorwatch.description.find import find_process
-from reactorwatch.errors import InputError
 from reactorwatch.notebook import html
 from reactorwatch.notebook.figures import ALARM, Mark, draw_panels
 from reactorwatch.notebook.frames import frame_of_rows
@@ -60,6 +59,8 @@ class BacktestResult(msgspec.Struct, frozen=True):
     """Result of a back-test; its fields are those of `reactorwatch backtest --json`.
 
     Attributes:
+        watched: False if no row could be judged.
+        why: reason why none could; None: one was judged.
         samples: number of rows.
         zero: clock time that the minutes count from, ISO 8601; None: unknown.
         span_min: time from the first row to the last, summed over the runs.
@@ -73,10 +74,13 @@ class BacktestResult(msgspec.Struct, frozen=True):
         noise_levels: standard deviations of the equations' noise; None: they did not judge.
         baseline: change of the equations after the diagnosis of the training; None: they stayed as given.
         alarms: the alarms in the order in which they were raised.
+        headline: outcome in a line for each incident, the largest first, after doubts about the training.
         text: report as `reactorwatch backtest` prints it.
         record: the record.
     """
 
+    watched: bool
+    why: str | None
     samples: int
     zero: str | None
     span_min: float
@@ -90,6 +94,7 @@ class BacktestResult(msgspec.Struct, frozen=True):
     noise_levels: dict[str, dict[str, float]] | None
     baseline: dict[str, Any] | None
     alarms: list[RaisedAlarm]
+    headline: list[str]
     text: str
     record: Any = None
 
@@ -97,7 +102,7 @@ class BacktestResult(msgspec.Struct, frozen=True):
         return self.text
 
     def __repr__(self) -> str:
-        return f"<{self._summary()}>"
+        return f"<{'; '.join(self.headline)}>"
 
     def _repr_html_(self) -> str:
         rows = []
@@ -106,9 +111,9 @@ class BacktestResult(msgspec.Struct, frozen=True):
             rows.append((f"{alarm.raised_min:g}", cleared, alarm.alarm, alarm.priority, cause))
         trained = self.trained_until_min
         parts = [
-            html.headline(self._summary()),
+            *map(html.headline, self.headline),
             html.sentence(
-                "All of it went into the training."
+                f"Nothing was watched: {self.why}."
                 if trained is None
                 else f"Trained until {trained:g} min; {self.expected_false_alarms:.2g} false alarms are expected later."
             ),
@@ -116,16 +121,6 @@ class BacktestResult(msgspec.Struct, frozen=True):
         ]
         parts += [html.sentence(f"{item['signal']} is not watched: {item['why']}") for item in self.signals["left_out"]]
         return "".join(parts)
-
-    def _summary(self) -> str:
-        """Number of alarms, the first of them, and the likeliest cause of the last that has suspects."""
-        if not self.alarms:
-            return "No alarms." if self.trained_until_min is not None else "Nothing was watched."
-        first = self.alarms[0]
-        suspects = [alarm.suspect[0] for alarm in self.alarms if alarm.suspect]
-        count = "1 alarm" if len(self.alarms) == 1 else f"{len(self.alarms)} alarms"
-        named = f"; likely cause: {suspects[-1]}" if suspects else ""
-        return f"{count}, the first at {first.raised_min:g} min ({first.alarm}){named}."
 
     def to_frame(self) -> "DataFrame":
         """A row for each alarm, with its likeliest cause.
@@ -177,21 +172,25 @@ def backtest(record: Record, process: ProcessLike | None = None, **settings: Any
     """
     still: dict[str, str] = {}
     named = getattr(record, "process", None) if process is None else process
-    config = monitor_settings(settings)
-    if named is None:
+    described = None if named is None else find_process(named, record.zero_ns)
+    config = monitor_settings(settings, described)
+    if described is None:
         watched = WatchedProcess(limit_training(config, record.rows), None)
     else:
-        watched = watch_process(config, find_process(named, record.zero_ns), record.rows)
+        watched = watch_process(config, described, record.rows)
         still = check_training_record(record, *watched)
     zero_ns = replace(record, zero_ns=0).stored_zero_ns  # so that the minutes of a model are those of the record
     publications = samples_of(record, config.plant, zero_ns)
     result = run_backtest((encode(item) for item in publications), watched.config, zero_ns, watched.model)
     result.left_out = still | result.left_out
-    if not result.rows:
-        raise InputError(f"{record.name}: holds no sample that can be used")
+    check_watched(record.name, result)
     found = backtest_object(result, zero_ns, record.zero)
-    text = backtest_text(result, zero_ns, Path(record.name), record.zero_ns or None)
-    return msgspec.convert(found | {"text": text, "record": record}, BacktestResult)
+    clock_ns = record.zero_ns or None
+    outcome = {
+        "headline": backtest_headline(result, zero_ns, clock_ns),
+        "text": backtest_text(result, zero_ns, Path(record.name), clock_ns),
+    }
+    return msgspec.convert(found | outcome | {"record": record}, BacktestResult)
 
 
 def _merge_spans(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -4,13 +4,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from monitor_node.replay.backtest import Backtest
-from reactorwatch.api.alarm_lines import alarm_headline, alarm_lines
+from monitor_node.watch.promise import REMEDY, describe_rate
+from reactorwatch.api.alarm_lines import alarm_lines, headline
 from reactorwatch.contract.alarm_text import priority_word
 from reactorwatch.contract.messages_pb2 import Promise
 from reactorwatch.contract.promise_text import describe_power, promise_fields
+from reactorwatch.limits import parse_json
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.terminal import printable_lines
 
@@ -34,6 +34,8 @@ def backtest_object(
         return None if time_ns is None else to_minutes(time_ns, zero_ns)
 
     return {
+        "watched": not result.not_watched,
+        "why": result.not_watched or None,
         "samples": result.rows,
         "zero": zero,
         "span_min": to_minutes(result.span_ns),
@@ -85,8 +87,21 @@ def _baseline(result: Backtest, minutes: Callable[[int], float | None]) -> dict[
     change = result.baseline
     if change is None:
         return None
-    model = msgspec.json.decode(change.model)
+    model = parse_json(change.model)
     return {"what": change.what, "from_min": minutes(change.time_ns), "why": change.why, "extended_model": model}
+
+
+def backtest_headline(result: Backtest, zero_ns: int, clock_zero_ns: int | None = None) -> list[str]:
+    """Lines that state the outcome; arguments as for `backtest_text`."""
+    doubt, promise, raised = "", result.promise, result.raised_alarms
+    if result.not_watched:
+        doubt = f"nothing was watched: {result.not_watched}"
+        if not raised:
+            return [doubt]
+    elif promise is not None and not promise.kept:
+        rate = describe_rate(promise.can_keep_per_30_days)
+        doubt = f"not trustworthy yet: by its training, false alarms may come {rate}; {REMEDY}"
+    return headline(raised, zero_ns, clock_zero_ns, doubt)
 
 
 def backtest_text(
@@ -104,17 +119,13 @@ def backtest_text(
     report = backtest_object(result, zero_ns, is_trained=is_trained)
     since = "" if clock_zero_ns is None else f", minutes since {format_utc(clock_zero_ns)}"
     lines = [f"{file}: {report['samples']} rows over {report['span_min']:g} min{since}"]
-    lines += filter(None, [alarm_headline(result.raised_alarms, zero_ns, clock_zero_ns)])
+    lines += backtest_headline(result, zero_ns, clock_zero_ns)
     lines += [f"  {name} is not watched: {why}" for name, why in result.left_out.items()]
     if result.runs > 1:
         lines.append(
             f"the plant's clock steps back, or the plant was restarted: {result.runs} runs, watched one by one"
         )
-    if report["trained_until_min"] is None and result.refused_trainings:
-        lines.append("nothing was watched: no training was fit to learn from, for the reasons below")
-    elif report["trained_until_min"] is None:
-        lines.append("too short to watch: all of it went into the training (make it shorter with --training)")
-    else:
+    if report["trained_until_min"] is not None:
         where = "on another file" if is_trained else f"until {report['trained_until_min']:g} min"
         lines.append(
             f"training: {where} ({result.training_rows} rows); "
@@ -129,8 +140,6 @@ def backtest_text(
     lines += alarm_lines(result.raised_alarms, zero_ns)
     is_stated = result.promise is not None  # above, as of the end
     lines += [f"  note: {note}" for note in result.notes if not (is_stated and note.startswith("promise: "))]
-    if not result.raised_alarms and report["trained_until_min"] is not None:
-        lines.append("no alarms")
     if result.refused:
         lines.append("refused: " + ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items())))
     return printable_lines(lines)

@@ -46,7 +46,7 @@ def record(
 
     described = process or find_process()
     if file_kind(path) == "mcap":
-        from recorder.tools.mcap_file import read_record
+        from recorder.tools.convert import read_record
 
         recorded = read_record(path, plant, described)
         return recorded if process is None else convert_to_process(recorded, process)
@@ -66,7 +66,7 @@ def described_process(path: Path, plant: str | None = None, choice: ProcessChoic
     """
     if not choice.is_default or file_kind(path) == "table":
         return choice.load()
-    from recorder.tools.mcap_file import recorded_process
+    from recorder.files.recording import recorded_process
 
     return recorded_process(path, plant) or choice.load()
 
@@ -157,14 +157,8 @@ def open_messages(
         encoded = (encode(item) for item in publications)
         zero_ns, has_clock_time = measured.stored_zero_ns, bool(measured.zero_ns)
         return MessageSource(encoded, zero_ns, has_clock_time, measured.read_as, choice.load(), measured)
-    from recorder.tools.mcap_file import (
-        ZERO_NS,
-        has_clock,
-        read_messages,
-        read_metadata,
-        recorded_process,
-        zero_from,
-    )
+    from recorder.files.metadata import ZERO_NS
+    from recorder.files.recording import has_clock, read_messages, read_metadata, recorded_process, zero_from
 
     read = (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
     metadata = read_metadata(path)
@@ -182,11 +176,13 @@ def expand_folder(folder: Path) -> list[Path]:
     Raises:
         InputError: the folder holds neither.
     """
-    from recorder.storage.mcap_writer import FILE_INDEX
-    from recorder.tools.mcap_file import read_metadata
+    from recorder.files.metadata import FILE_INDEX
+    from recorder.files.recording import live_file, read_metadata
 
     one_recording = {FILE_INDEX, "cut", "merged"}
     records, recordings = (list_files(folder, suffix) for suffix in (".csv", ".mcap"))
+    if not records and not recordings and live_file(folder) is not None:
+        return [folder]
     if not records and not recordings:
         raise InputError(f"{folder}: holds no record (.csv) and no recording (.mcap)")
     origins = []
@@ -206,7 +202,7 @@ def resolve_plant(path: Path, plant: str | None) -> str:
     """
     if file_kind(path) == "table":
         return plant or DEFAULT_PLANT
-    from recorder.tools.mcap_file import one_plant_in
+    from recorder.files.recording import one_plant_in
 
     name = one_plant_in(path, plant)
     try:

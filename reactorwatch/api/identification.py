@@ -116,8 +116,8 @@ def identify(
         input: names of the inputs, none, one or several; None: those of the process.
         validate: record to validate on; all of `record` is then fitted.
         settle: number of first held-out rows that may set the state, and are left out of the fits.
-        form: `model` (`arx`, `oe`, `armax`, `bj`, `narx`, `noe`), `order`, `delay`, `scheme`, `recursive`,
-            `forgetting`, `adaptation` and `gain`, like the options of the command.
+        form: `model` (`arx`, `oe`, `armax`, `bj`, `narx`, `noe`), `order`, `delay`, `recursive`
+            and `forgetting`, like the options of the command.
 
     Raises:
         InputError: a signal is missing, the record cannot determine the model, or `form` has another name.

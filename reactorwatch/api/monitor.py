@@ -1,11 +1,13 @@
 """A monitor that is fed from Python."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from math import isfinite
 from typing import Any
 
 import msgspec
+from google.protobuf.message import Message
 
+from monitor_node.alarms.alarms import suspect_messages
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor as MonitorCore
 from monitor_node.diagnosis_worker import find_deviations
@@ -15,8 +17,10 @@ from reactorwatch.api.rows import iterate_rows
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import priority_word
 from reactorwatch.contract.codec import Publication, encode
-from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, Incident, Quality, Sample
+from reactorwatch.contract.messages_pb2 import Suspect as SuspectMessage
 from reactorwatch.description.find import find_process
+from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_minutes, to_time_ns
 from reactorwatch.runtime.config import section
@@ -45,7 +49,8 @@ class AlarmChange(msgspec.Struct, frozen=True):
     Attributes:
         time_min: time of the row that caused it, in minutes.
         alarm: name of the alarm, `chart/signal`.
-        event: `raised`, `cleared`, `suspects` and others, see `docs/alarms.md`.
+        event: `raised`, `cleared`, `suspected` (new suspects of the incident of this alarm) and others, see
+            `docs/alarms.md`.
         priority: `low`, `medium`, `high` or `critical`.
         text: a sentence for people.
         suspect: likely causes, the likeliest first.
@@ -76,11 +81,12 @@ class Monitor:
     """
 
     def __init__(self, process: ProcessLike | None = None, **settings: Any) -> None:
-        config = monitor_settings(settings)
-        named = load_process(config) if process is None else watch_process(config, find_process(process, on_bus=True))
-        self._config, model = named
+        described = None if process is None else find_process(process, on_bus=True)
+        config = monitor_settings(settings, described)
+        self._config, model = load_process(config) if described is None else watch_process(config, described)
         self._core = MonitorCore(self._config, 0, points=False, model=model, diagnose=find_deviations)
         self._rows = 0
+        self._suspects = self._newest_suspects()
 
     @property
     def phase(self) -> str:
@@ -111,7 +117,7 @@ class Monitor:
             )
             message = encode(Publication(keys.key(self._config.plant, keys.SAMPLE, signal), sample))
             published = (item.message for item in self._core.on_message(message, time_ns))
-            changes += [_change(item) for item in published if isinstance(item, Alarm)]
+            changes += [change for item in published if (change := self._change(item)) is not None]
         self._rows += 1
         return changes
 
@@ -145,19 +151,36 @@ class Monitor:
             raise InputError(f"the state of a monitor cannot be read: {error}") from error
         self._core.from_bytes(core)
         self._rows = rows
+        self._suspects = self._newest_suspects()
+
+    def _newest_suspects(self) -> dict[int, list[SuspectMessage]]:
+        """Suspects of the incidents that may change, by number."""
+        return {item.number: suspect_messages(item.suspects) for item in self._core.alarms.memory.incidents}
+
+    def _change(self, message: Message) -> AlarmChange | None:
+        """Change of an alarm, or new suspects of an incident at its first-out alarm; None for another message."""
+        if isinstance(message, Alarm):
+            return _alarm_change(message, message.event, message.suspects)
+        if not isinstance(message, Incident) or message.suspects == self._suspects.get(message.number, []):
+            return None
+        self._suspects = self._newest_suspects()
+        return _alarm_change(self._core.alarms.alarm(message.alarms[0]), "suspected", message.suspects)
 
 
-def _change(alarm: Alarm) -> AlarmChange:
-    suspects = [Suspect(item.cause, item.probability, item.text) for item in alarm.suspects]
-    return AlarmChange(
-        to_minutes(alarm.time_ns), alarm.alarm, alarm.event, priority_word(alarm.priority), alarm.text, suspects
-    )
+def _alarm_change(alarm: Alarm, event: str, suspects: Iterable[SuspectMessage]) -> AlarmChange:
+    causes = [Suspect(item.cause, item.probability, item.text) for item in suspects]
+    return AlarmChange(to_minutes(alarm.time_ns), alarm.alarm, event, priority_word(alarm.priority), alarm.text, causes)
 
 
-def monitor_settings(settings: Mapping[str, Any]) -> MonitorConfig:
+def monitor_settings(settings: Mapping[str, Any], process: Process | None = None) -> MonitorConfig:
     """The monitor's settings.
+
+    Args:
+        settings: values by key.
+        process: process whose signals they are about; None: as the settings say.
 
     Raises:
         InputError: an unknown name or a value outside its range.
     """
-    return section(MonitorConfig, "monitor", {}, {"plant": keys.DEFAULT_PLANT} | dict(settings))
+    about = {"plant": keys.DEFAULT_PLANT, **settings} | ({} if process is None else {"process": process.name})
+    return section(MonitorConfig, "monitor", {}, about)

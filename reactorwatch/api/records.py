@@ -180,8 +180,9 @@ def read_record(
             it. None: the one that a recording describes, else the reactor.
         plant: name of the plant in a recording; None: the only one in it.
         columns: names of the columns in a table, by signal, where they differ.
-        form: what is not to be guessed about a table: `time`, `time_unit`, `time_format`, `zone`, `period`, `missing`,
-            `separator`, `decimal`, `header`, `transposed`, like the options of the commands.
+        form: what is not to be guessed about a table: `time`, `time_unit`, `time_format`, `dates`, `zone`, `period`,
+            `missing`, `separator`, `decimal`, `header`, `transposed`, `tag`, `value`, `quality_good`, like the options
+            of the commands.
 
     Returns:
         The record; `read_as` has the guesses about a table.
@@ -193,9 +194,10 @@ def read_record(
     for name in form:
         if name not in known:
             raise InputError(describe_unknown("argument", name, known))
-    missing = form.pop("missing", ())
-    words = (missing,) if isinstance(missing, str | float | int) else missing
-    stated = FileFormat(**form, missing=tuple(map(str, words)))
+    for name in {"missing", "quality_good"} & form.keys():
+        words = (form[name],) if isinstance(form[name], str | float | int) else form[name]
+        form[name] = tuple(map(str, words))
+    stated = FileFormat(**form)
     names = dict(columns or {})
     if hasattr(file, "__arrow_c_stream__") or hasattr(file, "__dataframe__"):
         described = find_process(process or DEFAULT_PROCESS)

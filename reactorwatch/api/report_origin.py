@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
-import reactorwatch
+from reactorwatch.version import this_build
 
 
 def report_origin(file: Path, settings: Mapping[str, object]) -> dict[str, str]:
@@ -18,7 +18,7 @@ def report_origin(file: Path, settings: Mapping[str, object]) -> dict[str, str]:
     chosen = ", ".join(f"{name} {_format(value)}" for name, value in settings.items() if value)
     parts = {
         "made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %z"),
-        "software": f"reactorwatch {reactorwatch.__version__}",
+        "software": f"reactorwatch {this_build()}",
         "file": str(file),
         "SHA-256 of the file": file_hash(file) if file.is_file() else "",
         "settings": chosen or "default",

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 import numpy as np
 
-from plant_node.initial_state import complete_state
 from reactorwatch.api.record_view import plot_record, record_html
 from reactorwatch.api.records import ProcessLike, Record, measured_fields, model_of, process_of
 from reactorwatch.arrays import Array
@@ -18,8 +17,10 @@ from reactorwatch.errors import InputError
 from reactorwatch.notebook import html
 from reactorwatch.process import named_effects
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.law import laws_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
+from reactorwatch.process.steady_state import complete_state
 from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.record import join_runs
 
@@ -157,7 +158,8 @@ def _simulate_run(
             f"{measured.name}: {names} must be there in every row, it is missing at {measured.time_min[row]:g} min"
         )
     if measured.rows == 1 and not alone:
-        return replace(measured, columns={name: measured.columns[name] for name in (*model.input_names, *first)})
+        columns = {name: measured.columns[name] for name in (*model.input_names, *first)}
+        return replace(measured, columns=columns, excluded={})
     start, simulator = complete_state(model, first, inputs[0], float(measured.time_min[0])), Simulator(model)
     try:
         if settle:
@@ -167,7 +169,7 @@ def _simulate_run(
         raise InputError(f"{measured.name}: {error}") from error
     columns = {name: inputs[:, index] for index, name in enumerate(model.input_names)}
     columns |= {name: trajectory.outputs[:, index] for index, name in enumerate(model.output_names)}
-    return replace(measured, columns=columns)
+    return replace(measured, columns=columns, excluded={})
 
 
 def _fit_start(simulator: Simulator, measured: MeasuredRecord, inputs: Array, start: Array, rows: int) -> Array:
@@ -207,7 +209,7 @@ def report(
         as_json: format as a JSON object.
     """
     rmse = root_mean_squares(measured, simulated, model, settle)
-    remarks = [sentence for law in model.laws for sentence in law.outside(simulated.columns)]
+    remarks = [sentence for law in laws_of(model) for sentence in law.outside(simulated.columns)]
     if as_json:
         result = {
             "file": None if out is None else str(out),

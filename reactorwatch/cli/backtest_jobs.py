@@ -8,16 +8,23 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
 
 from monitor_node.config import DEFAULT, DEFAULT_TRAINING_ROWS, MonitorConfig
-from monitor_node.replay.backtest import Backtest, TrainedPlant, run, train
-from monitor_node.replay.record_checks import check_training_record
-from monitor_node.replay.report_watch import watch
-from monitor_node.replay.row_log import LoggedRow, RowLog, rows_of_file
+from monitor_node.replay.backtest import (
+    Backtest,
+    LoggedRow,
+    RowLog,
+    TrainedPlant,
+    check_training_record,
+    check_watched,
+    rows_of_file,
+    run,
+    train,
+)
 from monitor_node.watched_process import WatchedProcess, limit_training, load_process, watch_process
+from reactorwatch.api.alarm_lines import group_by_cause
 from reactorwatch.api.backtest_report import backtest_object, backtest_text
-from reactorwatch.api.files import MessageSource, open_messages, record, resolve_plant
+from reactorwatch.api.files import MessageSource, open_messages, resolve_plant
 from reactorwatch.cli.batch import FileOptions, Job, JobKind, JobResult, Row, as_table
 from reactorwatch.cli.options import check_recording
 from reactorwatch.cli.printing import json_line
@@ -27,14 +34,13 @@ from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import DEFAULT_PROCESS
 from reactorwatch.description.process import Process
-from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.errors import prefix_errors
 from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.cells import quote_formula
 from reactorwatch.records.record import to_minutes, to_time_ns
 
 ROWS_FOR_TRAINING = 3 * DEFAULT_TRAINING_ROWS
 """Rows that are counted to find a third of a record; of a longer one the training is not limited."""
-
-SCHEMES = MONITOR_SCHEME, REPORT_SCHEME = ("monitor", "report")
 
 LOG_COLUMNS = ("file", "row", "time_min", "in_alarm", "raised")
 
@@ -46,20 +52,14 @@ class BacktestOptions(FileOptions):
     Attributes:
         settings: settings of the monitor, except the plant, which the file may name.
         log_rows: return the rows with their alarms.
-        scheme: `monitor`, or `report` for the scheme of the original report.
         is_one_of_many: name the file in the result, because there are others.
         trained: result of a training on another file; None: each file begins with a training.
     """
 
     settings: MonitorConfig
     log_rows: bool = False
-    scheme: str = MONITOR_SCHEME
     is_one_of_many: bool = False
     trained: TrainedPlant | None = None
-
-    def __post_init__(self) -> None:
-        if self.scheme not in SCHEMES:
-            raise InputError(f"--scheme: {describe_unknown('scheme', self.scheme, SCHEMES)}")
 
 
 class RowsOfFile(NamedTuple):
@@ -112,11 +112,9 @@ def train_on(file: Path, asked: BacktestOptions) -> TrainedPlant:
         InputError: as `run_job`; or the file has too few rows, or no output that can be watched.
     """
     opened = _open(file, asked, learns=True)
-    try:
+    with prefix_errors(f"--train {file}"):
         config, model = opened.watched
         return train(opened.source.messages, config, opened.source.zero_ns or 0, model)
-    except InputError as error:
-        raise InputError(f"--train {file}: {error}") from error
 
 
 def run_job(job: Job[BacktestOptions]) -> JobResult:
@@ -129,12 +127,9 @@ def run_job(job: Job[BacktestOptions]) -> JobResult:
     opened = _open(job.at, asked, learns=asked.trained is None)
     source, (config, model) = opened.source, opened.watched
     first, log = FirstSamples(config.plant), RowLog() if asked.log_rows else None
-    if asked.scheme == REPORT_SCHEME:
-        result = _watch_by_report(job, opened, log)
-    else:
-        result = run(first.collect_samples(source.messages), config, source.zero_ns or 0, model, asked.trained, log)
+    result = run(first.collect_samples(source.messages), config, source.zero_ns or 0, model, asked.trained, log)
     result.left_out = opened.still | result.left_out
-    _check_watched(job.at, result)
+    check_watched(job.at, result)
     zero_ns = result.first_ns if source.zero_ns is None else source.zero_ns
     zero = source.zero(result.first_ns)
     found = backtest_object(result, zero_ns, zero, is_trained=asked.trained is not None)
@@ -146,27 +141,13 @@ def run_job(job: Job[BacktestOptions]) -> JobResult:
     if opened.process is None or model is not None:
         remarks += filter(None, [first.unit_remark(model or DEFAULT.require_model())])
     logged = None if log is None else RowsOfFile(job.file, _logged_rows(log, source, zero_ns), zero_ns)
-    return JobResult(text, _row(job.file, found), remark="; ".join(remarks), extra=logged)
-
-
-def _watch_by_report(job: Job[BacktestOptions], opened: _Opened, log: RowLog | None) -> Backtest:
-    """Watch a file by the scheme of the original report."""
-    config = opened.watched[0]
-    measured = record(job.at, job.asked.plant, job.asked.columns, opened.process, job.asked.stated)
-    if measured.runs is not None:
-        raise InputError(f"{job.at}: the report's scheme needs one run, {measured.describe_runs()}; cut one out of it")
-    length, minutes = config.training_length, measured.time_min
-    rows = length.rows or int(np.searchsorted(minutes, minutes[0] + (length.minutes or 0.0) - 1e-9))
-    return watch(measured, config.inputs, config.outputs, rows, measured.zero_ns, log)
-
-
-def _check_watched(file: Path, result: Backtest) -> None:
-    if not result.rows:
-        why = ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items()))
-        raise InputError(f"{file}: holds no sample that can be used{f'; refused: {why}' if why else ''}")
-    if set(result.outputs) <= result.left_out.keys():
-        reasons = "; ".join(f"{name}: {result.left_out[name]}" for name in result.outputs)
-        raise InputError(f"{file}: there is no output to watch ({reasons})")
+    return JobResult(
+        text,
+        _row(job.file, found, result, zero_ns),
+        remark="; ".join(remarks),
+        not_watched=result.not_watched,
+        extra=logged,
+    )
 
 
 def _open(file: Path, asked: BacktestOptions, *, learns: bool) -> _Opened:
@@ -230,23 +211,28 @@ def write_rows(path: Path, files: Sequence[RowsOfFile]) -> None:
         for file in files:
             for number, row in enumerate(file.rows):
                 minutes = repr(to_minutes(row.time_ns, file.zero_ns))
-                writer.writerow((str(file.file), number, minutes, int(row.in_alarm), int(row.raised)))
+                writer.writerow((quote_formula(str(file.file)), number, minutes, int(row.in_alarm), int(row.raised)))
 
 
-_COLUMNS = ("samples", "span_min", "trained_until_min", "expected_false_alarms")
+_COLUMNS = ("samples", "span_min", "trained_until_min", "expected_false_alarms", "trustworthy")
 _OF_ALARMS = ("alarms", "first_alarm", "first_alarm_min", "suspect")
 
 
-def _row(file: Path, found: dict[str, Any]) -> Row:
-    alarms = found["alarms"]
-    suspects = [item["suspect"][0]["cause"] for item in alarms if item["suspect"]]
-    first = alarms[0] if alarms else {"alarm": None, "raised_min": None}
-    of_alarms = (len(alarms), first["alarm"], first["raised_min"], suspects[0] if suspects else None)
+def _row(file: Path, found: dict[str, Any], result: Backtest, zero_ns: int) -> Row:
+    """Row of a file; the first alarm and the suspect are those of the largest incident."""
+    found = found | {"trustworthy": result.promise and result.promise.kept}
+    of_alarms: tuple[Any, ...] = (0, None, None, None)
+    for largest, *_ in group_by_cause(result.raised_alarms)[:1]:
+        first = largest.raised[0][0]
+        suspect = largest.suspect or next(iter(first.suspects), None)
+        cause = None if suspect is None else suspect.cause
+        of_alarms = (len(result.raised_alarms), first.alarm, to_minutes(first.raised_ns, zero_ns), cause)
     return {
         "file": str(file),
+        "watched": found["watched"],
         **{name: found[name] for name in _COLUMNS},
         **dict(zip(_OF_ALARMS, of_alarms, strict=True)),
-        "error": None,
+        "error": found["why"],
     }
 
 
@@ -255,16 +241,18 @@ def _summary(rows: Sequence[Row]) -> str:
     lines = [
         {
             "file": row["file"],
-            "alarms": "failed" if row["error"] else str(row["alarms"]),
+            "alarms": str(row["alarms"]) if row["watched"] else "failed" if row["watched"] is None else "not watched",
+            "but": "not trustworthy yet" if row["watched"] and row["trustworthy"] is False else "",
             "first": row["first_alarm"] or "",
             "at": "" if row["first_alarm_min"] is None else f"{row['first_alarm_min']:g} min",
             "suspect": row["suspect"] or "",
         }
         for row in rows
     ]
-    failed = sum(bool(row["error"]) for row in rows)
-    alarmed = sum(bool(row["alarms"]) for row in rows)
-    counts = f"{alarmed} with alarms, {len(rows) - failed - alarmed} without, {failed} failed"
+    failed, unwatched = (sum(row["watched"] is state for row in rows) for state in (None, False))
+    alarmed = sum(bool(row["watched"] and row["alarms"]) for row in rows)
+    sound = len(rows) - failed - unwatched - alarmed
+    counts = f"{alarmed} with alarms, {sound} without, {unwatched} not watched, {failed} failed"
     return f"{as_table(lines)}\n\n{len(rows)} files: {counts}"
 
 

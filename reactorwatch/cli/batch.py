@@ -1,7 +1,7 @@
 """Run one job for each of many files, and print the results in the order of the files.
 
-A file that cannot be used costs one line, and an exit code of 2 after the others are done. This process runs the job of
-a single file itself.
+A file that cannot be used costs one line, and an exit code of 2 after the others are done; so does one that holds too
+little to be judged, with an exit code of 3 if no other was judged. This process runs the job of a single file itself.
 """
 
 import csv
@@ -18,15 +18,17 @@ import typer
 
 from reactorwatch.api.files import expand_folder
 from reactorwatch.cli.display import format_rows, print_report
-from reactorwatch.cli.printing import print_lines
+from reactorwatch.cli.printing import json_line, print_lines
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.cells import quote_formula
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.folder import fill_folder
 from reactorwatch.records.input_file import list_files
-from reactorwatch.runtime.parallel.jobs import Failed, choose_executor, in_job_order
+from reactorwatch.runtime.parallel import choose_executor
+from reactorwatch.runtime.parallel.jobs import Failed, in_job_order
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
 
@@ -81,6 +83,7 @@ class JobResult:
         row: row of the summary.
         remark: remark on the file for standard error; empty: none.
         not_written: error of writing the result's files; empty: none.
+        not_watched: reason why no row could be judged; empty: one was.
         extra: what else the command needs of the file.
     """
 
@@ -88,6 +91,7 @@ class JobResult:
     row: Row
     remark: str = ""
     not_written: str = ""
+    not_watched: str = ""
     extra: Any = None
 
 
@@ -98,7 +102,8 @@ class JobKind(Generic[Options]):
     Attributes:
         doing: name of the work, for the progress display.
         work: runs a job.
-        columns: names of a row's results, between `file` and `error`; null for a file that could not be used.
+        columns: names of a row's results, between `watched` and `error`; null for a file that could not be used.
+            `watched` is false for one that holds too little, and null for one that cannot be read.
         summary: formats rows as a table.
     """
 
@@ -174,20 +179,23 @@ def run_jobs(
         out: folder for the summary of several files; None: no folder.
         processes: number of processes; None: one a core.
         scheduler: address of a cluster, or None.
-        on_end: called with the `extra` of the files that could be used, in their order; None: not called.
+        on_end: called with the `extra` of the files that were watched, in their order; None: not called.
 
     Raises:
         InputError: the single file cannot be used, or there are no such workers.
-        typer.Exit: with 2, some of several files could not be used; each has its line.
+        typer.Exit: with 2, some of several files could not be used; with 3, none of them could be watched. Each of
+            these has its line.
     """
     file, as_json = jobs[0].file, jobs[0].asked.as_json
     if len(jobs) == 1 and scheduler is None:
-        with task(f"{kind.doing} {file.name}"):
+        with task(f"{kind.doing} {file.name}"), unfit_lines([file], as_json=as_json):
             result = kind.work(jobs[0])
         print_report(result.text, as_json=as_json)
         write_remark(file, result.remark)
         if result.not_written:
             raise InputError(result.not_written)
+        if result.not_watched:
+            raise UnfitRecordError(f"{file}: {result.not_watched}")
         if on_end is not None:
             on_end([result.extra])
         return
@@ -198,23 +206,44 @@ def run_jobs(
             if isinstance(outcome, Failed):
                 reason = _strip_name(outcome.reason, file)
                 print_lines(f"reactorwatch: {file}: {reason}", err=True)
-                rows.append({"file": str(file), **dict.fromkeys(kind.columns), "error": reason})
+                watched = False if outcome.exit_code == UnfitRecordError.exit_code else None
+                if as_json and watched is False:
+                    print_unfit(file, reason)
+                rows.append({"file": str(file), "watched": watched, **dict.fromkeys(kind.columns), "error": reason})
             else:
                 print_report(outcome.text, as_json=as_json)
                 write_remark(file, outcome.remark)
-                if outcome.not_written:
-                    print_lines(f"reactorwatch: {file}: {outcome.not_written}", err=True)
+                if problem := outcome.not_written or outcome.not_watched:
+                    print_lines(f"reactorwatch: {file}: {problem}", err=True)
                 rows.append(outcome.row)
-                extras.append(outcome.extra)
-    failed = sum(bool(row["error"]) for row in rows)
+                if not outcome.not_watched:
+                    extras.append(outcome.extra)
     if len(rows) > 1 and not as_json:
         print_report(f"\n{kind.summary(rows)}")
-    if len(rows) > 1 and out is not None and failed < len(rows):
+    if len(rows) > 1 and out is not None and _count_failed(rows) < len(rows):
         write_summary(out, rows)
     if on_end is not None and extras:
         on_end(extras)
-    if failed:
-        raise typer.Exit(2)
+    if _count_failed(rows):
+        raise typer.Exit(InputError.exit_code)
+    if not any(row["watched"] for row in rows):
+        raise typer.Exit(UnfitRecordError.exit_code)
+
+
+@contextmanager
+def unfit_lines(files: Sequence[Path], *, as_json: bool) -> Generator[None]:
+    """Print an object for each file where a record holds too little for all of them, as for a JSON reader."""
+    try:
+        yield
+    except UnfitRecordError as error:
+        for file in files if as_json else ():
+            print_unfit(file, _strip_name(str(error), file))
+        raise
+
+
+def print_unfit(file: Path, why: str) -> None:
+    """Print the object of a file that was not watched, diagnosed or identified."""
+    print_report(json_line({"file": str(file), "watched": False, "why": why}), as_json=True)
 
 
 @contextmanager
@@ -265,17 +294,25 @@ def _strip_name(reason: str, file: Path) -> str:
     return reason
 
 
+def _count_failed(rows: Sequence[Row]) -> int:
+    """Number of files with an error, without those that hold too little to be judged."""
+    return sum(bool(row["error"]) and row["watched"] is not False for row in rows)
+
+
 def write_summary(folder: Path, rows: Sequence[Row]) -> None:
     """Write `summary.json` and `summary.csv`.
 
     Raises:
         InputError: the folder cannot be made or written to.
     """
-    summary = {"files": len(rows), "failed": sum(bool(row["error"]) for row in rows), "results": list(rows)}
+    unwatched = sum(row["watched"] is False for row in rows)
+    summary = {"files": len(rows), "failed": _count_failed(rows), "not_watched": unwatched, "results": list(rows)}
     table = io.StringIO()
     writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows(
+        {name: quote_formula(value) if isinstance(value, str) else value for name, value in row.items()} for row in rows
+    )
     content = {SUMMARY_OBJECT: msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n"}
     content[SUMMARY_TABLE] = table.getvalue().encode()
     with fill_folder(folder) as temporary:

@@ -22,6 +22,7 @@ def causes(
     table: TableOptions,
 ) -> None:
     """Show which causes the sensors distinguish, and from which size on each is seen."""
+    from plant_node.config import resolutions
     from reactorwatch.api.files import record_of_process
     from reactorwatch.cli.causes_report import as_json_text, as_matrix
     from reactorwatch.cli.progress import task
@@ -34,7 +35,7 @@ def causes(
     if record is None:
         described = choice.load()
         model = described.require_model()
-        measured = excite(model)
+        measured = excite(model, resolutions(described))
     else:
         path, columns = check_recording(record), parse_columns(column)
         measured, described = record_of_process(path, plant, columns, choice, table.stated)

@@ -25,7 +25,7 @@ def send_command(node: str, client: ClientOptions, name: str, message: "Message"
     """Send a command to a node and return its reply.
 
     Args:
-        node: `monitor`, `recorder` or `replay`: the node named in errors, whose settings name the plant.
+        node: `monitor` or `recorder`: the node named in errors, whose settings name the plant.
         client: where it is sent; without a plant, to that of the settings, else `cstr`.
         name: name of the command.
         message: message of the command.

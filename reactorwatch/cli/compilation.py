@@ -15,8 +15,7 @@ TRAINING_MIN = 15.0
 def compile_kernels() -> None:
     """Compile the numerical kernels once, so that no first start has to: half a minute on a new machine."""
     from monitor_node.config import MonitorConfig
-    from monitor_node.fleet.plant_kinds import ANY, PlantKind
-    from monitor_node.fleet.watched_plants import WatchedPlants
+    from monitor_node.fleet.monitor import ANY, PlantKind, prepare
     from monitor_node.replay import backtest
     from plant_node.config import PlantConfig
     from plant_node.record import simulate_record
@@ -31,5 +30,5 @@ def compile_kernels() -> None:
         for reference in ("auto", "black-box", "arx"):
             config = MonitorConfig(training_min=TRAINING_MIN, reference=reference)
             backtest.run(map(encode, samples_of(record, config.plant)), config)
-        WatchedPlants([PlantKind(ANY, MonitorConfig(), None)], 0, points=False).prepare()
+        prepare([PlantKind(ANY, MonitorConfig(), None)], points=False)
         diagnose(record, cstr())

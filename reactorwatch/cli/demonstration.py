@@ -5,7 +5,6 @@ the alarms, a comparison with the alarms of a back-test, value for value, and a 
 """
 
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,7 +30,7 @@ from reactorwatch.cli.run_progress import POLL_S, RunProgress
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.contract.codec import Encoded, decode
-from reactorwatch.contract.messages_pb2 import Alarm, Fault, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, Fault, Incident, Sample
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.diagnosis.result import NAMED, Diagnosis
@@ -43,12 +42,13 @@ from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import section
+from reactorwatch.runtime.crash import INTERRUPTED
 from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.terminal import printable_lines
 from recorder.config import RecorderConfig
-from recorder.policy.own_alarms import DISK_ALARM
+from recorder.core import DISK_ALARM
 
 PLANT = "demo"
 NODES = ("recorder", "monitor", "plant")
@@ -90,8 +90,8 @@ def run(flags: dict[str, Any], fault: str | None, out: Path | None, site: Path |
         site: folder of a site, for its router and the nodes' certificates; None: without TLS.
 
     Returns:
-        0 if alarms were raised after the fault and not before, and the back-test agreed; 1 if not; 130 if it was
-        stopped.
+        0 if alarms were raised after the fault and not before, and the back-test agreed; 1 if not; 130 if Ctrl-C
+        stopped it, and 0 if SIGTERM or SIGHUP did.
 
     Raises:
         InputError: invalid arguments, or a node that failed.
@@ -118,10 +118,10 @@ def run(flags: dict[str, Any], fault: str | None, out: Path | None, site: Path |
         tables = {"plant": plant, "monitor": monitor}
         settings = write_node_settings(folder / SETTINGS_FILE, restrict_to_plant(recorder, site), tables, join, NODES)
         print_lines(f"to see it as it runs: reactorwatch view --web --config {folder / SETTINGS_FILE}", err=True)
-        with stop_on_signals() as stop:
+        with stop_on_signals(is_supervisor=True) as stop:
             if not _run_nodes(bus, stop, settings, folder, plant, process.name):
                 print_lines(f"stopped; what was recorded until then is in {folder}", err=True)
-                return 130
+                return INTERRUPTED if stop.interrupted else 0
     return _conclude(folder, recording, monitor, injected)
 
 
@@ -136,8 +136,6 @@ def _run_nodes(
     bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folder: Path, plant: PlantConfig, process: str
 ) -> bool:
     """Run the nodes until the plant has finished; returns False if a signal stopped it before."""
-    woken = threading.Event()
-    stop.call_on_set(woken.set)
     assert plant.rows is not None, "a demonstration has an end"
     duration_min = plant.rows * plant.period_min
     progress = RunProgress(bus, PLANT, to_time_ns((plant.rows - 1) * plant.period_min))
@@ -153,7 +151,7 @@ def _run_nodes(
         for node in NODES:
             processes.start(node)
         started = time.monotonic()
-        while not woken.wait(POLL_S):
+        while not stop.wait(POLL_S):
             if not unwritten.empty():
                 break
             ended = processes.exit_codes()
@@ -166,7 +164,7 @@ def _run_nodes(
             if not progress.started and time.monotonic() - started > START_WITHIN_S:
                 raise InputError(f"no sample within {START_WITHIN_S:g} s of the start; see the .log files in {folder}")
             advance(progress.plant_min, "starting the nodes" if not progress.started else f"running {process}")
-        progress.wait_until_evaluated(lambda seconds: woken.wait(seconds) or stop.is_set or not unwritten.empty())
+        progress.wait_until_evaluated(lambda seconds: stop.wait(seconds) or not unwritten.empty())
         ended = processes.stop(("plant", "monitor", "recorder"))
     if not unwritten.empty():
         raise InputError(f"{folder} is not complete: {unwritten.get()}; make room, and run it again")
@@ -190,11 +188,11 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, DiagnosisOptions, load_case, write_report
     from reactorwatch.diagnosis.report.words import describe_verdict
     from recorder.columns.run_reader import read_segments
-    from recorder.dashboard.file import write_rrd
+    from recorder.view.file import write_rrd
 
     drawing = recording.with_suffix(".rrd")
     with task("checking"):
-        first_ns, faults, alarms = _events(recording)
+        first_ns, faults, alarms, incidents = _events(recording)
         again = backtest.run(open_messages(recording, PLANT).messages, monitor)
     with task("diagnosing"):
         asked = DiagnosisOptions(plant=PLANT)
@@ -208,7 +206,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         alarm.SerializeToString() for alarm in again.alarm_messages
     ]
     raised = [alarm for alarm in alarms if alarm.event == "raised"]
-    suspected = [alarm for alarm in alarms if alarm.event == "suspected"]
+    suspected = [incident for incident in incidents if incident.suspects]
     onset_ns = min((item.onset_ns for item in faults if item.active), default=None)
     before = [alarm for alarm in raised if onset_ns is None or alarm.time_ns < onset_ns]
     after = [alarm for alarm in raised if onset_ns is not None and alarm.time_ns >= onset_ns]
@@ -236,7 +234,8 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         lines.append("- No alarm was raised after the fault.")
     if suspected:
         last = suspected[-1]
-        late = (last.time_ns - (onset_ns or 0)) / MINUTE_NS
+        named = next(item for item in suspected if item.number == last.number and item.suspects == last.suspects)
+        late = (named.time_ns - (onset_ns or 0)) / MINUTE_NS
         lines.append(f"- Likely cause, {late:.1f} min after the fault: {suspects_text(last.suspects, first_ns)}.")
     lines.append(
         "- False alarms before the fault: "
@@ -291,10 +290,10 @@ def _program(name: str) -> str:
     return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
 
 
-def _events(recording: Path) -> tuple[int, list[Fault], list[Alarm]]:
+def _events(recording: Path) -> tuple[int, list[Fault], list[Alarm], list[Incident]]:
     first_ns: int | None = None
     faults: list[Fault] = []
-    alarms: list[Alarm] = []
+    alarms, incidents = list[Alarm](), list[Incident]()
     for message in open_messages(recording, PLANT).messages:
         body = decode(message.payload, message.encoding)
         if isinstance(body, Sample):
@@ -303,6 +302,8 @@ def _events(recording: Path) -> tuple[int, list[Fault], list[Alarm]]:
             faults.append(body)
         elif isinstance(body, Alarm):
             alarms.append(body)
+        elif isinstance(body, Incident):
+            incidents.append(body)
     if first_ns is None:
         raise InputError(f"{recording}: holds no sample")
-    return first_ns, faults, alarms
+    return first_ns, faults, alarms, incidents

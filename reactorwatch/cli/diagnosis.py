@@ -16,6 +16,7 @@ from reactorwatch.diagnosis.parameter_priors import parse_priors
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import report_object
 from reactorwatch.diagnosis.result import Experiment
+from reactorwatch.errors import UnfitRecordError
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import fill_folder
 from reactorwatch.records.record import Record
@@ -58,7 +59,7 @@ def load_case(file: Path, asked: DiagnosisOptions) -> Case:
     measured, process = record_of_process(
         check_recording(file), asked.plant, asked.columns, asked.process, asked.stated
     )
-    model = process.require_model()
+    model = process.require_model(UnfitRecordError)
     priors = {} if asked.uncertain is None else parse_priors(asked.uncertain, model)
     make_run(measured, model)
     return Case(measured, process, process.select_causes(asked.without), process.uncertain | priors)

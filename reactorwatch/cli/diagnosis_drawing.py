@@ -11,8 +11,8 @@ from reactorwatch.diagnosis.report.pictures import interval
 from reactorwatch.diagnosis.result import SD_95, Curves, Diagnosis
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record, to_time_ns
-from recorder.dashboard.file import DIAGNOSIS, write_views
 from recorder.panels.base import ALARM, INPUT, LIMIT, MEASURED, PREDICTED, Colour, Series, TimePlot
+from recorder.view.file import DIAGNOSIS, write_views
 
 
 def write_drawing(diagnosis: Diagnosis, model: ProcessModel, measured: Record, path: Path) -> None:

@@ -17,7 +17,7 @@ from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.diagnosis.report.machine import as_object
 from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import Cause
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.records.output import check_output_folder
 from reactorwatch.records.source_text import is_table
 
@@ -82,7 +82,7 @@ def run_job(job: Job[DiagnosisOptions]) -> JobResult:
 
 def _check(asked: DiagnosisOptions) -> None:
     process = asked.process.load()
-    model = process.require_model()
+    model = process.require_model(UnfitRecordError)
     process.select_causes(asked.without)
     if asked.uncertain is not None:
         parse_priors(asked.uncertain, model)
@@ -104,7 +104,7 @@ _COLUMNS = ("samples", "span_min", "seconds", "verdict", "causes", "location", "
 
 def _row(report: dict[str, Any], found: DiagnosisResult) -> Row:
     row = report | {"causes": " + ".join(map(_fault_text, found.causes)), "delta_bic": report["gain"]["delta_bic"]}
-    return {name: row[name] for name in ("file", *_COLUMNS)}
+    return {"file": row["file"], "watched": True} | {name: row[name] for name in _COLUMNS}
 
 
 def _fault_text(cause: Cause) -> str:
@@ -135,7 +135,7 @@ def _summary(rows: Sequence[Row]) -> str:
     lines = [
         {
             "file": row["file"],
-            "verdict": row["verdict"] or "failed",
+            "verdict": row["verdict"] or ("failed" if row["watched"] is None else "not diagnosed"),
             "causes": row["causes"] or "",
             "matters": "yes" if row["practical"] else "",
             "delta BIC": "" if row["delta_bic"] is None else f"{row['delta_bic']:,.0f}",

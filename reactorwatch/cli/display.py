@@ -28,9 +28,9 @@ _COLUMNS = re.compile(r"\S {3,}\S")
 _MEANINGS = (
     (r"^(?:The simulation is right|no alarms|no gaps|nothing was damaged)(?s:.*)$", RIGHT),
     (r"the same alarms, value for value", RIGHT),
-    (r"^(?:Detected|The simulation is wrong)\b(?s:.*)$", STRONG),
+    (r"^(?:Detected|Raised|The simulation is wrong)\b(?s:.*)$", STRONG),
     (r"\((?:critical|high)\)|OTHER ALARMS|\bfailed\b", WRONG),
-    (r"\(medium\)|^\s*note: |is not watched", ATTENTION),
+    (r"\(medium\)|^\s*note: |is not watched|^(?:not trustworthy yet|nothing was watched): ", ATTENTION),
     (r"(?<=cause named: )[^,\n]+|(?<=suspect: )[^\n]+", CAUSE),
 )
 """Styles of what a report states, by pattern."""

@@ -17,8 +17,7 @@ from typing import NamedTuple
 
 from cryptography.exceptions import InvalidSignature
 
-from monitor_node.health.other_monitors import OtherMonitors
-from reactorwatch import __version__
+from monitor_node.health import OtherMonitors
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
@@ -26,6 +25,7 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.security.acl import Role, kinds_of, parse_common_name
 from reactorwatch.runtime.security.certificates import read_certificate, read_common_name, read_key
+from reactorwatch.version import version
 
 RENEW_DAYS = 30
 MAX_OFFSET_S = 1.0
@@ -245,14 +245,14 @@ def _check_nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Findin
             yield _check_node(node, *reports[node])
     if (monitors := listener.monitors.count(plant)) > 1:
         found = f"{monitors} of them watch {plant}: every alarm is raised as often"
-        yield Finding("monitors", found, "stop all but one; for a stand-by, start both with the same --plants")
+        yield Finding("monitors", found, "stop all but one")
 
 
 def _check_node(node: str, health: Health, offset_s: float) -> Finding:
     found = f"{health.phase}, version {health.version}, its clock {offset_s:+.3f} s from this one"
-    cures = []
-    if health.version != __version__:
-        cures.append(f"install the same version as here, {__version__}")
+    cures = [f"mend what it waits for: {health.waiting_for}"] if health.waiting_for else []
+    if health.version != version():
+        cures.append(f"install the same version as here, {version()}")
     if abs(offset_s) > MAX_OFFSET_S:
         cures.append("have both machines' clocks set by NTP, as with chrony")
     return Finding(node, found, "; ".join(cures))

@@ -25,7 +25,7 @@ def example(
     """Write a simulated sample record (.csv, .csv.gz, .xlsx or .parquet), its truth in FILE.truth.json."""
     import msgspec
 
-    from plant_node.examples import EXAMPLES, make_example
+    from plant_node.record import EXAMPLES, make_example
     from reactorwatch.cli.progress import task
     from reactorwatch.records.atomic import atomic_write
     from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table

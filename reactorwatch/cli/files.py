@@ -20,7 +20,6 @@ from reactorwatch.cli.options import (
 )
 from reactorwatch.cli.printing import print_lines, print_text
 from reactorwatch.errors import InputError
-from reactorwatch.records.output import check_output_folder
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record
@@ -38,7 +37,6 @@ def dashboard(
     diagnosis: Annotated[
         Path | None, Option(help="The report of a diagnosis of it (a folder), drawn into a tab.")
     ] = None,
-    png: Annotated[Path | None, Option(help="A folder for a picture of each tab, without a screen.")] = None,
     force: Force = False,
     table: TableOptions,
 ) -> None:
@@ -47,26 +45,18 @@ def dashboard(
     from reactorwatch.cli.diagnosis import DRAWING
     from reactorwatch.cli.progress import task
     from recorder.columns.run_reader import read_segments
-    from recorder.dashboard.file import write_rrd
-    from recorder.dashboard.picture import picture_names, render_tabs
+    from recorder.view.file import write_rrd
 
     choice = chosen.choose()
     drawn = diagnosis / DRAWING if diagnosis is not None else None
     out = check_output(out, ".rrd", (file, drawn, choice.file), force=force)
     if drawn is not None and not drawn.is_file():
         raise InputError(f"--diagnosis {diagnosis}: holds no {DRAWING}; it must be the folder that diagnose -o wrote")
-    if png is not None:
-        check_output_folder(png, picture_names(), (file, choice.file), option="--png", force=force)
     with task(f"drawing {file.name}"):
         recording = open_messages(check_recording(file), plant, stated=table.stated, choice=choice)
         run = read_segments(recording.messages, given_zero_ns=recording.zero_ns, process=recording.process)
         write_rrd(_check_samples(run, file), out, diagnosis=drawn)
     print_lines(f"wrote {out}", *([f"note: read as: {recording.read_as}"] if recording.read_as else []))
-    if png is not None:
-        with task("rendering"):
-            pictures = render_tabs(out, png)
-        for picture in pictures:
-            print_lines(f"wrote {picture}")
 
 
 def _check_samples(runs: "Iterable[RunColumns]", file: Path) -> "Iterator[RunColumns]":
@@ -130,4 +120,12 @@ def export_csv(
 
 
 def _report_text(out: Path, record: "Record") -> str:
-    return "\n".join([f"wrote {out}: {record.rows} rows", *(f"note: {remark}" for remark in record.remarks)])
+    from reactorwatch.records.cells import quote_formula
+
+    remarks, quoted = list(record.remarks), [name for name in record.columns if quote_formula(name) != name]
+    if quoted and out.suffix.lower() in (".csv", ".gz"):
+        remarks.append(
+            f"a spreadsheet would take {quoted[0]!r} for a formula, so a quote stands before it, which is "
+            "left out when the file is read here"
+        )
+    return "\n".join([f"wrote {out}: {record.rows} rows", *(f"note: {remark}" for remark in remarks)])

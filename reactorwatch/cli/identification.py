@@ -10,7 +10,6 @@ from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.dataset import Dataset
-from reactorwatch.identification.families import LINEAR_FAMILIES, Family
 from reactorwatch.identification.identify import Coefficients, Identification, ModelForm, identify
 from reactorwatch.identification.selection import Selection, select
 from reactorwatch.records.record import Record
@@ -89,25 +88,20 @@ def compare(
     outputs: Sequence[str],
     form: ModelForm,
     *,
-    neural: bool,
     as_json: bool,
 ) -> str:
     """Compare every family at every order up to that of the form, and format the choice for each output.
 
     Raises:
-        InputError: as `fit`, or the extra for neural networks is not installed.
+        InputError: as `fit`.
     """
-    families: list[Family] = [*LINEAR_FAMILIES]
-    if neural:
-        from reactorwatch.identification.neural import Neural
-
-        families.append(Neural())
     if form.order < 1:
         raise InputError(f"order must be at least 1, got {form.order}")
     orders, texts = range(1, form.order + 1), []
     for output in outputs:
-        u, y, time = Dataset.of_record(measured, inputs, output).arrays
-        selection = select(u, y, time, families=families, orders=orders, delay=form.delay)
+        data = Dataset.of_record(measured, inputs, output)
+        data.split(data.rows // 2)[0].check_movement()
+        selection = select(*data.arrays, orders=orders, delay=form.delay)
         text = f"{selection.table()}\n\n{selection.reason}"
         heading = f"{output}\n" if len(outputs) > 1 else ""
         texts.append(_selection_json(selection, output) if as_json else f"{heading}{text}")

@@ -8,11 +8,11 @@ Only the imports for `--help` are here; each command imports its own when it is 
 import gc
 import os
 import sys
+from pathlib import Path
 from typing import cast
 
 import typer
 
-from reactorwatch import __version__
 from reactorwatch.cli import (
     alarm,
     baseline,
@@ -23,7 +23,6 @@ from reactorwatch.cli import (
     files,
     models,
     nodes,
-    playback,
     recordings,
     runs,
     site,
@@ -34,6 +33,7 @@ from reactorwatch.cli.interrupt import clear_interrupt, raise_until_handled
 from reactorwatch.cli.option_groups import Command, add_commands
 from reactorwatch.cli.printing import print_lines
 from reactorwatch.runtime.crash import INTERRUPTED, UNUSABLE, guard, print_error
+from reactorwatch.version import this_build
 
 # Typer brings a copy of click, or uses the one installed, depending on its version; its errors are one family in both.
 UsageProblem: type[typer.BadParameter] = next(
@@ -41,6 +41,9 @@ UsageProblem: type[typer.BadParameter] = next(
 )
 
 NAME = "reactorwatch"
+
+LIMITS_FILE = "REACTORWATCH_LIMITS"
+"""Environment variable with the path of a settings file whose limits hold, for commands that take no settings."""
 
 app = typer.Typer(
     name=NAME,
@@ -71,19 +74,16 @@ COMMANDS: dict[str, Command] = {
     "recover": recordings.recover,
     "info": recordings.info,
     "cut": recordings.cut,
-    "merge": recordings.merge,
     "simulate": studies.simulate,
     "backtest": studies.backtest,
     "diagnose": studies.diagnose,
     "causes": causes.causes,
     "identify": models.identify,
     "linearise": models.linearise,
-    "reproduce": models.reproduce,
     "compile": compilation.compile_kernels,
 }
 add_commands(app, COMMANDS)
 for name, group, text in (
-    ("playback", playback.playback, "Pause a running replay, step it, or change its rate."),
     ("alarm", alarm.alarms, "List, acknowledge, shelve, suppress or comment the alarms of a plant."),
     ("baseline", baseline.baselines, "Accept, relearn or restore the baseline of a plant."),
     ("charts", charts.charts, "Control charts: how long they run, and which is fastest."),
@@ -93,7 +93,7 @@ for name, group, text in (
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        print_lines(f"reactorwatch {__version__}")
+        print_lines(f"reactorwatch {this_build()}")
         raise typer.Exit
 
 
@@ -119,6 +119,10 @@ def main() -> None:
 
 def _run() -> int:
     try:
+        if LIMITS_FILE in os.environ:
+            from reactorwatch.runtime.config import read_settings
+
+            read_settings(Path(os.environ[LIMITS_FILE]))
         code = app(prog_name=NAME, standalone_mode=False)
         sys.stdout.flush()
     except UsageProblem as error:

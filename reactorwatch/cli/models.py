@@ -1,4 +1,4 @@
-"""Commands for linear models: `identify` from a record, `linearise` from the equations, `reproduce` the study."""
+"""Commands for linear models: `identify` from a record, and `linearise` from the equations."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,14 +9,11 @@ from reactorwatch.cli.display import print_report
 from reactorwatch.cli.option_groups import TableOptions
 from reactorwatch.cli.options import (
     Columns,
-    Force,
     Inputs,
-    Jobs,
     Json,
     Plant,
     Process,
     RecordFile,
-    Scheduler,
     check_recording,
     parse_columns,
     split_names,
@@ -45,26 +42,12 @@ def identify(
     settle: Annotated[
         int, Option(help="Held-out rows that may set the state of the free run, and are left out of fits.")
     ] = 0,
-    recursive: Annotated[bool, Option("--recursive", help="Learn row by row, as the monitor does.")] = False,
+    recursive: Annotated[bool, Option("--recursive", help="Learn arx row by row, as the monitor does.")] = False,
     forgetting: Annotated[
         float, Option(help="With --recursive: weight of a row relative to its successor, in (0, 1].")
     ] = 1.0,
-    adaptation: Annotated[
-        str,
-        Option(
-            help="With --recursive: forgetting (least squares), kalman, gradient (LMS) or normalized-gradient (NLMS); "
-            "the last three of arx."
-        ),
-    ] = "forgetting",
-    gain: Annotated[float | None, Option(help="Of an adaptation other than forgetting.")] = None,
-    scheme: Annotated[
-        str, Option(help="least-squares, or report: as the original report fits (arx and oe).")
-    ] = "least-squares",
     compare: Annotated[
         bool, Option("--compare", help="Compare ARX and OE of orders 1 to --order, and choose.")
-    ] = False,
-    neural: Annotated[
-        bool, Option("--neural", help="With --compare: a neural network too (reactorwatch[neural]).")
     ] = False,
     plant: Plant = None,
     column: Columns = None,
@@ -74,7 +57,7 @@ def identify(
     """Fit models of the outputs to one half, validate them on the other."""
     from reactorwatch.api.files import record
     from reactorwatch.cli import identification
-    from reactorwatch.cli.batch import write_remark
+    from reactorwatch.cli.batch import unfit_lines, write_remark
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.unit_remarks import unit_remark
     from reactorwatch.errors import prefix_errors
@@ -87,9 +70,6 @@ def identify(
         delay,
         recursive=recursive,
         forgetting=forgetting,
-        adaptation=adaptation,
-        gain=gain,
-        scheme=scheme,
     )
     if compare and (validate is not None or settle):
         raise InputError("--compare chooses by the second half of FILE: leave --validate and --settle out")
@@ -100,9 +80,9 @@ def identify(
     assert measured is not None
     equations = described.model
     remark = "" if equations is None else unit_remark(equations, measured.columns, measured.time_min)
-    with task(f"identifying {file.name}"), prefix_errors(file):
+    with task(f"identifying {file.name}"), unfit_lines([file], as_json=as_json), prefix_errors(file):
         if compare:
-            text = identification.compare(measured, described.inputs, outputs, form, neural=neural, as_json=as_json)
+            text = identification.compare(measured, described.inputs, outputs, form, as_json=as_json)
         else:
             text = identification.fit(measured, described.inputs, outputs, form, held_out, settle, as_json=as_json)
     print_report(text, as_json=as_json)
@@ -123,40 +103,3 @@ def linearise(
     from reactorwatch.description.choice import ProcessChoice
 
     print_text(describe(ProcessChoice(process).load().require_model(), levels, step, as_json=as_json))
-
-
-def reproduce(
-    out: Annotated[Path, Option("--out", "-o", help="Folder for study.md and its pictures.")],
-    seed: Annotated[int, Option(help="Of every simulated record.", min=0)] = 1,
-    only: Annotated[str | None, Option(help="Figures by number, such as 7,12 [all].")] = None,
-    file: Annotated[Path | None, Option("--record", help="A record that figures 5, 6, 11 to 16 learn from.")] = None,
-    data: Annotated[
-        Path | None, Option(help="A folder of records of others, for an entry on measured records.")
-    ] = None,
-    plant: Plant = None,
-    column: Columns = None,
-    jobs: Jobs = None,
-    scheduler: Scheduler = None,
-    force: Force = False,
-) -> None:
-    """Draw every figure of the original report (source tree, reactorwatch[pictures])."""
-    from reactorwatch.api.files import record
-
-    try:
-        from benchmarks.study_figures.reproduce import check_out
-        from benchmarks.study_figures.reproduce import reproduce as reproduce_figures
-    except ModuleNotFoundError as error:
-        if not (error.name or "").startswith("benchmarks"):
-            raise
-        raise InputError(
-            "reproduce: the figures of the report are in the source tree, not in the installed package; "
-            "run `make setup` in a clone of the project and use its .venv/bin/reactorwatch"
-        ) from error
-
-    if data is not None and not data.is_dir():
-        raise InputError(f"--data {data}: must be a folder of records, and there is none of that name")
-    check_out(out, only, (file, data), data=data, force=force)
-    measured = record(check_recording(file), plant, parse_columns(column)) if file else None
-    if measured is not None and measured.runs is not None:
-        raise InputError(f"--record {file}: must be one run, {measured.describe_runs()}; cut one run out of it")
-    print_text(reproduce_figures(out, seed, only, measured, data=data, processes=jobs, scheduler=scheduler))

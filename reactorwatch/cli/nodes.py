@@ -108,7 +108,7 @@ def monitor(
     from monitor_node.fleet.config import FleetConfig
     from monitor_node.fleet.node import run as run_fleet
     from reactorwatch.cli.supervise import diagnosis_settings, run_diagnosis_node
-    from reactorwatch.records.folder import make_folder
+    from reactorwatch.records.output import check_folder_name
     from reactorwatch.runtime.config import LogConfig, section
 
     tables, bus = _settings(target)
@@ -120,7 +120,7 @@ def monitor(
     of_fleet = {"plants": plants, "shard": shard, "state": str(state) if state is not None else None}
     fleet = section(FleetConfig, "fleet", tables, of_fleet)
     if state is not None and fleet.plants is None:
-        flags |= {"state_file": str(state / "monitor.state"), "alarm_state_file": str(state / "alarms.state")}
+        flags["state_file"] = str(state / "monitor.state")
     config_of_monitor = section(MonitorConfig, "monitor", tables, flags)
     if fleet.plants is not None:
         state = Path(fleet.state) if fleet.state is not None else None
@@ -130,13 +130,13 @@ def monitor(
     if shard is not None and fleet.plants is None:
         raise InputError("--shard is a part of the plants that --plants names; give both")
     if state is not None:
-        make_folder(state, "--state")
+        check_folder_name(state, "--state")
     if fleet.plants is not None:
         run_fleet(config_of_monitor, fleet, bus, _metrics(tables))
         return
     diagnosis = diagnosis_settings(tables, config_of_monitor, diagnose)
     with run_diagnosis_node(diagnosis, bus, section(LogConfig, "log", tables, {})) if diagnosis.out else nullcontext():
-        run(config_of_monitor, bus, _metrics(tables))
+        run(config_of_monitor, bus, _metrics(tables), **({"state": state} if state is not None else {}))
 
 
 def record(
@@ -186,16 +186,15 @@ def replay(
 ) -> None:
     """Publish a recording or a record as the plant did, or verify a recording.
 
-    While it runs, `playback` pauses, resumes or steps it, or changes its rate; in a terminal, so do the keys space,
-    right, up and down.
+    In a terminal the keys space, right, up and down pause and resume it, step it, and change its rate.
     """
     part = {"--from": begin, "--to": end, "--loop": loop, "--column": column}
     if verify:
         from reactorwatch.cli.verification import run
 
-        given = {"--rate": rate, **part, "--process": chosen.process, "--up": up}
+        given = {"--rate": rate, **part, "--input": chosen.inputs, "--output": chosen.outputs, "--up": up}
         _refuse(given, "--verify publishes nothing and takes the whole recording")
-        raise typer.Exit(run(check_recording(file), target.config, name, as_json=as_json))
+        raise typer.Exit(run(check_recording(file), target.config, name, chosen.process, as_json=as_json))
     if up:
         from reactorwatch.cli.plant_settings import PlayedRecord
         from reactorwatch.cli.supervise import run_until_stopped

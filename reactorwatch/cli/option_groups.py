@@ -26,6 +26,9 @@ class TableOptions:
     time_format: Annotated[
         str | None, Option(help="Format of timestamps, such as '%d.%m.%Y %H:%M:%S' [by their form].")
     ] = None
+    dates: Annotated[
+        str | None, Option(help="Order in dates such as 03/04/2026, month-first or day-first [by all rows].")
+    ] = None
     zone: Annotated[
         str | None, Option(help="Time zone of local timestamps, such as Europe/Berlin or +01:00 [UTC].")
     ] = None
@@ -33,7 +36,7 @@ class TableOptions:
     separator: Annotated[str | None, Option(help="Character between cells, or tab or blank [by the first rows].")] = (
         None
     )
-    decimal: Annotated[str | None, Option(help="Decimal sign, '.' or ',' [by the first rows].")] = None
+    decimal: Annotated[str | None, Option(help="Decimal sign, '.' or ',' [by all cells].")] = None
     missing: Annotated[list[str] | None, Option(help="A cell that means: not measured, such as -999 (repeatable).")] = (
         None
     )
@@ -43,12 +46,21 @@ class TableOptions:
     transposed: Annotated[
         bool | None, Option("--transposed/--no-transposed", help="Each row is a signal [by the first rows].")
     ] = None
+    tag: Annotated[
+        str | None, Option(help="The column of tags of a table with a row for each value; none: wide [by its rows].")
+    ] = None
+    value: Annotated[str | None, Option(help="The column of values of such a table [by its name and content].")] = None
+    quality_good: Annotated[
+        list[str] | None,
+        Option(help="Qualities of usable values, such as 'Good,192', or '*' (repeatable) [words and codes of OPC]."),
+    ] = None
 
     stated: FileFormat = field(init=False)
 
     def __post_init__(self) -> None:
         values = {item.name: getattr(self, item.name) for item in fields(FileFormat)}
-        object.__setattr__(self, "stated", FileFormat(**{**values, "missing": tuple(self.missing or ())}))
+        lists = {name: tuple(values[name] or ()) for name in ("missing", "quality_good")}
+        object.__setattr__(self, "stated", FileFormat(**{**values, **lists}))
 
 
 def stated_settings(stated: FileFormat) -> dict[str, Any] | None:

@@ -4,21 +4,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from plant_node.config import PlantConfig
-from plant_node.process_settings import fit_settings
+from plant_node.config import PlantConfig, fit_settings
 from plant_node.record import load_process
 from reactorwatch.api.files import record
 from reactorwatch.cli.option_groups import stated_settings
 from reactorwatch.cli.options import check_recording
-from reactorwatch.description.catalogue import catalogue
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
+from reactorwatch.description.find import DEFAULT_PROCESS, find_in_catalogue, find_process
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import section
 from recorder.config import ReplayConfig
+from recorder.files.recording import one_plant_in, recorded_process
 from recorder.tools.convert import plant_name
-from recorder.tools.mcap_file import one_plant_in, recorded_process
 
 Tables = dict[str, dict[str, Any]]
 
@@ -176,10 +174,6 @@ def _played_process(path: Path, process: str | None, plant: str | None) -> tuple
         plant, described = plant or recorded, recorded_process(path, recorded)
         if process is None and described is not None:
             process = described.name
-            if process not in catalogue():
-                raise InputError(
-                    f"--record {path}: is of process {process!r}, which is in no catalogue here; name its file "
-                    "by --process"
-                )
+            find_in_catalogue(process, f"--record {path}")
     process = process or DEFAULT_PROCESS
     return process, plant_name(plant, find_process(process))

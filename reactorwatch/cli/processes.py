@@ -1,7 +1,8 @@
 """Nodes as processes, under one supervisor that is also their router.
 
 A node is started as `python -m plant_node SETTINGS`, in a session of its own, so that Ctrl-C on the terminal reaches
-the supervisor only. It then stops the nodes one after the other: the plant first, the recorder last.
+the supervisor only. It then stops the nodes one after the other: the plant first, the recorder last. Each node reads a
+pipe of which the supervisor alone holds the other end, and ends when it closes, by whatever end of the supervisor.
 """
 
 import subprocess
@@ -16,6 +17,7 @@ import msgspec
 import structlog
 
 from reactorwatch.records.atomic import atomic_write
+from reactorwatch.runtime.node_main import SUPERVISED
 
 log = structlog.get_logger()
 
@@ -44,12 +46,14 @@ class Processes:
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, node: str) -> subprocess.Popen[bytes]:
-        """Start a node."""
-        command = [sys.executable, "-m", MODULES[node], str(self._settings[node])]
+        """Start a node, also one that has ended."""
+        if node in self.exit_codes():
+            self.stop([node])
+        command = [sys.executable, "-P", "-m", MODULES[node], str(self._settings[node]), SUPERVISED]
         with nullcontext() if self._logs is None else (self._logs / f"{node}.log").open("wb") as output:
             process = subprocess.Popen(  # noqa: S603 (our own modules)
                 command,
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=None if output is None else subprocess.STDOUT,
                 start_new_session=True,
@@ -77,6 +81,8 @@ class Processes:
                 log.warning("did not stop when asked, killed", node=node, after_s=STOP_WITHIN_S)
                 process.kill()
                 codes[node] = process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
         return codes
 
     def __enter__(self) -> Self:

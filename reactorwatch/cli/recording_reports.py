@@ -8,9 +8,9 @@ from reactorwatch.contract.alarm_text import format_moment, priority_word
 from reactorwatch.description.process import ROLES, Process
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.terminal import printable_lines
-from recorder.storage.recover import RecoveryResult
+from recorder.files.copies import RecoveryResult
+from recorder.files.recording import has_clock
 from recorder.tools.inspect import FileInfo
-from recorder.tools.mcap_file import has_clock
 
 MAX_LINES = 20
 """Gaps that are listed one by one for people."""
@@ -60,8 +60,8 @@ def info_object(seen: FileInfo, file: Path) -> dict[str, Any]:
         "first_ns": overview.first_ns,
         "last_ns": overview.last_ns,
         "span_s": overview.span_s,
-        "from_min": minutes(span.first_ns) if span is not None else None,
-        "to_min": minutes(span.last_ns) if span is not None else None,
+        "from_min": minutes(span[0]) if span is not None else None,
+        "to_min": minutes(span[1]) if span is not None else None,
         "runs": [
             {"plant": plant, "from_min": minutes(run.first_ns), "to_min": minutes(run.last_ns)}
             for plant, runs in sorted(overview.runs.items())
@@ -99,6 +99,10 @@ def info_object(seen: FileInfo, file: Path) -> dict[str, Any]:
             for alarm in overview.alarms
         ],
         "metadata": seen.metadata,
+        "live": seen.live or None,
+        "profile": seen.profile,
+        "library": seen.library,
+        "attachments": list(seen.attachments),
         "processes": [
             {
                 "plant": plant,
@@ -127,6 +131,16 @@ def info_text(seen: FileInfo, file: Path) -> str:
             spans = [(to_minutes(run.first_ns, seen.zero_ns), to_minutes(run.last_ns, seen.zero_ns)) for run in runs]
             named = [f"  run {number}: {first:g} to {last:g} min" for number, (first, last) in enumerate(spans, 1)]
             lines += _first_lines(named, "more")
+    if seen.live:
+        lines.append(f"{seen.live} is still being recorded: this is its intact part")
+    if not seen.metadata:
+        encodings = sorted({topic["encoding"] for topic in report["topics"]})
+        lines.append(
+            f"of another program: profile {seen.profile!r}, library {seen.library!r}, "
+            f"encodings {', '.join(map(repr, encodings)) or 'none'}"
+        )
+    if seen.attachments:
+        lines.append(f"attachments: {', '.join(seen.attachments)}")
     facts = [
         f"{name} {seen.metadata[name]}" for name in ("plant", "version", "seed", "started") if name in seen.metadata
     ]

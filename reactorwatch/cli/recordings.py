@@ -1,4 +1,4 @@
-"""Commands for recordings: `recover`, `info`, `cut` and `merge`."""
+"""Commands for recordings: `recover`, `info` and `cut`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,8 +31,8 @@ def recover(
     """Recover the intact messages of a damaged recording."""
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.recording_reports import saved_object, saved_text
-    from recorder.storage.part_file import is_locked
-    from recorder.storage.recover import recover as save
+    from recorder.files.copies import recover as save
+    from recorder.files.part_file import is_locked
 
     if is_locked(check_input(file)):
         raise InputError(f"{file}: is still being written; stop its recorder first")
@@ -85,10 +85,11 @@ def cut(
 ) -> None:
     """Copy a span of plant time out of a recording."""
     from reactorwatch.cli.progress import task
-    from recorder.tools.cut import cut as copy
-    from recorder.tools.cut import sample_window
+    from recorder.files.copies import cut as copy
+    from recorder.files.copies import sample_window
+    from recorder.files.metadata import ZERO_NS
+    from recorder.files.recording import read_metadata, recordings_in
     from recorder.tools.inspect import zero_ns_of
-    from recorder.tools.mcap_file import ZERO_NS, read_metadata, recordings_in
 
     from_ns = parse_span_ns(begin, "--from") if begin is not None else -(2**63)
     to_ns = parse_span_ns(end, "--to") if end is not None else 2**63
@@ -101,27 +102,6 @@ def cut(
         window = sample_window(sources, zero_ns + from_ns, zero_ns + to_ns)
         about = {**read_metadata(file), "cut": f"from {begin or 'the start'} to {end or 'the end'} of {file.name}"}
         count = copy(sources, out, window, {**about, ZERO_NS: str(zero_ns)})
-    print_lines(f"wrote {out}: {count} messages")
-
-
-def merge(
-    files: Annotated[list[Path], Argument(help="Recordings (.mcap), or folders of them.")],
-    out: Annotated[Path, Option("--out", "-o", help="The file to write (.mcap).")],
-    force: Force = False,
-) -> None:
-    """Merge several recordings into one, in order of receipt."""
-    from reactorwatch.cli.progress import task
-    from recorder.tools.cut import merge as join
-    from recorder.tools.mcap_file import read_metadata, recordings_in
-
-    out = check_output(out, ".mcap", files, force=force)
-    with task(f"merging into {out.name}"):
-        sources = [source for file in files for source in recordings_in(check_recording(file))]
-        for number, source in enumerate(sources):
-            if any(source.samefile(other) for other in sources[:number]):
-                raise InputError(f"{source}: is named twice, and its messages would be there twice; name it once")
-        about = {**read_metadata(files[0]), "merged": ", ".join(source.name for source in sources)}
-        count = join(sources, out, about)
     print_lines(f"wrote {out}: {count} messages")
 
 

@@ -68,8 +68,6 @@ def router(
 
     Refused messages are logged.
     """
-    import threading
-
     import structlog
 
     from reactorwatch.runtime.bus_zenoh import log_refusals, router_from_file
@@ -77,20 +75,25 @@ def router(
     from reactorwatch.runtime.config import BusConfig, LogConfig, read_settings, section
     from reactorwatch.runtime.event_loop import stop_on_signals
     from reactorwatch.runtime.logs import configure
+    from reactorwatch.runtime.retry import retry
 
     if file is not None and (config is not None or endpoint is not None):
         raise InputError(f"{file}: has the address of this router; leave out --config and --endpoint")
     tables = read_settings(config)
     settings = section(BusConfig, "bus", tables, {"endpoint": endpoint})
     configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
+    log = structlog.get_logger()
     with log_refusals(), stop_on_signals() as stop:
-        bus = router_from_file(check_input(file)) if file is not None else plain_router(settings)
-        stopped = threading.Event()
-        stop.call_on_set(stopped.set)
-        structlog.get_logger().info("router", **({"settings": str(file)} if file else {"endpoint": settings.endpoint}))
+        bus = retry(
+            lambda: router_from_file(check_input(file)) if file is not None else plain_router(settings),
+            stop.wait,
+            lambda why, is_new: log.warning("waiting", node="router", why=why) if is_new else None,
+        )
+        if bus is None:
+            return
+        log.info("router", **({"settings": str(file)} if file else {"endpoint": settings.endpoint}))
         try:
-            if not stop.is_set:
-                stopped.wait()
+            stop.wait()
         finally:
             bus.close()
 

@@ -12,16 +12,25 @@ from reactorwatch.cli.display import has_colour, print_screen_text, screen_width
 from reactorwatch.cli.printing import json_line
 from reactorwatch.cli.status_view import format_plant
 from reactorwatch.contract import keys
-from reactorwatch.contract.alarm_text import priority_word, state_word
+from reactorwatch.contract.alarm_text import priority_word, set_suspects, state_word
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode_message
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, ListAlarms, Promise, Sample
+from reactorwatch.contract.messages_pb2 import (
+    Alarm,
+    CommandReply,
+    Health,
+    Incident,
+    ListAlarms,
+    Promise,
+    Sample,
+    Suspect,
+)
 from reactorwatch.contract.promise_text import promise_fields
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.event_loop import stop_on_signals
+from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
 from reactorwatch.terminal import printable
-from recorder.columns.measurement import measured_value
+from recorder.columns.samples import measured_value
 
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process
@@ -50,6 +59,7 @@ class StatusBoard:
         self._alive: set[tuple[str, str]] = set()
         self._health: dict[tuple[str, str], Health] = {}
         self._alarms: dict[tuple[str, str], Alarm] = {}
+        self._suspects: dict[tuple[str, int], list[Suspect]] = {}  # by plant and incident
         self._promises: dict[str, Promise] = {}
         self._samples: dict[str, Counter[int]] = {}  # by plant and second
         self._lock = threading.Lock()
@@ -75,6 +85,10 @@ class StatusBoard:
                 self._health[topic.plant, topic.name] = body
             elif isinstance(body, Alarm):
                 self._alarms[topic.plant, body.alarm] = body
+                self._take_suspects(topic.plant, body.incident)
+            elif isinstance(body, Incident):
+                self._suspects[topic.plant, body.number] = list(body.suspects)
+                self._take_suspects(topic.plant, body.number)
             elif isinstance(body, Promise):
                 self._promises[topic.plant] = body
             elif isinstance(body, Sample):
@@ -84,6 +98,13 @@ class StatusBoard:
                 seconds[second] += 1
                 for old in [item for item in seconds if item < second - WINDOW_S]:
                     del seconds[old]
+
+    def _take_suspects(self, plant: str, number: int) -> None:
+        """Give the alarms of an incident its newest suspects, but for those that name their cause themselves."""
+        suspects = self._suspects.get((plant, number))
+        for (name, _), alarm in self._alarms.items():
+            if suspects is not None and name == plant and alarm.incident == number and not alarm.names_cause:
+                set_suspects(alarm, suspects)
 
     def on_alarms(self, plant: str, alarms: list[Alarm]) -> None:
         """Record a node's list of alarms; published ones are newer and stay."""
@@ -163,6 +184,8 @@ class StatusBoard:
                 **{name: getattr(health, name) for name in ("received", "published", "lost", "late", "refused")},
                 "lag_ms": health.lag_ms,
             }
+            if health.waiting_for:
+                state["waiting_for"] = health.waiting_for
             if health.reference:
                 state["reference"] = health.reference
             if health.phase == "training":
@@ -198,15 +221,13 @@ def run(
         except ConnectionError as error:
             raise InputError(f"no router at {config.endpoint}; `reactorwatch doctor` checks the connection") from error
         try:
-            stopped = threading.Event()
-            stop.call_on_set(stopped.set)
             board = _subscribe(bus, plant or "*", process)
             if once or as_json:
-                stopped.wait(listen_s)
+                stop.wait(listen_s)
                 _query_alarms(bus, board)
                 print_screen_text(_text(board, as_json=as_json))
             else:
-                _show(bus, board, stopped)
+                _show(bus, board, stop)
         finally:
             bus.close()
 
@@ -216,7 +237,7 @@ def _subscribe(bus: ZenohBus, plant: str, process: "Process | None") -> StatusBo
     bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), board.on_token)
     bus.subscribe(keys.all_keys(plant, keys.HEALTH), board.on_message, history_s=HISTORY_S)
     bus.subscribe(keys.all_keys(plant, keys.PROMISE), board.on_message, history_s=inf)
-    for kind in (keys.SAMPLE, keys.ALARM):
+    for kind in (keys.SAMPLE, keys.ALARM, keys.INCIDENT):
         bus.subscribe(keys.all_keys(plant, kind), board.on_message)
     return board
 
@@ -232,13 +253,13 @@ def _query_alarms(bus: ZenohBus, board: StatusBoard) -> None:
                         board.on_alarms(plant, list(reply.alarms))
 
 
-def _show(bus: ZenohBus, board: StatusBoard, stopped: threading.Event) -> None:
+def _show(bus: ZenohBus, board: StatusBoard, stop: StopSignal) -> None:
     from rich.live import Live
     from rich.text import Text
 
     asked: list[str] = []
     with Live(auto_refresh=False) as live:
-        while not stopped.wait(REFRESH_S):
+        while not stop.wait(REFRESH_S):
             if board.plants != asked:
                 _query_alarms(bus, board)
                 asked = board.plants

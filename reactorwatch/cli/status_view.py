@@ -76,6 +76,8 @@ def _promise(plant: dict[str, Any]) -> list[Row]:
 
 
 def _node(node: dict[str, Any]) -> Row:
+    if (why := node.get("waiting_for")) is not None:
+        return (node["node"], Cell(f"{node['phase']}: {why}", WRONG), _age(node))
     if not node["alive"]:
         return (node["node"], Cell("not there", WRONG), _age(node))
     phase = node.get("phase", "")

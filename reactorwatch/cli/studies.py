@@ -92,9 +92,6 @@ def backtest(
     ] = None,
     training: TrainingOptions,
     reference: Reference = None,
-    scheme: Annotated[
-        str, Option(help="monitor, or report: watch as the original report does, mean +- 3 sigma of OE(3,3).")
-    ] = "monitor",
     column: Columns = None,
     out: Annotated[Path | None, Option("--out", "-o", help="Folder for a summary of several files.")] = None,
     rows: Annotated[
@@ -109,7 +106,7 @@ def backtest(
     """Run the monitor over recordings at full speed."""
     from monitor_node.config import MonitorConfig
     from reactorwatch.cli.backtest_jobs import BACKTEST, BacktestOptions, train_on, write_rows
-    from reactorwatch.cli.batch import SUMMARY, expand_files, make_jobs, run_jobs
+    from reactorwatch.cli.batch import SUMMARY, expand_files, make_jobs, run_jobs, unfit_lines
     from reactorwatch.cli.progress import task
     from reactorwatch.contract.keys import DEFAULT_PLANT
     from reactorwatch.records.output import check_output_folder
@@ -123,10 +120,8 @@ def backtest(
         rows = check_output(rows, ".csv", sources, force=force)
     if train is not None and training.is_given:
         raise InputError(f"--train {train}: all of it is the training; leave --training and --training-rows out")
-    if train is not None and scheme == "report":
-        raise InputError(f"--train {train}: the report's scheme learns from the first rows of each file; leave it out")
     tables = read_settings(config)
-    flags: dict[str, Any] = {"plant": plant or DEFAULT_PLANT, "reference": reference}
+    flags: dict[str, Any] = {"plant": plant or DEFAULT_PLANT, "reference": reference, "process": choice.process}
     if choice.outputs:
         choice.load()  # reports a column of two roles
         flags |= {"inputs": choice.inputs, "outputs": choice.outputs, "modes": choice.modes}
@@ -140,11 +135,10 @@ def backtest(
         as_json=as_json,
         settings=settings,
         log_rows=rows is not None,
-        scheme=scheme,
         is_one_of_many=len(named) > 1,
     )
     if train is not None:
-        with task(f"learning from {train.name}"):
+        with task(f"learning from {train.name}"), unfit_lines(named, as_json=as_json):
             asked = replace(asked, trained=train_on(train, asked))
     run_jobs(
         BACKTEST,
@@ -189,7 +183,7 @@ def diagnose(
     table: TableOptions,
 ) -> None:
     """Find where a simulation differs from the record, and name the cause."""
-    from reactorwatch.cli.batch import expand_files, run_jobs
+    from reactorwatch.cli.batch import expand_files, run_jobs, unfit_lines
     from reactorwatch.cli.diagnosis import DiagnosisOptions
     from reactorwatch.cli.diagnosis_jobs import DIAGNOSIS, check_out, diagnosis_jobs
     from reactorwatch.description.choice import ProcessChoice
@@ -208,5 +202,6 @@ def diagnose(
         limits=parse_limits(limit),
         without=split_names(without),
     )
-    todo = diagnosis_jobs(named, out, asked, elsewhere=scheduler is not None)
+    with unfit_lines(named, as_json=as_json):
+        todo = diagnosis_jobs(named, out, asked, elsewhere=scheduler is not None)
     run_jobs(DIAGNOSIS, todo, out, processes=jobs, scheduler=scheduler)

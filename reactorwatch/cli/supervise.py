@@ -1,7 +1,6 @@
 """`up`: run the router in this process and the nodes as processes, until stopped."""
 
 import contextlib
-import threading
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +12,7 @@ import structlog
 
 from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
-from monitor_node.pipeline.budget import check_promise
+from monitor_node.watch.budget import check_promise
 from plant_node.config import PlantConfig
 from reactorwatch.cli.bus_settings import (
     VIEWER,
@@ -30,6 +29,7 @@ from reactorwatch.cli.run_progress import RunProgress
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
+from reactorwatch.limits import limits
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.output import check_folder_name
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
@@ -37,7 +37,7 @@ from reactorwatch.runtime.event_loop import stop_on_signals
 from reactorwatch.runtime.logs import configure
 from recorder.__main__ import first_file
 from recorder.config import RecorderConfig
-from recorder.policy.file_names import ENDING
+from recorder.keep import ENDING
 
 log = structlog.get_logger()
 
@@ -54,7 +54,7 @@ def run_until_stopped(
     site: Path | None = None,
     played: PlayedRecord | None = None,
 ) -> int:
-    """Run everything until SIGINT or SIGTERM, or until a node ends by itself.
+    """Run everything until SIGINT, SIGTERM or SIGHUP, or until a node ends by itself.
 
     Args:
         target: settings file and router.
@@ -94,21 +94,21 @@ def run_until_stopped(
     with open_router(site, join) as bus:  # before anything is written, in case the address is taken
         tables_written = {source.node: source.settings, "monitor": monitor, "diagnosis": diagnosis, "metrics": metrics}
         nodes = ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", source.node)
-        settings = _write_settings(recorder, source.about, {**tables_written, "log": log_config}, join, nodes)
-        with stop_on_signals() as stop, Processes(settings) as processes_running:
-            woken = threading.Event()
-            stop.call_on_set(woken.set)
+        settings = _write_settings(
+            recorder, source.about, {**tables_written, "log": log_config, "limits": limits()}, join, nodes
+        )
+        with stop_on_signals(is_supervisor=True) as stop, Processes(settings) as processes_running:
             progress = RunProgress(bus, source.plant) if source.has_end else None
             for node in nodes:
                 processes_running.start(node)
             log.info("running", plant=source.plant, router=join[VIEWER].endpoint, out=recorder.out, stop="Ctrl-C")
-            while not woken.wait(POLL_S):
+            while not stop.wait(POLL_S):
                 ended = processes_running.exit_codes()
                 if ended:
                     for node, code in ended.items():
                         log.info("ended by itself", node=node, code=code)
                     if progress is not None and ended == {source.node: 0}:
-                        progress.wait_until_evaluated(woken.wait)
+                        progress.wait_until_evaluated(stop.wait)
                     return 1 if any(ended.values()) else 0
             return 0
 
@@ -146,7 +146,7 @@ def run_diagnosis_node(config: DiagnosisConfig, bus_config: BusConfig, log_confi
     """Run the diagnosis node in a process of its own while the context lasts."""
     with TemporaryDirectory() as folder:
         settings = Path(folder) / "settings.toml"
-        write_settings(settings, {"bus": bus_config, "diagnosis": config, "log": log_config})
+        write_settings(settings, {"bus": bus_config, "diagnosis": config, "log": log_config, "limits": limits()})
         with Processes({"diagnosis": settings}) as processes:
             processes.start("diagnosis")
             yield

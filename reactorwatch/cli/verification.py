@@ -7,20 +7,28 @@ from typing import Any
 from monitor_node.config import MonitorConfig
 from monitor_node.replay.message_diff import Difference
 from monitor_node.replay.verification import COMPARED, Verification, verify
-from reactorwatch import __version__
-from reactorwatch.cli.printing import json_line, print_text
+from reactorwatch.cli.printing import json_line, print_lines, print_text
 from reactorwatch.cli.progress import task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.find import find_in_catalogue, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import parse_tables, read_settings, section
 from reactorwatch.terminal import printable_lines
+from reactorwatch.version import UNKNOWN, describe_build, this_build
+from recorder.files.recording import (
+    has_clock,
+    one_plant_in,
+    read_messages,
+    read_metadata,
+    recorded_process,
+    recordings_in,
+)
 from recorder.tools.inspect import gaps_in, zero_ns_of
-from recorder.tools.mcap_file import has_clock, one_plant_in, read_messages, read_metadata, recorded_process
 
 SETTINGS = "settings"
 """Name of the nodes' settings in the metadata of a recording."""
@@ -28,13 +36,14 @@ MAX_LINES = 10
 MAX_VALUE = 60
 
 
-def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) -> int:
+def run(file: Path, config: Path | None, plant: str | None, process: str | None = None, *, as_json: bool) -> int:
     """Verify a recording and print the result.
 
     Args:
         file: the recording, or a folder of them.
         config: settings file; None: the settings in the recording.
         plant: plant of the monitor; None: the only one in the recording.
+        process: name or file of the process; None: that of the settings file, or the one that the recording describes.
         as_json: print one JSON object.
 
     Returns:
@@ -46,19 +55,22 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
     if is_table(file):
         raise InputError(f"{file}: holds no alarms to verify; a recording (.mcap) was expected")
     metadata = read_metadata(file)
+    other_builds = _describe_other_builds(file)
+    for line in other_builds:  # before the work, whose result or refusal it may explain
+        print_lines(line, err=as_json)
     monitor = _settings(file, metadata, config, one_plant_in(file, plant))
+    judged = find_process(process, on_bus=True) if process else None
+    if judged is None and config is None:
+        judged = _recorded_process(file, monitor)
 
     def read() -> Iterator[Encoded]:
         return (Encoded(*entry[:4]) for entry in read_messages(file, plant=monitor.plant) if not entry.latched)
 
     with task(f"verifying {file.name}"):
         try:
-            verification = verify(read, monitor, _described_process(file, monitor) if config is None else None)
+            verification = verify(read, monitor, judged)
         except InputError as error:
             raise error if str(error).startswith(str(file)) else InputError(f"{file}: {error}") from error
-    version = metadata.get("version", __version__)
-    if version != __version__:
-        verification.notes.append(f"it was recorded by version {version}, and this is {__version__}")
     verification.notes += [
         f"{gap.messages} messages of {gap.stream} never reached this recording; what the monitor published about "
         "them, and what it learned from them, is then not reproduced"
@@ -69,28 +81,35 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
     report = _object(verification, file, monitor.plant, zero_ns) | {
         "zero": format_utc(zero_ns) if has_clock(metadata) else None
     }
+    if as_json:
+        report["notes"] = other_builds + report["notes"]
     print_text(json_line(report) if as_json else _text(report))
     return 0 if verification.exact else 1
 
 
-def _described_process(file: Path, monitor: MonitorConfig) -> Process | None:
-    """Process that the recording describes, where the settings in it name a file; None: that of the settings.
+def _describe_other_builds(file: Path) -> list[str]:
+    """Remark that other builds of this software made the recording, or files of it; empty if it was this one."""
+    recorded = [{"version": UNKNOWN, "commit": UNKNOWN} | read_metadata(part) for part in recordings_in(file)]
+    builds = dict.fromkeys(describe_build(build["version"], build["commit"]) for build in recorded)
+    others = [build for build in builds if build != this_build()]
+    if not others:
+        return []
+    return [f"it was recorded by another build, {' and '.join(others)}, and this is {this_build()}: they may differ"]
 
-    A file of equations that a recording cannot hold is read.
+
+def _recorded_process(file: Path, monitor: MonitorConfig) -> Process | None:
+    """Process that the settings in a recording name: of the catalogue, or as the recording itself describes it.
+
+    A file that they name is not opened. None: they name none.
 
     Raises:
-        InputError: that file is no longer there.
+        InputError: the recording does not hold the equations that judged.
     """
-    named = ProcessChoice(monitor.process).file
-    described = None if named is None else recorded_process(file, monitor.plant)
-    if named is None or described is None or (described.model is None and named.exists()):
-        return None
-    if described.model is None and named.suffix.lower() != ".toml":
-        raise InputError(
-            f"{file}: was watched by the equations of {named}, which a recording does not hold, and there is no such "
-            "file; put it back, or name another by --config"
-        )
-    return described
+    path = ProcessChoice(monitor.process).file
+    described = None if path is None else recorded_process(file, monitor.plant)
+    if path is not None and described is not None and (described.model is not None or path.suffix.lower() == ".toml"):
+        return described
+    return find_in_catalogue(monitor.process, str(file)) if monitor.process else None
 
 
 def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: str) -> MonitorConfig:

@@ -34,7 +34,7 @@ def view(
 
     from reactorwatch.cli.observer import load_recorder_settings, observed_process
     from reactorwatch.description.find import find_process
-    from recorder.dashboard.live import DisplayTarget, show
+    from recorder.view.viewer import DisplayTarget, show
 
     if process is not None and target.config is None:
         target = replace(target, name=target.name or find_process(process).name)

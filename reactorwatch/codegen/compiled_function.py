@@ -142,11 +142,6 @@ class CompiledFunction:
         return _address(self._scalar_call)
 
     @cached_property
-    def lanes_address(self) -> int:
-        """As `address`, for `LANES` independent rows or more: the code takes so many at a time."""
-        return _address(self._vector_call)
-
-    @cached_property
     def _scalar_call(self) -> _Call:
         return self._compile(1)
 

@@ -34,7 +34,7 @@ def jit(kernel: Kernel) -> Kernel:
         compiled = numba.njit(cache=True, **_OPTIONS)(kernel)
     except RuntimeError:  # Numba: no locator available
         return cast(Kernel, numba.njit(cache=False, **_OPTIONS)(kernel))
-    _tolerate_full_disk(compiled)
+    _tolerate_cache_failures(compiled)
     return cast(Kernel, compiled)
 
 
@@ -47,10 +47,10 @@ def inline(kernel: Kernel) -> Kernel:
     return cast(Kernel, numba.njit(forceinline=True, **_OPTIONS)(kernel))
 
 
-def _tolerate_full_disk(compiled: Any) -> None:
-    """Let a kernel work where its machine code cannot be cached: what was asked for is its result, not the cache."""
+def _tolerate_cache_failures(compiled: Any) -> None:
+    """Let a kernel work where its cache cannot be written, or names modules of another version that are gone."""
     cache = compiled._cache
-    save = cache.save_overload
+    save, load = cache.save_overload, cache.load_overload
 
     def save_overload(signature: Any, code: Any) -> None:
         try:
@@ -58,7 +58,15 @@ def _tolerate_full_disk(compiled: Any) -> None:
         except OSError as error:
             _log.debug("the machine code of %s is not cached: %s", compiled.__name__, error)
 
-    cache.save_overload = save_overload
+    def load_overload(signature: Any, target: Any) -> Any:
+        try:
+            return load(signature, target)
+        except (ImportError, AttributeError) as error:
+            _log.debug("the cached machine code of %s is of another version: %s", compiled.__name__, error)
+            cache.flush()
+            return None
+
+    cache.save_overload, cache.load_overload = save_overload, load_overload
 
 
 def python_function(kernel: Kernel) -> Kernel:

@@ -3,12 +3,18 @@
 from collections.abc import Iterable
 from datetime import UTC, datetime
 
-from reactorwatch.contract.messages_pb2 import AlarmState, Priority, Suspect
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Priority, Suspect
 
 MIN_PROBABILITY = 0.05
 """Probability below which a suspect is not shown."""
 
 _MINUTE_NS = 60_000_000_000
+
+
+def set_suspects(alarm: Alarm, suspects: Iterable[Suspect]) -> None:
+    """Replace the suspects of an alarm, as by those that its incident has now."""
+    del alarm.suspects[:]
+    alarm.suspects.extend(suspects)
 
 
 def describe_suspects(suspects: Iterable[Suspect]) -> str:

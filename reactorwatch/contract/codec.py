@@ -6,7 +6,7 @@ many of them as an empty message.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias, TypeVar, get_args
+from typing import NamedTuple, TypeAlias, get_args
 
 from google.protobuf.message import DecodeError as ProtobufDecodeError
 from google.protobuf.message import Message
@@ -14,6 +14,15 @@ from google.protobuf.message import Message
 from reactorwatch.contract import messages_pb2 as messages
 
 PREFIX = "application/protobuf;"
+
+_TIME, _SEQUENCE = 0x09, 0x10
+"""Field and wire type of the first fields of a `Sample`."""
+
+MAX_VARINT = 10
+"""Bytes of protobuf's longest number."""
+PACKAGE, VERSION = "reactorwatch.", "reactorwatch.v1"
+OTHER_VERSION = "version"
+"""Reason of a `DecodeError` for messages of this software in another version of their schema."""
 
 MAX_PAYLOAD = 1 << 20
 """Largest payload that is decoded, in bytes; messages take less than a hundredth of it."""
@@ -25,6 +34,7 @@ Body: TypeAlias = (
     | messages.ChartPoint
     | messages.Alarm
     | messages.AlarmKpis
+    | messages.Incident
     | messages.Reconstruction
     | messages.Baseline
     | messages.Promise
@@ -43,7 +53,6 @@ MESSAGES: tuple[type[Message], ...] = (
     messages.ShelveAlarm,
     messages.ListAlarms,
     messages.BaselineCommand,
-    messages.ReplayCommand,
     messages.CommandReply,
 )
 
@@ -62,9 +71,6 @@ class Encoded(NamedTuple):
     payload: bytes
     encoding: str
     received_ns: int = 0
-
-
-Kind = TypeVar("Kind", bound=Message)
 
 
 class DecodeError(ValueError):
@@ -109,14 +115,16 @@ def decode(payload: bytes, encoding: str) -> Message:
     """Decode a payload as the message that the encoding names.
 
     Raises:
-        DecodeError: the encoding is unknown (reason `encoding`), the payload is too large (`too_large`) or malformed
-            (`payload`).
+        DecodeError: the encoding is unknown (reason `encoding`) or of another version of the schema (`version`), the
+            payload is too large (`too_large`) or malformed (`payload`).
     """
     if len(payload) > MAX_PAYLOAD:
         raise DecodeError("too_large", f"a payload must have at most {MAX_PAYLOAD} bytes, got {len(payload)}")
     read = _READERS.get(encoding)
     if read is None:
-        raise DecodeError("encoding", f"encoding must be '{PREFIX}reactorwatch.v1.<message>', got {encoding!r}")
+        is_other = encoding.startswith(PREFIX + PACKAGE) and not encoding.startswith(f"{PREFIX}{VERSION}.")
+        reason = OTHER_VERSION if is_other else "encoding"
+        raise DecodeError(reason, f"encoding must be '{PREFIX}{VERSION}.<message>', got {encoding!r}")
     try:
         return read(payload)
     except ProtobufDecodeError as error:
@@ -124,10 +132,18 @@ def decode(payload: bytes, encoding: str) -> Message:
         raise DecodeError("payload", f"{len(payload)} bytes are not a {name}: {error}") from error
 
 
-def decode_as(message: Encoded, kind: type[Kind]) -> Kind | None:
-    """Decode a message of a type; None if it is of another type, or cannot be decoded."""
+def read_sequence(payload: bytes) -> int:
+    """Read the sequence number of one sample without parsing the rest; 0 for bytes in another form."""
     try:
-        body = decode(message.payload, message.encoding)
-    except DecodeError:
-        return None
-    return body if isinstance(body, kind) else None
+        at = 9 if payload[0] == _TIME else 0  # the time takes eight bytes, or none if it is zero
+        if payload[at] != _SEQUENCE:
+            return 0
+        byte = payload[at + 1]
+        number, shift = byte & 0x7F, 7
+        while byte >= 0x80 and shift < 7 * MAX_VARINT:
+            byte = payload[at + 1 + shift // 7]
+            number |= (byte & 0x7F) << shift
+            shift += 7
+    except IndexError:
+        return 0
+    return number if byte < 0x80 else 0

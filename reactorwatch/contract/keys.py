@@ -21,6 +21,7 @@ MODEL = "model"
 CHART = "chart"
 ALARM = "alarm"
 ALARM_KPIS = "alarm_kpis"
+INCIDENT = "incident"
 RECONSTRUCTION = "reconstruction"
 BASELINE = "baseline"
 PROMISE = "promise"
@@ -29,6 +30,9 @@ FAULT = "fault"
 COMMAND = "command"
 AUDIT = "audit"
 ALIVE = "alive"
+
+BLOCKED = "blocked"
+"""Phase of a node that waits at its start for what the machine refuses."""
 
 RECORDING = "recording"
 """First part of the names of a recorder's own alarms; the recorder executes commands on them."""
@@ -140,67 +144,65 @@ def monitor_token(plant: str, name: str) -> str:
         plant: name of the plant.
         name: unique name of the monitor; `*`: the key expression of all.
     """
-    return key(plant, ALIVE, f"@monitor/{name}")
+    return instance_token(plant, "monitor", name)
 
 
-def fleet_token(fleet: str, of: str, number: str, name: str) -> str:
-    """Liveliness token of a monitor that shares a fleet.
+def instance_token(plant: str, node: str, name: str) -> str:
+    """Liveliness token of one instance of a node, in addition to that of the node, by which a second one finds it.
+
+    >>> instance_token("cstr", "recorder", "0f3a9c21.4711@pi4")
+    'reactor/cstr/alive/@recorder/0f3a9c21.4711@pi4'
 
     Args:
-        fleet: digest of the shared settings, as one part of a key.
+        plant: name of the plant.
+        node: name of the node.
+        name: unique name of the instance, with its process and host; `*`: the key expression of all.
+    """
+    return key(plant, ALIVE, f"@{node}/{name}")
+
+
+def fleet_token(plants: str, of: str, number: str, name: str) -> str:
+    """Liveliness token of a fleet's monitor.
+
+    >>> fleet_token("reactor/north_*", "5", "2", "0f3a9c21.4711@pi4")
+    'reactor/@fleet/alive/north_+/5/2/0f3a9c21.4711@pi4'
+
+    Args:
+        plants: key expression of the fleet's plants. A key cannot hold its `*`, which `+` replaces.
         of: count of shards.
         number: number of the monitor's shard.
-        name: name of the monitor, from `fleet_member`.
+        name: unique name of the instance, with its process and host.
     """
-    return f"{ROOT}/{FLEET}/{ALIVE}/{fleet}/{of}/{number}/{name}"
+    return f"{ROOT}/{FLEET}/{ALIVE}/{plants.removeprefix(f'{ROOT}/').replace('*', '+')}/{of}/{number}/{name}"
 
 
-FLEET_TOKENS = fleet_token("*", "*", "*", "*")
+FLEET_TOKENS = f"{ROOT}/{FLEET}/{ALIVE}/*/*/*/*"
 """Key expression of the tokens of all monitors of all fleets."""
-
-
-def fleet_member(name: str, plants: str) -> str:
-    """Name of a fleet's monitor in its token, with the plants that the fleet watches.
-
-    >>> fleet_member("01", "reactor/north_*")
-    '01@north_+'
-
-    Args:
-        name: unique name of the monitor.
-        plants: key expression of the fleet's plants. A key cannot hold its `*`, which `+` replaces.
-    """
-    return f"{name}@{plants.removeprefix(f'{ROOT}/').replace('*', '+')}"
 
 
 class FleetToken(NamedTuple):
     """Parts of the token of a fleet's monitor, see `fleet_token`."""
 
-    fleet: str
+    plants: str
     of: str
     number: str
     name: str
-
-    @property
-    def plants(self) -> str:
-        """Key expression of the fleet's plants; empty if the token does not hold it."""
-        expression = f"{ROOT}/{self.name.partition('@')[2].replace('+', '*')}"
-        try:
-            return check_plants(expression)
-        except ValueError:
-            return ""
 
 
 def parse_fleet_token(token: str) -> FleetToken | None:
     """Parse the token of a fleet's monitor; None if it has another form.
 
-    >>> parse_fleet_token(fleet_token("0f", "5", "2", "a"))
-    FleetToken(fleet='0f', of='5', number='2', name='a')
+    >>> parse_fleet_token(fleet_token("reactor/*", "5", "2", "a"))
+    FleetToken(plants='reactor/*', of='5', number='2', name='a')
     """
     root, _, rest = token.partition(f"/{FLEET}/{ALIVE}/")
     parts = rest.split("/")
     if root != ROOT or len(parts) != 4 or not all(parts):
         return None
-    return FleetToken(*parts)
+    try:
+        return FleetToken(check_plants(f"{ROOT}/{parts[0].replace('+', '*')}"), *parts[1:])
+    except ValueError:
+        return None
 
 
 def samples_of(plants: str) -> str:

@@ -145,7 +145,7 @@ class ChartPoint(_message.Message):
     def __init__(self, time_ns: _Optional[int] = ..., statistic: _Optional[float] = ..., centre: _Optional[float] = ..., lower_limit: _Optional[float] = ..., upper_limit: _Optional[float] = ..., out: bool = ...) -> None: ...
 
 class Alarm(_message.Message):
-    __slots__ = ("time_ns", "alarm", "state", "priority", "raised_ns", "cleared_ns", "value", "limit", "unit", "contributions", "suspects", "text", "event", "incident", "first_in", "shelved_until_ns", "comment", "by")
+    __slots__ = ("time_ns", "alarm", "state", "priority", "raised_ns", "cleared_ns", "value", "limit", "unit", "contributions", "suspects", "text", "event", "incident", "first_in", "shelved_until_ns", "comment", "by", "names_cause")
     TIME_NS_FIELD_NUMBER: _ClassVar[int]
     ALARM_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -164,6 +164,7 @@ class Alarm(_message.Message):
     SHELVED_UNTIL_NS_FIELD_NUMBER: _ClassVar[int]
     COMMENT_FIELD_NUMBER: _ClassVar[int]
     BY_FIELD_NUMBER: _ClassVar[int]
+    NAMES_CAUSE_FIELD_NUMBER: _ClassVar[int]
     time_ns: int
     alarm: str
     state: AlarmState
@@ -182,7 +183,28 @@ class Alarm(_message.Message):
     shelved_until_ns: int
     comment: str
     by: str
-    def __init__(self, time_ns: _Optional[int] = ..., alarm: _Optional[str] = ..., state: _Optional[_Union[AlarmState, str]] = ..., priority: _Optional[_Union[Priority, str]] = ..., raised_ns: _Optional[int] = ..., cleared_ns: _Optional[int] = ..., value: _Optional[float] = ..., limit: _Optional[float] = ..., unit: _Optional[str] = ..., contributions: _Optional[_Iterable[_Union[Contribution, _Mapping]]] = ..., suspects: _Optional[_Iterable[_Union[Suspect, _Mapping]]] = ..., text: _Optional[str] = ..., event: _Optional[str] = ..., incident: _Optional[int] = ..., first_in: bool = ..., shelved_until_ns: _Optional[int] = ..., comment: _Optional[str] = ..., by: _Optional[str] = ...) -> None: ...
+    names_cause: bool
+    def __init__(self, time_ns: _Optional[int] = ..., alarm: _Optional[str] = ..., state: _Optional[_Union[AlarmState, str]] = ..., priority: _Optional[_Union[Priority, str]] = ..., raised_ns: _Optional[int] = ..., cleared_ns: _Optional[int] = ..., value: _Optional[float] = ..., limit: _Optional[float] = ..., unit: _Optional[str] = ..., contributions: _Optional[_Iterable[_Union[Contribution, _Mapping]]] = ..., suspects: _Optional[_Iterable[_Union[Suspect, _Mapping]]] = ..., text: _Optional[str] = ..., event: _Optional[str] = ..., incident: _Optional[int] = ..., first_in: bool = ..., shelved_until_ns: _Optional[int] = ..., comment: _Optional[str] = ..., by: _Optional[str] = ..., names_cause: bool = ...) -> None: ...
+
+class Incident(_message.Message):
+    __slots__ = ("time_ns", "number", "since_ns", "until_ns", "state", "alarms", "suspects", "text")
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    SINCE_NS_FIELD_NUMBER: _ClassVar[int]
+    UNTIL_NS_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    ALARMS_FIELD_NUMBER: _ClassVar[int]
+    SUSPECTS_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    time_ns: int
+    number: int
+    since_ns: int
+    until_ns: int
+    state: AlarmState
+    alarms: _containers.RepeatedScalarFieldContainer[str]
+    suspects: _containers.RepeatedCompositeFieldContainer[Suspect]
+    text: str
+    def __init__(self, time_ns: _Optional[int] = ..., number: _Optional[int] = ..., since_ns: _Optional[int] = ..., until_ns: _Optional[int] = ..., state: _Optional[_Union[AlarmState, str]] = ..., alarms: _Optional[_Iterable[str]] = ..., suspects: _Optional[_Iterable[_Union[Suspect, _Mapping]]] = ..., text: _Optional[str] = ...) -> None: ...
 
 class AlarmKpis(_message.Message):
     __slots__ = ("time_ns", "alarms_10min", "flood", "chattering", "standing", "stale", "priorities", "unacknowledged", "shelved", "suppressed", "out_of_service", "incidents")
@@ -271,7 +293,7 @@ class Reconstruction(_message.Message):
     def __init__(self, time_ns: _Optional[int] = ..., value: _Optional[float] = ..., sd: _Optional[float] = ..., unit: _Optional[str] = ..., measured: _Optional[float] = ..., cause: _Optional[str] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("time_ns", "node", "version", "phase", "uptime_s", "received", "lost", "late", "refused", "refused_by_reason", "lag_ms", "duplicated", "out_of_order", "published", "rows", "incomplete_rows", "heard_from_ns", "not_stored", "stalls", "reference", "training", "failures")
+    __slots__ = ("time_ns", "node", "version", "phase", "uptime_s", "received", "lost", "late", "refused", "refused_by_reason", "lag_ms", "duplicated", "out_of_order", "published", "rows", "incomplete_rows", "heard_from_ns", "not_stored", "stalls", "reference", "training", "failures", "waiting_for")
     class RefusedByReasonEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -315,6 +337,7 @@ class Health(_message.Message):
     REFERENCE_FIELD_NUMBER: _ClassVar[int]
     TRAINING_FIELD_NUMBER: _ClassVar[int]
     FAILURES_FIELD_NUMBER: _ClassVar[int]
+    WAITING_FOR_FIELD_NUMBER: _ClassVar[int]
     time_ns: int
     node: str
     version: str
@@ -337,7 +360,8 @@ class Health(_message.Message):
     reference: str
     training: float
     failures: _containers.ScalarMap[str, int]
-    def __init__(self, time_ns: _Optional[int] = ..., node: _Optional[str] = ..., version: _Optional[str] = ..., phase: _Optional[str] = ..., uptime_s: _Optional[float] = ..., received: _Optional[int] = ..., lost: _Optional[int] = ..., late: _Optional[int] = ..., refused: _Optional[int] = ..., refused_by_reason: _Optional[_Mapping[str, int]] = ..., lag_ms: _Optional[float] = ..., duplicated: _Optional[int] = ..., out_of_order: _Optional[int] = ..., published: _Optional[int] = ..., rows: _Optional[int] = ..., incomplete_rows: _Optional[int] = ..., heard_from_ns: _Optional[_Mapping[str, int]] = ..., not_stored: _Optional[int] = ..., stalls: _Optional[int] = ..., reference: _Optional[str] = ..., training: _Optional[float] = ..., failures: _Optional[_Mapping[str, int]] = ...) -> None: ...
+    waiting_for: str
+    def __init__(self, time_ns: _Optional[int] = ..., node: _Optional[str] = ..., version: _Optional[str] = ..., phase: _Optional[str] = ..., uptime_s: _Optional[float] = ..., received: _Optional[int] = ..., lost: _Optional[int] = ..., late: _Optional[int] = ..., refused: _Optional[int] = ..., refused_by_reason: _Optional[_Mapping[str, int]] = ..., lag_ms: _Optional[float] = ..., duplicated: _Optional[int] = ..., out_of_order: _Optional[int] = ..., published: _Optional[int] = ..., rows: _Optional[int] = ..., incomplete_rows: _Optional[int] = ..., heard_from_ns: _Optional[_Mapping[str, int]] = ..., not_stored: _Optional[int] = ..., stalls: _Optional[int] = ..., reference: _Optional[str] = ..., training: _Optional[float] = ..., failures: _Optional[_Mapping[str, int]] = ..., waiting_for: _Optional[str] = ...) -> None: ...
 
 class Baseline(_message.Message):
     __slots__ = ("time_ns", "what", "by", "why", "id", "model", "restored")
@@ -500,16 +524,6 @@ class BaselineCommand(_message.Message):
     why: str
     id: int
     def __init__(self, what: _Optional[str] = ..., by: _Optional[str] = ..., why: _Optional[str] = ..., id: _Optional[int] = ...) -> None: ...
-
-class ReplayCommand(_message.Message):
-    __slots__ = ("rows", "rate", "by")
-    ROWS_FIELD_NUMBER: _ClassVar[int]
-    RATE_FIELD_NUMBER: _ClassVar[int]
-    BY_FIELD_NUMBER: _ClassVar[int]
-    rows: int
-    rate: float
-    by: str
-    def __init__(self, rows: _Optional[int] = ..., rate: _Optional[float] = ..., by: _Optional[str] = ...) -> None: ...
 
 class CommandReply(_message.Message):
     __slots__ = ("accepted", "text", "alarms", "baselines")

@@ -5,7 +5,7 @@ from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 
 from reactorwatch.description.process import Process, describe_model
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, describe_exception
 from reactorwatch.process import MODELS
 
 GROUP = "reactorwatch.processes"
@@ -30,7 +30,7 @@ def _load(entry: EntryPoint) -> Process:
     try:
         found = entry.load()()
     except Exception as error:  # code of another package may raise anything
-        raise InputError(f"{name}: {type(error).__name__}: {error}") from error
+        raise InputError(f"{name}: {describe_exception(error)}") from error
     return check_process(found, name)
 
 

@@ -1,4 +1,8 @@
-"""Find a process: by name in the catalogue, or in a file that describes it (`.toml`, `.py`, `extended.json`)."""
+"""Find a process: by name in the catalogue, or in a file that describes it (`.toml`, `.py`, `extended.json`).
+
+Only a user chooses a file, by an option, a settings file or an argument (`find_process`). A name that data state, such
+as the settings in a recording, is looked up in the catalogue (`find_in_catalogue`) and never opened as a path.
+"""
 
 import runpy
 from dataclasses import replace
@@ -7,10 +11,10 @@ from pathlib import Path
 from reactorwatch.description.catalogue import catalogue, check_process
 from reactorwatch.description.process import Process, describe_model
 from reactorwatch.description.toml_file import parse_process, parse_tables
-from reactorwatch.errors import InputError, describe_unknown, prefix_errors
+from reactorwatch.errors import InputError, describe_exception, describe_unknown, prefix_errors
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.input_file import wrap_read_errors
+from reactorwatch.records.input_file import read_regular, wrap_read_errors
 
 FUNCTION = "process"
 """Function of a `.py` file that returns the process."""
@@ -46,8 +50,8 @@ def find_process(
     kind = path.suffix.lower()
     if kind not in FILE_KINDS:
         return _find_by_name(str(process), "process", "a path to a .toml, .py or .json file")
-    with wrap_read_errors(path):
-        content = path.read_bytes()
+    with wrap_read_errors(path), prefix_errors(f"process file {path}"):
+        content = read_regular(path)
     with prefix_errors(f"process file {path}"):
         if kind == ".toml":
             return parse_process(content, lambda name: _find_equations(name, path.parent, zero_ns, on_bus=on_bus))
@@ -59,6 +63,25 @@ def find_process(
         elif zero_ns:
             extended = extended.rebase(zero_ns)
         return build_process(extended)
+
+
+def find_in_catalogue(name: str, source: str) -> Process:
+    """Find a process that data name: in the catalogue only, whatever file the name may be the path of.
+
+    Args:
+        name: the name, as the data state it.
+        source: the data, for the error.
+
+    Raises:
+        InputError: the catalogue has no such process.
+    """
+    processes = catalogue()
+    if name not in processes:
+        raise InputError(
+            f"{source}: is of process {name!r}, which is in no catalogue here, and a file that data name is not "
+            "opened; name its file by --process"
+        )
+    return processes[name]()
 
 
 def build_process(extended: ExtendedModel) -> Process:
@@ -91,9 +114,11 @@ def _find_equations(name: str, folder: Path, zero_ns: int, *, on_bus: bool) -> P
 def _call_function(path: Path) -> object:
     """Run a file of the user, as `python FILE` would, and call its function."""
     try:
-        return runpy.run_path(str(path))[FUNCTION]()
-    except InputError:
+        names = runpy.run_path(str(path))
+        if FUNCTION in names:
+            return names[FUNCTION]()
+    except (InputError, KeyboardInterrupt):
         raise
-    except Exception as error:  # the user's code may raise anything
-        missing = f"; it must have a function {FUNCTION}() that returns a Process" if error.args == (FUNCTION,) else ""
-        raise InputError(f"{type(error).__name__}: {error}{missing}") from error
+    except BaseException as error:  # the user's code may raise anything, and may call sys.exit
+        raise InputError(describe_exception(error)) from error
+    raise InputError(f"it must have a function {FUNCTION}() that returns a Process, got none")

@@ -1,5 +1,6 @@
 """A process: its signals with their roles and, if there are any, equations, effects and controllers."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -7,7 +8,7 @@ from typing import Literal, get_args
 
 import msgspec
 
-from reactorwatch.errors import InputError, describe_unknown, prefix_errors
+from reactorwatch.errors import InputError, describe_exception, describe_unknown, prefix_errors
 from reactorwatch.process import OPERATIONS, own_effects
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.effect_twins import add_generic
@@ -191,14 +192,17 @@ class Process:
         """Copy with the signals alone."""
         return replace(self, equations=None, effects=(), controllers=(), parameters={}, generic=False)
 
-    def require_model(self) -> ProcessModel:
+    def require_model(self, kind: type[InputError] = InputError) -> ProcessModel:
         """The model.
+
+        Args:
+            kind: kind of the error.
 
         Raises:
             InputError: the process has no equations.
         """
         if self.model is None:
-            raise InputError(
+            raise kind(
                 f"process {self.name!r}: must have equations for this, got none; name those of the catalogue with "
                 'equations = "NAME", or write them in a .py file'
             )
@@ -232,7 +236,7 @@ class Process:
             ("name", names),
             ("column", [signal.name if signal.column is None else signal.column for signal in self.signals]),
         ):
-            twice = next((value for value in values if values.count(value) > 1), None)
+            twice = next((value for value, times in Counter(values).items() if times > 1), None)
             if twice is not None:
                 owners = [
                     f"{s.name} ({s.role})" for s, value in zip(self.signals, values, strict=True) if value == twice
@@ -270,7 +274,7 @@ class Process:
         assert extended is not None
         if extended.effects is not None:  # its equations may be code of the user
             _check_expressions(self.name, extended)
-        for effect in extended.effects or ():
+        for effect in own_effects(extended) if extended.effects is not None else ():
             _check_effect(self.name, effect, extended)
 
 
@@ -300,7 +304,7 @@ def _check_effect(process: str, effect: Effect, model: ProcessModel) -> None:
     except Exception as error:
         name = getattr(effect, "name", type(effect).__name__)
         raise InputError(
-            f"process {process!r}, effect {name!r}: must extend the equations, got {type(error).__name__}: {error}"
+            f"process {process!r}, effect {name!r}: must extend the equations, got {describe_exception(error)}"
         ) from error
 
 

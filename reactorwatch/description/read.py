@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from reactorwatch.arrays import Array
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import DEFAULT_PROCESS
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.read_table import MissingColumnError, SignalColumn, read_table
-from reactorwatch.records.record import Record
+from reactorwatch.records.record import LARGEST_VALUE, Record
 from reactorwatch.records.time_column import STANDARD
 from reactorwatch.units import conversion
 
@@ -32,7 +33,7 @@ def read_process_table(
 
     Returns:
         The record, in the units of the equations; without equations, in those of the signals. A value outside the
-        bounds of its signal is NaN, as if it was not measured; `read_as` has their number.
+        bounds of its signal is NaN, as if it was not measured; `excluded` has it, and `read_as` their number.
 
     Raises:
         InputError: as `read_table`; or `columns` names no signal of the process.
@@ -65,7 +66,7 @@ def read_process_table(
         if process.model is None:
             cure += ", or its columns with --input and --output"
         raise InputError(f"{error}; if it is no record of the reactor, {cure}") from error
-    return _to_model_units(_drop_impossible(measured, process), process)
+    return _to_model_units(_exclude_impossible(measured, process), process)
 
 
 def read_signals(
@@ -86,7 +87,7 @@ def read_signals(
 
 
 def convert_to_process(record: Record, process: Process) -> Record:
-    """Convert recorded signals to the units of a process, without values outside their bounds.
+    """Convert recorded signals to the units of a process, and exclude values outside their bounds.
 
     Args:
         record: samples in the units that they were published in; one without a unit is in that of its signal.
@@ -97,12 +98,16 @@ def convert_to_process(record: Record, process: Process) -> Record:
     """
     known = {name: unit for name, unit in process.units.items() if name in record.columns}
     described = replace(record, units={**known, **record.units})
-    return _to_model_units(_drop_impossible(_convert(described, known), process), process)
+    return _to_model_units(_exclude_impossible(_convert(described, known), process), process)
 
 
-def _drop_impossible(record: Record, process: Process) -> Record:
-    """Replace values outside the bounds of their signals by NaN."""
-    columns, notes = dict(record.columns), [record.read_as] if record.read_as else []
+def _exclude_impossible(record: Record, process: Process) -> Record:
+    """Exclude values outside the bounds of their signals.
+
+    Those of an input or output remain samples, since a monitor checks their range.
+    """
+    columns, excluded = record.raw_columns, dict[str, Array]()
+    notes = [record.read_as] if record.read_as else []
     for signal in process.signals:
         if signal.bounds is None or signal.name not in columns:
             continue
@@ -111,8 +116,11 @@ def _drop_impossible(record: Record, process: Process) -> Record:
         outside = (values < low) | (values > high)
         if outside.any():
             columns[signal.name] = np.where(outside, np.nan, values)
-            notes.append(f"{np.count_nonzero(outside)} values of {signal.name} outside {low:g} to {high:g} left out")
-    return replace(record, columns=columns, read_as=", ".join(notes))
+            if signal.role in ("input", "output"):
+                excluded[signal.name] = np.where(outside & (np.abs(values) < LARGEST_VALUE), values, np.nan)
+            counted = f"{np.count_nonzero(outside)} values of {signal.name} outside {low:g} to {high:g}"
+            notes.append(f"{counted} are no measurements")
+    return replace(record, columns=columns, read_as=", ".join(notes), excluded=excluded)
 
 
 def _to_model_units(record: Record, process: Process) -> Record:
@@ -122,11 +130,13 @@ def _to_model_units(record: Record, process: Process) -> Record:
 
 def _convert(record: Record, wanted_units: Mapping[str, str]) -> Record:
     """Convert signals to units, by name of the signal."""
-    columns, units = dict(record.columns), dict(record.units)
+    columns, units, excluded = dict(record.columns), dict(record.units), dict(record.excluded)
     for name, wanted in wanted_units.items():
         unit = units.get(name, wanted)
         if unit == wanted or name not in columns:
             continue
         scale, offset = conversion(unit, wanted, f"{record.name}, signal {name!r}")
         columns[name], units[name] = scale * columns[name] + offset, wanted
-    return replace(record, columns=columns, units=units)
+        if name in excluded:
+            excluded[name] = scale * excluded[name] + offset
+    return replace(record, columns=columns, units=units, excluded=excluded)

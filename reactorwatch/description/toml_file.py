@@ -9,8 +9,8 @@ import msgspec
 
 from reactorwatch.description.process import KnownParameter, Process, Signal, describe_model
 from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.limits import parse_toml
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.toml_text import parse_toml
 
 _Column = str | Annotated[int, msgspec.Meta(ge=1)]
 
@@ -30,6 +30,7 @@ class _Time(msgspec.Struct, forbid_unknown_fields=True):
     unit: str | None = None
     zone: str | None = None
     format: str | None = None
+    dates: str | None = None
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
@@ -37,6 +38,9 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     separator: str | None = None
     decimal: str | None = None
     transposed: bool | None = None
+    tag: _Column | None = None
+    value: _Column | None = None
+    quality_good: tuple[str | int, ...] = ()
 
 
 class _Document(msgspec.Struct, forbid_unknown_fields=True):
@@ -53,10 +57,14 @@ class _Document(msgspec.Struct, forbid_unknown_fields=True):
 _KEYS = {
     "--time-unit": "[time] unit",
     "--time-format": "[time] format",
+    "--missing": "missing",
+    "--dates": "[time] dates",
     "--period": "[time] period",
     "--zone": "[time] zone",
     "--separator": "[file] separator",
     "--decimal": "[file] decimal",
+    "--tag": "[file] tag",
+    "--value": "[file] value",
 }
 """Keys by the options that state the same."""
 
@@ -112,8 +120,8 @@ def parse_tables(tables: Mapping[str, Any], find_equations: Callable[[str], Proc
 def to_tables(process: Process) -> dict[str, Any]:
     """Tables that describe the signals and files of a process, without its equations; `parse_tables` reads them."""
     stated = process.file_format
-    time = _Time(stated.time, stated.period, stated.time_unit, stated.zone, stated.time_format)
-    file = _File(stated.header, stated.separator, stated.decimal, stated.transposed)
+    time = _Time(stated.time, stated.period, stated.time_unit, stated.zone, stated.time_format, stated.dates)
+    file = _File(**{field.name: getattr(stated, field.name) for field in msgspec.structs.fields(_File)})
     signals = [
         {name: value for name, value in asdict(signal).items() if value is not None and value != ""}
         for signal in process.signals
@@ -126,7 +134,9 @@ def to_tables(process: Process) -> dict[str, Any]:
         **{
             name: given
             for name, table in (("time", time), ("file", file))
-            if (given := {key: value for key, value in msgspec.structs.asdict(table).items() if value is not None})
+            if (
+                given := {key: value for key, value in msgspec.structs.asdict(table).items() if value not in (None, ())}
+            )
         },
     }
 
@@ -146,7 +156,7 @@ def add_description(extended: Mapping[str, Any], process: Process) -> dict[str, 
 
 def _file_format(document: _Document) -> FileFormat:
     """Statements of a document about its files."""
-    time = document.time
+    time, file = document.time, document.file
     if time.column is not None and time.period is not None:
         raise InputError(
             f"[time] has a column or a period, got column {time.column!r} and period {time.period!r}; leave one out"
@@ -157,9 +167,15 @@ def _file_format(document: _Document) -> FileFormat:
             time_unit=time.unit,
             zone=time.zone,
             time_format=time.format,
+            dates=time.dates,
             period=time.period,
             missing=tuple(str(cell) for cell in document.missing),
-            **msgspec.structs.asdict(document.file),
+            **{
+                **msgspec.structs.asdict(file),
+                "tag": None if file.tag is None else str(file.tag),
+                "value": None if file.value is None else str(file.value),
+                "quality_good": tuple(map(str, file.quality_good)),
+            },
         )
     except InputError as error:
         text = str(error)

@@ -101,7 +101,8 @@ def diagnose(
     bands = tolerances_of(whole, model, tolerance or {})
     plant = add_priors(model, uncertain or {})
     hidden = hidden_sources(model, tuple(effects))
-    search = Search(plant, (*effects, *hidden), whole, smallest_noise(model))
+    smallest_sd = smallest_noise(model, whole.measured)
+    search = Search(plant, (*effects, *hidden), whole, smallest_sd)
     run = search.run
     result = search_single_cause(search)
     if search.adopt_colored_noise(result.best):
@@ -146,10 +147,11 @@ def diagnose(
             remarks.append("a lasting cause simulates the rows that were held out better than one that drifts")
     best.hypothesis.filter.noise, result.nominal.hypothesis.filter.noise = result.noise, result.nominal_noise
     law = unknown.law if unknown is not None and verdict == UNKNOWN and unknown.location == location else None
+    reported = None
     if law is None:
         best, covariances = refine_parameters(search, best)
     else:
-        best = law_hypothesis(law, run)
+        reported, best = law_hypothesis(law, run, model, uncertain or {})
         if unknown is not None and unknown.approximation > LISTED:
             remarks.append(
                 f"the law is an approximation: a smooth correction there is better by {unknown.approximation:.0f} BIC"
@@ -158,6 +160,7 @@ def diagnose(
     before, after = evaluate_holdout(run, result.nominal, best)
     curves = curves_of(whole, run, model, result.nominal, best, covariances)
     noise_sd = _noise_sd(result, run, model, curves, verdict) if law is None else law.noise_sd(model)
+    noise_sd = np.maximum(noise_sd, smallest_sd)
     unexplained = verdict == UNKNOWN and residual_exceeds_tolerance(before, noise_sd, model, bands)
     if verdict == UNKNOWN and not unexplained and looks_like_integration(plant, run, result.nominal.fit.innovations):
         location = TIMING
@@ -182,7 +185,11 @@ def diagnose(
         remarks.append(experiment)
         experiment = None
     gain = _gain(model, result.nominal.bic - best.bic, noise_sd, before, after)
-    described = None if law is None or unknown is None else describe_law(adjusted, run, unknown.found, gain.held_out)
+    described = (
+        None
+        if reported is None or unknown is None
+        else describe_law(adjusted, run, unknown.found, reported, covariances, gain.held_out)
+    )
     return Diagnosis(
         samples=run.time_min.size,
         span_min=record.span_min,
@@ -196,7 +203,7 @@ def diagnose(
         gain=gain,
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
         experiment=experiment,
-        extended_model=extended_model(adjusted, effects, causes, record.zero_ns, None if law is None else law.law),
+        extended_model=extended_model(adjusted, effects, causes, record.zero_ns, reported),
         remarks=tuple(remarks),
         parameters=parameters,
         curves=curves,

@@ -12,7 +12,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.colored_noise import LOW, Noise, power_spectrum
-from reactorwatch.diagnosis.fitting.outliers import resolution
+from reactorwatch.kalman.resolution import resolution_sd
 
 ROUNDS = 100
 """Number of multiplicative steps, after which the levels change by less than a thousandth."""
@@ -37,8 +37,7 @@ def estimate_sensor_noise(
     for index, name in enumerate(outputs):
         decay = float(np.exp(-period_min / time_min[name])) if name in time_min else 0.0
         level = _high_frequency_sd(residual[:, index], decay)
-        rounding = resolution(measured[:, index]) / np.sqrt(12.0)
-        sd[index] = min(sd[index], max(level, rounding))
+        sd[index] = min(sd[index], max(level, resolution_sd(measured[:, index])))
     return sd
 
 

@@ -87,7 +87,7 @@ def identifiability(model: ProcessModel, effects: Sequence[Effect], run: Run) ->
         effects: possible causes.
         run: the excitation; its noise levels are those under which the nominal model is most likely.
     """
-    search = Search(model, effects, run, smallest_noise(model))
+    search = Search(model, effects, run, smallest_noise(model, run.measured))
     nominal = search.fit_nominal()
     wanted = FOLLOWED * _least_noncentrality(REFUTED + log(search.run.values))
     causes = [

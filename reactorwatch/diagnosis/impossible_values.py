@@ -52,9 +52,10 @@ def _check_column(record: Record, name: str, bounds: Bounds) -> None:
     row = int(rows[0])
     others = np.count_nonzero(values[rows] == values[row]) - 1
     also = f" (and {others} more of it)" if others else ""
+    read_as = f"; read as: {record.read_as}" if "--missing" in record.read_as else ""  # a code, in the file's unit
     raise InputError(
         f"{_place(record, row)}, column {name!r}: must be in [{lower:g}, {upper:g}] {unit}, "
-        f"got {values[row]:g}{also}; empty the cells that mean 'not measured'"
+        f"got {values[row]:g}{also}; empty the cells that mean 'not measured'{read_as}"
     )
 
 

@@ -20,6 +20,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.process.model import Parameter, ProcessModel, parameter, variable
+from reactorwatch.units import absolute
 
 _OFF, _BEGIN = ".off", ".begin"
 _PRIOR = re.compile(r"\+?([\d.]+(?:[eE][-+]?\d+)?)\s*(\D.*)?")
@@ -29,7 +30,7 @@ def parse_priors(text: str, model: ProcessModel) -> dict[str, float]:
     """Parse priors such as `K3=2%,Tf=0.5K`: standard deviations by name, in the parameters' units.
 
     Args:
-        text: for each parameter a percentage of its value, or a number with its unit.
+        text: for each parameter a percentage of its value, or a number with its unit; of degC and degF only a number.
         model: process model with the parameters.
 
     Raises:
@@ -45,6 +46,8 @@ def parse_priors(text: str, model: ProcessModel) -> dict[str, float]:
         unit = (match[2] or "").strip()
         if unit not in ("%", item.unit):
             raise InputError(f"uncertain {name} must be in % or in {item.unit}, got {value!r}")
+        if unit == "%" and absolute(item.value, item.unit) is not None:
+            raise InputError(f"uncertain {name} must be in {item.unit}, of which a share is no size, got {value!r}")
         try:
             amount = float(match[1])
         except ValueError:

@@ -7,7 +7,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.impossible_values import check_values
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.units import find_wrong_unit
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 
@@ -35,7 +35,9 @@ def make_run(record: Record, model: ProcessModel) -> Run:
     """
     name = record.name
     if record.rows < FEWEST_ROWS:
-        raise InputError(f"{name}: a diagnosis needs at least {FEWEST_ROWS} rows, got {record.rows}; record for longer")
+        raise UnfitRecordError(
+            f"{name}: a diagnosis needs at least {FEWEST_ROWS} rows, got {record.rows}; record for longer"
+        )
     missing = [item for item in (*model.input_names, *model.output_names) if item not in record.columns]
     if missing:
         raise InputError(
@@ -47,12 +49,12 @@ def make_run(record: Record, model: ProcessModel) -> Run:
         values = record.columns[output.name]
         finite = values[np.isfinite(values)]
         if finite.size < FEWEST_VALUES:
-            raise InputError(
+            raise UnfitRecordError(
                 f"{name}: {output.name} needs at least {FEWEST_VALUES} values, got {finite.size}; "
                 "is the column the right one, and is the sensor recorded?"
             )
         if np.ptp(finite) == 0.0:
-            raise InputError(
+            raise UnfitRecordError(
                 f"{name}: {output.name} must vary, it is {finite[0]:g} {output.unit} in every row; "
                 "the sensor is stuck, or the column is not what it seems"
             )
@@ -62,7 +64,7 @@ def make_run(record: Record, model: ProcessModel) -> Run:
         values = np.concatenate([_hold_last(part.columns[item.name]) for part in record.split_runs()])
         if not np.all(np.isfinite(values)):
             of_run = "the first row" if record.runs is None else "the first row of each run"
-            raise InputError(
+            raise UnfitRecordError(
                 f"{name}: {item.name} must be there in {of_run}; leave out the rows before its first value"
             )
         inputs.append(values)
@@ -71,7 +73,7 @@ def make_run(record: Record, model: ProcessModel) -> Run:
         raise InputError(f"{name}: {wrong.text}")
     check_values(record, model)
     if all(np.ptp(values) <= LEAST_MOVE * item.scale for values, item in zip(inputs, model.inputs, strict=True)):
-        raise InputError(
+        raise UnfitRecordError(
             f"{name}: {', '.join(model.input_names)} must move, it is {inputs[0][0]:g} all the time; "
             "causes cannot be distinguished without excitation: record an interval with steps in it"
         )

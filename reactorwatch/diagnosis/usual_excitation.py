@@ -5,6 +5,8 @@ is unknown), `STEP_ROWS` rows each, from the stable steady state there. A row is
 that state is reached, so every process moves at its own speed.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from reactorwatch.arrays import Array
@@ -27,8 +29,13 @@ ROWS_A_TIME_CONSTANT = 10.0
 SHORTEST_PERIOD_MIN, LONGEST_PERIOD_MIN = 1e-3, 10.0
 
 
-def excite(model: ProcessModel) -> Record:
-    """Record of the process with its usual excitation and noise."""
+def excite(model: ProcessModel, resolution: Mapping[str, float] | None = None) -> Record:
+    """Record of the process with its usual excitation and noise.
+
+    Args:
+        model: process model of the plant.
+        resolution: smallest step between two values of an output, by name, in its unit; others are continuous.
+    """
     usual = np.array(
         [0.5 * (item.lower + item.upper) if item.usual is None else item.usual for item in model.inputs], dtype=float
     )
@@ -47,9 +54,9 @@ def excite(model: ProcessModel) -> Record:
     start = reference_point(model)[0] if rest is None else rest.state
     outputs = Simulator(model).run(time_min, inputs, start[: _own_states(model)]).outputs
     outputs = outputs + NOISE_SHARE * np.array(output_scales(model)) * rng.standard_normal(outputs.shape)
-    columns = dict(zip(model.input_names, inputs.T, strict=True)) | dict(
-        zip(model.output_names, outputs.T, strict=True)
-    )
+    columns = dict(zip((*model.input_names, *model.output_names), np.hstack([inputs, outputs]).T, strict=True))
+    for name, step in (resolution or {}).items():
+        columns[name] = step * np.round(columns[name] / step)
     return Record(time_min, columns, f"usual excitation of {model.name}")
 
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reactorwatch.errors import InputError
-from reactorwatch.identification.adaptation import AdaptiveRegression
+from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.linear_predictor import Kind
 from reactorwatch.identification.rls import RecursiveLeastSquares
@@ -58,7 +57,7 @@ def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
     if len(y) != rows:
         raise InputError(f"regressors and outputs must have equally many rows, got {rows} and {len(y)}")
     if rows < parameters:
-        raise InputError(f"{parameters} parameters need at least {parameters} complete rows, got {rows}")
+        raise UnfitRecordError(f"{parameters} parameters need at least {parameters} complete rows, got {rows}")
     for name, values in (("regressors", x), ("outputs", y)):
         if not np.all(np.isfinite(values)):
             row = int(np.argmin(np.isfinite(values).all(axis=1)))
@@ -67,7 +66,7 @@ def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
     values = np.linalg.svd(r, compute_uv=False)
     condition = float(values[0] / values[-1]) if values[-1] > 0.0 else np.inf
     if condition > SINGULAR_CONDITION:
-        raise InputError(
+        raise UnfitRecordError(
             f"the rows don't determine {parameters} parameters: condition number {condition:.1e}, at most "
             f"{SINGULAR_CONDITION:.0e} can be solved; try a lower order, slower sampling, other rows, a livelier input"
         )
@@ -125,7 +124,7 @@ def unscale(kind: Kind, structure: Structure, scaling: Scaling, solution: LeastS
     return LinearModel(kind, structure, parameters, covariance, noise_sd, solution.condition, solution.rows)
 
 
-def solution_of(estimator: RecursiveLeastSquares | AdaptiveRegression) -> LeastSquares:
+def solution_of(estimator: RecursiveLeastSquares) -> LeastSquares:
     """Solution from a recursive estimator."""
     return LeastSquares(
         estimator.parameters,

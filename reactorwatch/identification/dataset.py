@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.structure import as_columns
 from reactorwatch.records.record import Record
 
@@ -88,7 +88,7 @@ class Dataset:
             if signal not in record.columns:
                 raise InputError(f"{record.name}: holds no signal {signal!r}, only {', '.join(record.columns)}")
             if not np.isfinite(record.columns[signal]).any():
-                raise InputError(
+                raise UnfitRecordError(
                     f"{record.name}: {signal} has no measured value, so no model of {output} can be fitted"
                 )
         columns = [record.columns[name] for name in inputs]
@@ -122,15 +122,15 @@ class Dataset:
         for name, values in zip((self.output_name, *self.input_names), (self.output.T[0], *self.inputs.T), strict=True):
             measured = values[np.isfinite(values)]
             if measured.size == 0:
-                raise InputError(f"{name} has no measured value in the rows to fit, so no model can be fitted")
+                raise UnfitRecordError(f"{name} has no measured value in the rows to fit, so no model can be fitted")
             if np.ptp(measured) > 0.0:
                 continue
             if name == self.output_name:
-                raise InputError(
+                raise UnfitRecordError(
                     f"output {name} is constant, {measured[0]:g} in all rows to fit: there is nothing to identify; "
                     "name another output, or a record in which it changes"
                 )
-            raise InputError(
+            raise UnfitRecordError(
                 f"input {name} never moves, {measured[0]:g} in all rows to fit: a constant input excites none of the "
                 "orders; leave it out, or record rows in which it moves"
             )

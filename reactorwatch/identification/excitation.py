@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import UnfitRecordError
 from reactorwatch.identification.instrumental_variable import instrumental_variable
 from reactorwatch.identification.regressor import consecutive_rows
 from reactorwatch.identification.scaled_record import ScaledRecord
@@ -164,7 +164,7 @@ def conditioning(record: ScaledRecord) -> Check:
     """
     structure, regressors = record.structure, record.rows().regressors
     if len(regressors) < structure.parameters:
-        raise InputError(f"{structure.parameters} parameters need as many complete rows, got {len(regressors)}")
+        raise UnfitRecordError(f"{structure.parameters} parameters need as many complete rows, got {len(regressors)}")
     return condition_check(float(np.linalg.cond(regressors)))
 
 

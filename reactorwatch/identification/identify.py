@@ -1,30 +1,26 @@
 """Identify models of one output from a record, and validate them on rows that they have not seen."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, cast, get_args
+from typing import Any
 
 import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
 from reactorwatch.arrays import Array
-from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.identification import report_scheme
-from reactorwatch.identification.adaptation import GAINS, AdaptiveRegression
+from reactorwatch.errors import InputError, UnfitRecordError, describe_unknown
 from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, solution_of, unscale
 from reactorwatch.identification.dataset import Dataset
 from reactorwatch.identification.excitation import check_record
 from reactorwatch.identification.free_run import FittedModel, free_run
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
-from reactorwatch.identification.linear_predictor import Kind
 from reactorwatch.identification.output_error import fit_oe
 from reactorwatch.identification.polynomial_narx import PolynomialModel, fit_narx, name_product
 from reactorwatch.identification.polynomial_oe import fit_noe
 from reactorwatch.identification.prediction_error import fit_armax, fit_box_jenkins
-from reactorwatch.identification.recursive_prediction_error import RecursivePredictionError
-from reactorwatch.identification.regressor import consecutive_rows, rows_of
+from reactorwatch.identification.regressor import rows_of
 from reactorwatch.identification.residual_tests import DEFAULT_LAGS, independence, whiteness
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
@@ -38,17 +34,6 @@ MODELS: dict[str, Callable[..., FittedModel]] = {
     "noe": fit_noe,
 }
 """Fits by the kind of model."""
-
-SCHEMES: Mapping[str, Mapping[str, Callable[..., FittedModel]]] = {
-    "least-squares": MODELS,
-    "report": report_scheme.MODELS,
-}
-"""Fits by scheme and kind of model."""
-
-FORGETTING = "forgetting"
-
-RECURSIVE_MODELS: tuple[str, ...] = get_args(Kind)
-"""Models that can be learned row by row."""
 
 WORST_MINUS_LOG10_P = 6.0
 
@@ -65,11 +50,9 @@ class ModelForm:
             prediction, and of degree 3, fitted by simulation).
         order: number of lags of the output, of each input and of the disturbance.
         delay: samples from a move of an input to its first effect, at least 1.
-        recursive: whether it is learned row by row instead of from all rows at once.
-        forgetting: forgetting factor of the recursive methods, in (0, 1].
-        adaptation: gain of a recursive ARX model: `forgetting` (least squares), or one of `adaptation.GAINS`.
-        gain: gain of an adaptation other than `forgetting`; None: its default.
-        scheme: `least-squares`, or `report` for the scheme of the original report (see `report_scheme`).
+        recursive: whether an ARX model is learned row by row, by recursive least squares, instead of from all rows at
+            once.
+        forgetting: forgetting factor of recursive least squares, in (0, 1].
 
     Raises:
         InputError: an unknown kind of model, or a choice that it does not have.
@@ -80,30 +63,14 @@ class ModelForm:
     delay: int = 1
     recursive: bool = False
     forgetting: float = 1.0
-    adaptation: str = FORGETTING
-    gain: float | None = None
-    scheme: str = "least-squares"
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise InputError(describe_unknown("model", self.model, MODELS))
-        if self.recursive and self.model not in RECURSIVE_MODELS:
-            raise InputError(f"only {', '.join(RECURSIVE_MODELS)} can be recursive, got {self.model}")
-        if self.adaptation not in (FORGETTING, *GAINS):
-            raise InputError(describe_unknown("adaptation", self.adaptation, (FORGETTING, *GAINS)))
-        if not self.recursive and (self.adaptation, self.gain, self.forgetting) != (FORGETTING, None, 1.0):
-            raise InputError("adaptation, gain and forgetting are of recursive models: add --recursive")
-        if self.adaptation == FORGETTING and self.gain is not None:
-            raise InputError(f"a gain is of an adaptation, {', '.join(GAINS)}: of {FORGETTING} give the factor")
-        if self.adaptation != FORGETTING and (self.model != "arx" or self.forgetting != 1.0):
-            raise InputError(f"adaptation {self.adaptation} is for arx, without forgetting, got {self.model}")
-        if self.scheme not in SCHEMES:
-            raise InputError(describe_unknown("scheme", self.scheme, SCHEMES))
-        if self.model not in SCHEMES[self.scheme] or (self.recursive and self.scheme == "report"):
-            raise InputError(
-                f"scheme {self.scheme} fits {' and '.join(SCHEMES[self.scheme])}, and no recursive model, got "
-                f"{'recursive ' if self.recursive else ''}{self.model}"
-            )
+        if self.recursive and self.model != "arx":
+            raise InputError(f"only arx can be recursive, got {self.model}: leave --recursive out")
+        if not self.recursive and self.forgetting != 1.0:
+            raise InputError(f"forgetting is of a recursive model, got {self.forgetting:g}: add --recursive")
 
 
 class Deviations(msgspec.Struct, frozen=True):
@@ -262,11 +229,6 @@ def identify_and_run(
         # Where the input is to blame, that is the cause to name.
         excitation = checks.get("excitation", "ok")
         raise refusal if excitation == "ok" else InputError(excitation) from refusal
-    if form.scheme == "report" and isinstance(model, LinearModel) and model.condition > SINGULAR_CONDITION:
-        checks["rows"] = (
-            f"the report's rows do not determine {form.order * (1 + structure.inputs)} parameters, condition number "
-            f"{model.condition:.0e}: these are the parameters of least norm"
-        )
     residuals = model.residuals(*fitted.arrays)[:, 0]
     of_own_past = {"arx": form.order, "narx": form.order, "oe": 0, "noe": 0}.get(form.model, 2 * form.order)
     lags, white = max(DEFAULT_LAGS, of_own_past + 10), math.nan
@@ -301,7 +263,7 @@ def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out
     of_noise = {"armax": form.order, "bj": 2 * form.order}.get(form.model, 0)
     least = structure.history + structure.parameters + of_noise
     if fitted.rows <= least:
-        raise InputError(
+        raise UnfitRecordError(
             f"order {form.order} with delay {form.delay} needs more than {least} rows to fit, the first half of the "
             f"record unless another validates, got {fitted.rows}; lower the order, or record for longer"
         )
@@ -315,26 +277,14 @@ def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out
 def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
     u, y, t = data.arrays
     if not form.recursive:
-        return SCHEMES[form.scheme][form.model](structure, u, y, t)
+        return MODELS[form.model](structure, u, y, t)
     scaling = Scaling.of(u, y)
-    if form.model != "arx":
-        running = RecursivePredictionError(structure, scaling, form.forgetting, cast(Kind, form.model))
-        for k, unbroken_rows in enumerate(consecutive_rows(np.concatenate([u, y], axis=1), t)):
-            if unbroken_rows <= 1:
-                running.restart()
-            if unbroken_rows:
-                running.update(u[k], float(y[k, 0]))
-        return running.model
-    estimator: RecursiveLeastSquares | AdaptiveRegression
-    if form.adaptation == FORGETTING:
-        estimator = RecursiveLeastSquares(structure.parameters, form.forgetting)
-    else:
-        estimator = AdaptiveRegression(structure.parameters, form.adaptation, form.gain)
+    estimator = RecursiveLeastSquares(structure.parameters, form.forgetting)
     rows = rows_of(structure, scaling.inputs(u), scaling.outputs(y), t)
     for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
         estimator.update(regressor, float(value))
     if estimator.condition >= SINGULAR_CONDITION:
-        raise InputError(f"the rows don't determine {structure.parameters} parameters")
+        raise UnfitRecordError(f"the rows don't determine {structure.parameters} parameters")
     return unscale("arx", structure, scaling, solution_of(estimator))
 
 

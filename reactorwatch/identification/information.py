@@ -15,10 +15,7 @@ at condition 1e8 the parameters lose a digit or two against LAPACK. A second num
 rounds away, found by Knuth's exact sum (The Art of Computer Programming, vol. 2, section 4.2.2, theorem B). With
 forgetting, rounding is forgotten too.
 
-One kernel serves one plant and ten thousand. The memory of up to 64 plants is a tile, an array (quantity, plant):
-the inner loops run over plants, so the compiler turns them into vector instructions, and a tile stays in the
-nearest cache; a single plant is a tile of one. Every plant goes through the same operations in the same order, so
-the bits are the same. (Per-plant branches are written as selections for this reason.)
+The memory of an estimator is a tile, an array (quantity, plant), of one plant.
 """
 
 import numpy as np
@@ -26,7 +23,6 @@ from numpy.typing import NDArray
 
 from reactorwatch.codegen.numba_kernel import jit
 
-TILE_PLANTS = 64
 LARGEST_VALUE = 1e30
 """Regressors and outputs at or beyond this are refused."""
 
@@ -213,15 +209,6 @@ def is_acceptable(regressor: NDArray[np.float64], output: float) -> bool:
 
 
 @jit
-def first_invalid(regressors: NDArray[np.float64], outputs: NDArray[np.float64], present: NDArray[np.bool_]) -> int:
-    """Index of the first present plant whose row is not acceptable; -1 if there is none."""
-    for plant in range(outputs.size):
-        if present[plant] and not is_acceptable(regressors[plant], outputs[plant]):
-            return plant
-    return -1
-
-
-@jit
 def learn_one(
     tile: NDArray[np.float64],
     regressor: NDArray[np.float64],
@@ -245,48 +232,3 @@ def learn_one(
     work[n + USED, 0] = 1.0
     learn(tile, work, n, forgetting, renewal, rank_share)
     return work[n + PREDICTION, 0], work[n + RESIDUAL, 0], work[n + SPREAD, 0], work[n + LEVERAGE, 0]
-
-
-@jit
-def learn_all(
-    tiles: NDArray[np.float64],
-    regressors: NDArray[np.float64],
-    outputs: NDArray[np.float64],
-    present: NDArray[np.bool_],
-    forgetting: float,
-    renewal: float,
-    rank_share: float,
-    results: NDArray[np.float64],
-) -> None:
-    """`learn` for every tile.
-
-    Args:
-        tiles: shape (tiles, state_size(n), plants in a tile); plants beyond the last one get no row.
-        regressors: shape (plants, n).
-        outputs: shape (plants,).
-        present: shape (plants,); False leaves a plant as it is.
-        forgetting: see `learn`.
-        renewal: see `learn`.
-        rank_share: see `learn`.
-        results: shape (4, plants), receives prediction, residual, its standard deviation and leverage; NaN for a
-            plant that is not present.
-    """
-    plants, n = regressors.shape
-    in_tile = tiles.shape[2]
-    work = np.empty((n + _WORK, in_tile))
-    for t in range(tiles.shape[0]):
-        tile = tiles[t]
-        start = t * in_tile
-        for p in range(in_tile):
-            used = start + p < plants and present[start + p]
-            work[n + USED, p] = 1.0 if used else 0.0
-            work[n + OUTPUT, p] = outputs[start + p] if used else 0.0
-            for i in range(n):
-                work[i, p] = regressors[start + p, i] if used else 0.0
-        learn(tile, work, n, forgetting, renewal, rank_share)
-        for p in range(min(in_tile, plants - start)):
-            used = present[start + p]
-            results[0, start + p] = work[n + PREDICTION, p] if used else np.nan
-            results[1, start + p] = work[n + RESIDUAL, p] if used else np.nan
-            results[2, start + p] = work[n + SPREAD, p] if used else np.nan
-            results[3, start + p] = work[n + LEVERAGE, p] if used else np.nan

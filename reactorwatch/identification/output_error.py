@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.batch import least_squares, unscale
 from reactorwatch.identification.descent import ITERATIONS, best_descent, solution_at
 from reactorwatch.identification.instrumental_variable import instrumental_variable, stabilize, stable_arx
@@ -75,7 +75,7 @@ def minimise_simulation_error(
     chosen = (number >= choice.skip) & ((number - choice.skip) % choice.every == 0)
     objective = PredictionErrors(LinearPredictor("oe", structure), record.u, record.y, record.plan, chosen)
     if objective.compared.sum() < structure.parameters:
-        raise InputError(
+        raise UnfitRecordError(
             f"{structure.parameters} parameters need at least {structure.parameters} rows of a simulation, "
             f"got {int(objective.compared.sum())} of {count}"
         )

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.batch import least_squares
 from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.regressor import rows_of
@@ -142,7 +142,7 @@ def fit_narx(
     rows = replace(record, structure=structure.without_offset()).enough_rows()
     candidates = candidate_products(structure)
     if rows.position.size < len(candidates):
-        raise InputError(
+        raise UnfitRecordError(
             f"the {len(candidates)} candidates for terms need as many complete rows, got {rows.position.size}; "
             "lower the order"
         )

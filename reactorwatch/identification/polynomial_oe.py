@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.errors import InputError
+from reactorwatch.errors import UnfitRecordError
 from reactorwatch.identification.batch import least_squares
 from reactorwatch.identification.descent import descend, solution_at
 from reactorwatch.identification.polynomial_narx import (
@@ -133,7 +133,7 @@ def _choose_candidates(structure: Structure, rows: int) -> tuple[Product, ...]:
         candidates = candidate_products(structure, degree)
         if 2 * len(candidates) <= rows:
             return candidates
-    raise InputError(
+    raise UnfitRecordError(
         f"{len(candidates)} candidates for terms need twice as many rows of a simulation, got {rows}; lower the order"
     )
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.batch import unscale
 from reactorwatch.identification.descent import ITERATIONS, best_descent, solution_at
 from reactorwatch.identification.instrumental_variable import mirror_poles, stabilize, stable_arx
@@ -85,7 +85,7 @@ def _minimise(kind: Kind, record: ScaledRecord) -> tuple[Array, PredictionErrors
     structure, lags, objective = record.structure, record.structure.output_lags, _objective(kind, record)
     needed, usable = LinearPredictor(kind, structure).size, int(objective.compared.sum())
     if usable < needed:
-        raise InputError(
+        raise UnfitRecordError(
             f"{needed} parameters need at least {needed} rows of a prediction, got {usable} of {len(record.y)}"
         )
     starts = _armax_starts(record)

@@ -7,43 +7,21 @@ the history restarts.
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import isfinite
-from typing import Self
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Structure, as_columns
-from reactorwatch.stored_state import StoredState
+from reactorwatch.stored_state import Memory
 
 GAP_TOLERANCE = 0.25
 """An interval that differs from the period by more than this share of it is a gap."""
 
 
-class BufferState(StoredState, frozen=True):
-    """State of a `RegressorBuffer`.
-
-    Attributes:
-        structure: structure of the model.
-        period_ns: None; stored states have it.
-        choice: rows that are fitted.
-        outputs: output rows that the next regressor needs, newest first; fewer while the history fills.
-        inputs: input rows that the next regressor needs, newest first.
-        last_time_ns: time of the newest row; None before the first.
-        row: index of the next row, from 0.
-    """
-
-    structure: Structure
-    period_ns: int | None = None
-    choice: RowChoice = ALL_ROWS
-    outputs: tuple[tuple[float, ...], ...] = ()
-    inputs: tuple[tuple[float, ...], ...] = ()
-    last_time_ns: int | None = None
-    row: int = 0
-
-
-class RegressorBuffer:
-    """Turns rows into regressors, row by row.
+class RegressorBuffer(Memory):
+    """Turns rows into regressors, row by row. The object is its own memory.
 
     >>> buffer = RegressorBuffer(Structure.of_order(1))
     >>> buffer.update(0, [10.0], [1.0]) is None  # no history before the first row
@@ -54,63 +32,48 @@ class RegressorBuffer:
     Args:
         structure: structure of the model.
         choice: rows that are fitted; rows are counted from the first one.
+        outputs: outputs that the next regressor needs, newest first; fewer while the history fills.
+        inputs: inputs of the same rows, one row after the other.
+        last_time_ns: time of the newest row; None before the first.
+        row: index of the next row, from 0.
+
+    Raises:
+        ValueError: the rows do not fit the structure.
     """
 
-    def __init__(self, structure: Structure, choice: RowChoice = ALL_ROWS) -> None:
-        self._structure, self._choice = structure, choice
-        # Flat lists, newest row first: a regressor is a dozen numbers, and slicing a list of a dozen takes a fraction
-        # of the overhead of a NumPy call.
-        self._outputs: list[float] = []
-        self._inputs: list[float] = []
-        self._last_time_ns: int | None = None
-        self._row = 0
+    structure: Structure
+    choice: RowChoice = ALL_ROWS
+    # Flat lists: a regressor is a dozen numbers, and slicing a list of a dozen takes a fraction of the overhead of a
+    # NumPy call.
+    outputs: list[float] = msgspec.field(default_factory=list)
+    inputs: list[float] = msgspec.field(default_factory=list)
+    last_time_ns: int | None = None
+    row: int = 0
 
-    @classmethod
-    def from_state(cls, state: BufferState) -> Self:
-        """Resume from a state.
-
-        Raises:
-            ValueError: the state does not fit its structure.
-        """
-        buffer = cls(state.structure, state.choice)
-        filled = len(state.outputs)
-        if len(state.inputs) != filled or filled > state.structure.history:
-            raise ValueError(f"state must hold at most {state.structure.history} equal rows, got {filled}")
-        buffer._outputs = [value for row in state.outputs for value in row]
-        buffer._inputs = [value for row in state.inputs for value in row]
-        buffer._last_time_ns = state.last_time_ns
-        buffer._row = state.row
-        return buffer
-
-    @property
-    def state(self) -> BufferState:
-        """A copy of the full state."""
-        rows, count = len(self._outputs), self._structure.inputs
-        return BufferState(
-            self._structure,
-            choice=self._choice,
-            outputs=tuple((value,) for value in self._outputs),
-            inputs=tuple(tuple(self._inputs[row * count : (row + 1) * count]) for row in range(rows)),
-            last_time_ns=self._last_time_ns,
-            row=self._row,
-        )
+    def __post_init__(self) -> None:
+        filled, most = len(self.outputs), self.structure.history
+        if len(self.inputs) != filled * self.structure.inputs or filled > most:
+            raise ValueError(f"there must be at most {most} equal rows, got {filled}")
 
     @property
     def upcoming(self) -> NDArray[np.float64] | None:
         """Regressor of the next row, shape (parameters,); None while the history fills."""
-        structure = self._structure
-        if len(self._outputs) < structure.history:
+        return self._upcoming(self.structure.history)
+
+    def _upcoming(self, history: int) -> NDArray[np.float64] | None:
+        structure = self.structure
+        if len(self.outputs) < history:
             return None
         first, last = (structure.delay - 1) * structure.inputs, (structure.delay - 1 + structure.input_lags)
-        values = self._outputs[: structure.output_lags]
-        values += self._inputs[first : last * structure.inputs]
+        values = self.outputs[: structure.output_lags]
+        values += self.inputs[first : last * structure.inputs]
         if structure.offset:
             values.append(1.0)
         return np.array(values)
 
     def restart(self) -> None:
         """Clear the history, as after a gap."""
-        self._outputs, self._inputs, self._last_time_ns = [], [], None
+        self.outputs, self.inputs, self.last_time_ns = [], [], None
 
     def update(self, time_ns: int, inputs: Iterable[float], outputs: Iterable[float]) -> NDArray[np.float64] | None:
         """Add a row.
@@ -126,23 +89,25 @@ class RegressorBuffer:
         Raises:
             ValueError: a time not after the last one's, or a wrong number of values; nothing is changed then.
         """
-        structure = self._structure
+        structure = self.structure
         new_inputs, new_outputs = list(map(float, inputs)), list(map(float, outputs))
         if len(new_inputs) != structure.inputs or len(new_outputs) != 1:
             raise ValueError(
                 f"a row must have {structure.inputs} inputs and 1 outputs, got {len(new_inputs)} and {len(new_outputs)}"
             )
-        if self._last_time_ns is not None and time_ns <= self._last_time_ns:
-            raise ValueError(f"time_ns must increase, got {time_ns} after {self._last_time_ns}")
+        if self.last_time_ns is not None and time_ns <= self.last_time_ns:
+            raise ValueError(f"time_ns must increase, got {time_ns} after {self.last_time_ns}")
         complete = all(map(isfinite, new_inputs)) and all(map(isfinite, new_outputs))
-        regressor = self.upcoming if complete and self._choice.takes(self._row) else None
+        history = structure.history
+        is_wanted = complete and (self.choice is ALL_ROWS or self.choice.takes(self.row))
+        regressor = self._upcoming(history) if is_wanted else None
         if complete:
-            self._outputs = new_outputs + self._outputs[: structure.history - 1]
-            self._inputs = new_inputs + self._inputs[: (structure.history - 1) * structure.inputs]
+            self.outputs = new_outputs + self.outputs[: history - 1]
+            self.inputs = new_inputs + self.inputs[: (history - 1) * structure.inputs]
         else:
             self.restart()
-        self._last_time_ns = time_ns
-        self._row += 1
+        self.last_time_ns = time_ns
+        self.row += 1
         return regressor
 
 

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.regressor import consecutive_rows
 from reactorwatch.identification.structure import as_columns
 
@@ -97,7 +97,9 @@ def independence(
     reach = delay + lags - 1
     rows = np.flatnonzero(present & (np.concatenate([[0], consecutive_rows(u, time)[:-1]]) >= reach))
     if rows.size <= reach:
-        raise InputError(f"{lags} lags need more than {reach} rows with a residual and past inputs, got {rows.size}")
+        raise UnfitRecordError(
+            f"{lags} lags need more than {reach} rows with a residual and past inputs, got {rows.size}"
+        )
     past = np.concatenate([u[rows - lag] for lag in range(delay, delay + lags)], axis=1)
     past = past - past.mean(axis=0)
     # A constant or duplicate input adds no direction; the projection counts independent ones.
@@ -149,5 +151,5 @@ def _centre(residuals: ArrayLike, lags: int) -> tuple[NDArray[np.float64], NDArr
         raise InputError(f"residuals must have the shape (rows,), got {values.shape}")
     present = np.isfinite(values)
     if present.sum() < 2 * lags:
-        raise InputError(f"{lags} lags need at least {2 * lags} residuals, got {int(present.sum())}")
+        raise UnfitRecordError(f"{lags} lags need at least {2 * lags} residuals, got {int(present.sum())}")
     return np.where(present, values - np.mean(values[present]), 0.0), present

@@ -40,8 +40,29 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reactorwatch.arrays import Array
+from reactorwatch.errors import InputError
 from reactorwatch.identification import information
-from reactorwatch.identification.recursion import Recursion, RlsState, describe_invalid
+from reactorwatch.identification.information import LARGEST_VALUE
+from reactorwatch.stored_state import Memory
+
+DEFAULT_COVARIANCE_LIMIT = 1e6
+
+
+class RlsMemory(Memory):
+    """Memory of a recursive estimator.
+
+    Attributes:
+        parameters: number of parameters.
+        forgetting: weight of a row relative to its successor.
+        covariance_limit: bound on the eigenvalues of P.
+        numbers: shape (state_size(parameters),), laid out as in `information.py`.
+    """
+
+    parameters: int
+    forgetting: float
+    covariance_limit: float
+    numbers: Array
 
 
 class RlsUpdate(msgspec.Struct, frozen=True, gc=False):
@@ -61,7 +82,7 @@ class RlsUpdate(msgspec.Struct, frozen=True, gc=False):
     leverage: float
 
 
-class RecursiveLeastSquares(Recursion):
+class RecursiveLeastSquares:
     """y = regressor . parameters + noise, learned row by row.
 
     Regressors should be of the order of 1 (`regressor.Scaling`): `covariance_limit` counts in their units.
@@ -80,24 +101,53 @@ class RecursiveLeastSquares(Recursion):
 
     Raises:
         InputError: a setting out of its range.
+
+    Attributes:
+        memory: the settings and what was learned: what runs, and what is stored.
     """
 
+    memory_type = RlsMemory
+
     def __init__(self, parameters: int, forgetting: float = 1.0, covariance_limit: float | None = None) -> None:
-        super().__init__(1, parameters, forgetting, covariance_limit, plants_in_tile=1)
-        self._tile: NDArray[np.float64] = self._tiles[0]
+        if parameters < 1:
+            raise InputError(f"parameters must be at least 1, got {parameters}")
+        if covariance_limit is None:
+            covariance_limit = math.inf if forgetting == 1.0 else DEFAULT_COVARIANCE_LIMIT
+        if not covariance_limit > 1.0 / LARGEST_VALUE:
+            raise InputError(f"covariance_limit must be above {1.0 / LARGEST_VALUE}, got {covariance_limit}")
+        numbers = np.zeros(information.state_size(parameters))
+        self._use(RlsMemory(parameters, float(forgetting), float(covariance_limit), numbers))
+        start = 1.0 / (covariance_limit * forgetting ** (parameters - 1))
+        self._tile[2 * parameters : 3 * parameters] = start
 
     @classmethod
-    def from_state(cls, state: RlsState) -> Self:
-        """Resume, bit for bit from a state.
+    def resume(cls, memory: RlsMemory) -> Self:
+        """Estimator that goes on from a memory, bit for bit, which it updates.
 
         Raises:
-            ValueError: the state is of several plants, or damaged.
+            ValueError: the memory is damaged.
         """
-        if state.plants != 1:
-            raise ValueError(f"state must be of one plant, got {state.plants}: use RecursiveLeastSquaresBank")
-        estimator = cls(state.parameters, state.forgetting, state.covariance_limit)
-        estimator._load(state.memory)
+        estimator = cls.__new__(cls)
+        estimator._use(memory)
         return estimator
+
+    def _use(self, memory: RlsMemory) -> None:
+        size = information.state_size(memory.parameters)
+        if memory.numbers.shape != (size,):
+            raise ValueError(f"{memory.parameters} parameters must have {size} numbers, got {memory.numbers.size}")
+        self.memory, self._parameters = memory, memory.parameters
+        self._covariance_limit = memory.covariance_limit
+        self._rank_share = information.RANK_SHARE if math.isinf(self._covariance_limit) else 0.0
+        self._set_forgetting(memory.forgetting)
+        # The tile includes the work space of the kernel: one argument fewer at each update.
+        self._tile = np.zeros((size + information.work_size(memory.parameters), 1))
+        self._tile[:size, 0] = memory.numbers
+        memory.numbers = self._tile[:size, 0]
+
+    @property
+    def forgetting(self) -> float:
+        """Weight of a row relative to its successor."""
+        return self._forgetting
 
     def update(self, regressor: ArrayLike, output: float) -> RlsUpdate:
         """Predict the output, then learn from it.
@@ -116,7 +166,7 @@ class RecursiveLeastSquares(Recursion):
             self._tile, row, float(output), self._forgetting, self._renewal, self._rank_share
         )
         if result[0] != result[0]:
-            raise ValueError(describe_invalid(row, output))
+            raise ValueError(_describe_invalid(row, output))
         return RlsUpdate(*result)
 
     def predict(self, regressor: ArrayLike) -> float:
@@ -221,6 +271,17 @@ class RecursiveLeastSquares(Recursion):
         values = np.linalg.svd(np.sqrt(self._diagonal())[:, None] * self._factor(), compute_uv=False)
         return float(values[0] / values[-1]) if values[-1] > 0.0 else math.inf
 
+    def _set_forgetting(self, forgetting: float) -> None:
+        if not 0.0 < forgetting <= 1.0:
+            raise InputError(f"forgetting must be in (0, 1], got {forgetting}")
+        if forgetting < 1.0 and not self._covariance_limit < LARGEST_VALUE:
+            raise InputError(
+                f"covariance_limit must be below {LARGEST_VALUE} when forgetting < 1, got {self._covariance_limit}"
+            )
+        n, f = self._parameters, float(forgetting)
+        self._forgetting = self.memory.forgetting = f
+        self._renewal = (1.0 - f**n) / (self._covariance_limit * f ** (n - 1))
+
     def _factor(self) -> NDArray[np.float64]:
         n = self._parameters
         factor = np.eye(n)
@@ -236,3 +297,11 @@ class RecursiveLeastSquares(Recursion):
     def _weight_share(self) -> float:
         sums = self._sums()
         return float(sums[information.WEIGHT2] / sums[information.WEIGHT]) if sums[information.WEIGHT] > 0.0 else 1.0
+
+
+def _describe_invalid(regressor: NDArray[np.float64], output: float) -> str:
+    """Message for an invalid row."""
+    for i, value in enumerate(regressor):
+        if not abs(value) < LARGEST_VALUE:
+            return f"regressor[{i}] must be a finite number below {LARGEST_VALUE:g} in size, got {value}"
+    return f"output must be a finite number below {LARGEST_VALUE:g} in size, got {output}"

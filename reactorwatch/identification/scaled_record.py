@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
-from reactorwatch.errors import InputError
+from reactorwatch.errors import UnfitRecordError
 from reactorwatch.identification.regressor import Rows, rows_of
 from reactorwatch.identification.simulation import RunPlan, plan_run
 from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
@@ -43,7 +43,7 @@ class ScaledRecord:
         y = as_columns(outputs, "outputs", 1)
         values = y[np.isfinite(y)]
         if values.size and np.ptp(values) == 0.0:
-            raise InputError(f"output 1 is constant, {values[0]:g} in all rows: there is nothing to identify")
+            raise UnfitRecordError(f"output 1 is constant, {values[0]:g} in all rows: there is nothing to identify")
         scaling = Scaling.of(u, y, centred=structure.offset)
         return cls(structure, scaling, scaling.inputs(u), scaling.outputs(y), time)
 
@@ -65,7 +65,7 @@ class ScaledRecord:
         rows = self.rows(choice)
         usable, parameters = rows.regressors.shape
         if usable < parameters:
-            raise InputError(
+            raise UnfitRecordError(
                 f"{parameters} parameters need at least {parameters} rows that are complete and follow complete rows "
                 f"without a gap, got {usable} of {len(self.y)}"
             )

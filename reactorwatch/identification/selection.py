@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.families import LINEAR_FAMILIES, Family, Model
 from reactorwatch.identification.linear_model import fit_percent
 from reactorwatch.identification.structure import Structure, as_columns
@@ -142,7 +142,7 @@ def select(
     judged = [pair for pair in fitted if math.isfinite(pair[0].free_run_percent)]
     if not judged:
         reasons = "; ".join(f"{c.family} {c.order}: {c.refusal or 'its simulation diverges'}" for c in candidates)
-        raise InputError(f"no model can be chosen: {reasons or 'no family or order was given'}")
+        raise UnfitRecordError(f"no model can be chosen: {reasons or 'no family or order was given'}")
     best = max(judged, key=lambda pair: pair[0].free_run_percent)[0]
     equal = [pair for pair in judged if pair[0].free_run_percent >= best.free_run_percent - EQUAL_PERCENT]
     chosen, model = min(equal, key=lambda pair: (pair[0].parameters, -pair[0].free_run_percent))

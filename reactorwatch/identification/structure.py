@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, UnfitRecordError
 
 
 class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -180,7 +180,7 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             for i, column in enumerate(signals.T):
                 values = column[np.isfinite(column)]
                 if values.size == 0:
-                    raise InputError(f"{name} {i + 1} has no measured value")
+                    raise UnfitRecordError(f"{name} {i + 1} has no measured value")
                 centre, spread = float(np.mean(values)), float(np.std(values))
                 constant = spread <= 1e-12 * abs(centre)
                 moments.append((name, centre if centred else 0.0, 1.0 if constant else spread))

@@ -1,6 +1,7 @@
 """Process models, their simulation, their steady states, and effects on them."""
 
 from collections.abc import Mapping
+from typing import cast
 
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.generic_effects import generic_effects
@@ -40,7 +41,7 @@ LOCATION_PHRASES: Mapping[str, str] = CSTR_LOCATIONS
 
 def own_effects(model: ProcessModel) -> tuple[Effect, ...]:
     """Effects of a model's own: those that it has, else those of the catalogue under its name."""
-    return EFFECTS_OF.get(model.name, ()) if model.effects is None else model.effects
+    return EFFECTS_OF.get(model.name, ()) if model.effects is None else cast(tuple[Effect, ...], model.effects)
 
 
 def effects_of(model: ProcessModel) -> tuple[Effect, ...]:

@@ -92,6 +92,11 @@ class Effect(ABC):
         """True if the innovations have a derivative by the size."""
         return not (self.is_discontinuous or self.is_noise)
 
+    @property
+    def is_share(self) -> bool:
+        """True if the size is a share that is shown in per cent; one in the unit % is shown as it is."""
+        return self.unit == "1" and "{} %" in self.larger
+
     @abstractmethod
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """Apply the deviation; `size` is m(t) as an expression.
@@ -145,7 +150,7 @@ class Effect(ABC):
         text, amount = self.larger or f"{self.label}: {{}} {self.unit}".removesuffix(" 1"), size
         if size < 0.0 and self.smaller:
             text, amount = self.smaller, -size
-        if "{} %" in text:
+        if self.is_share:
             amount *= 100.0
         return text.format(f"{float(f'{amount:.2g}'):g}")
 
@@ -155,9 +160,10 @@ class Effect(ABC):
 
     def prefix(self, model: ProcessModel) -> str:
         """Prefix of the names of the parameters and states that this effect adds to a model."""
-        taken = (*model.parameter_names, *model.state_names)
+        parts = [name.split(".") for name in (*model.parameter_names, *model.state_names) if name.startswith(self.name)]
+        taken = {".".join(part[:end]) for part in parts for end in range(1, len(part))}
         prefix, number = self.name, 1
-        while any(name.startswith(f"{prefix}.") for name in taken):
+        while prefix in taken:
             number += 1
             prefix = f"{self.name}_{number}"
         return prefix

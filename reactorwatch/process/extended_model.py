@@ -28,12 +28,13 @@ from typing import Any
 import msgspec
 
 from reactorwatch.errors import InputError
+from reactorwatch.limits import limits, parse_json
 from reactorwatch.process import EFFECTS_OF, MODELS, named_effects
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.generic_effects import is_generic
-from reactorwatch.process.law import ExtendedLaw
+from reactorwatch.process.law import ExtendedLaw, laws_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, free_profile
 from reactorwatch.process.stored_equations import build_equations, store_equations
@@ -155,11 +156,10 @@ def parse_extended_model(text: str | bytes) -> ExtendedModel:
         InputError: it is no such file, or a part of it is invalid.
     """
     try:
-        file = msgspec.json.decode(text, type=_ModelFile)
+        file = msgspec.convert(parse_json(text), _ModelFile)
     except msgspec.ValidationError as error:
         raise InputError(f"is no model: {error}; it must be like extended.json of reactorwatch diagnose -o") from error
-    except (msgspec.DecodeError, RecursionError) as error:
-        raise InputError(f"is not JSON: {error}") from error
+    limits().check("effects", "the number of effects and laws", len(file.effects) + len(file.laws))
     if file.format != FORMAT:
         raise InputError(f"format must be {FORMAT!r}, got {file.format!r}")
     if file.equations is not None:
@@ -207,7 +207,7 @@ def extended_model_of(
         for item in (nominal.parameters if nominal else ())
         if values[item.name] != item.value
     }
-    return ExtendedModel(model.name, tuple(found), differing, zero_ns, model.laws, uncertain=model.uncertain)
+    return ExtendedModel(model.name, tuple(found), differing, zero_ns, laws_of(model), uncertain=model.uncertain)
 
 
 def are_named(extended: ExtendedModel) -> bool:

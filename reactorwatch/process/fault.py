@@ -88,7 +88,8 @@ class FaultSpecification:
         """
         values = self.with_defaults(end_min=end_min).values
         extended = self.effect.extend(model, self.profile)
-        new = [name for name in extended.parameter_names if name not in model.parameter_names]
+        before = set(model.parameter_names)
+        new = [name for name in extended.parameter_names if name not in before]
         prefix = next(name for name in new if name.endswith(".size")).removesuffix("size")
         return extended.with_values({f"{prefix}{name}": value for name, value in values.items()})
 

@@ -4,7 +4,7 @@
 |---|---|
 | an output | `.bias`, `.gain`, `.lag`, `.delay`, `.stuck`, `.noise` |
 | an input | `.gain`, `.offset`, `.lag`, `.delay`, `.stiction` |
-| a parameter | `.deviation` from its value, as a share of it; in its unit where its value is 0 |
+| a parameter | `.deviation` from its value, as a share of it; in its unit where its value is 0, and of degC, degF |
 | a state | `.source`, an unmodelled rate in its balance |
 
 Their scales come from the model: those of its states and inputs, and how much an output or a balance changes with them
@@ -31,6 +31,7 @@ from reactorwatch.process.output_effects import (
     OutputNoise,
     StuckOutput,
 )
+from reactorwatch.units import absolute
 
 TIMES_MIN = (0.05, 0.3, 2.0, 10.0)
 """Lags and delays from which fits start."""
@@ -287,27 +288,28 @@ def _of_input(item: Variable) -> list[Effect]:
 
 
 def _of_parameter(model: ProcessModel, item: Parameter) -> Effect:
-    """Deviation as a share of the value, or in its unit where the value is 0."""
-    kind: type[Effect]
-    if item.value:
-        ends = sorted((end - item.value) / item.value for end in (item.lower, item.upper))
-        typical = min(TYPICAL_SHARE, 0.5 * ends[1]) or max(-TYPICAL_SHARE, 0.5 * ends[0])
-        facts = {"lower": max(ends[0], -0.99), "upper": min(ends[1], LARGEST_SHARE), "typical": typical}
-        kind, formula, unit = ParameterEffect, "(1 + m)", "%"
-    else:
-        facts = {"lower": item.lower, "upper": item.upper, "typical": 1e-3 * (item.upper - item.lower)}
-        kind, formula, unit = ParameterShift, "+ m", item.unit
+    """Deviation as a share of the value; in its unit where the value is 0, or the unit's zero is no absolute one."""
+    from_zero = absolute(item.value, item.unit)
+    in_unit = not item.value or from_zero is not None
+    scale = 1.0 if in_unit else item.value
+    lower, upper = sorted((end - item.value) / scale for end in (item.lower, item.upper))
+    usual = TYPICAL_SHARE
+    if in_unit:  # of a temperature, as large as that of the same parameter in K
+        usual = 1e-3 * (upper - lower) if from_zero is None else TYPICAL_SHARE * from_zero
+    formula, unit = ("+ m", item.unit) if in_unit else ("(1 + m)", "%")
     return _make(
-        kind,
+        ParameterShift if in_unit else ParameterEffect,
         f"{item.name}.deviation",
         f"{item.name} {formula}.",
         label=f"other {item.name} ({item.meaning})" if item.meaning else f"other {item.name}",
         location=parameter_location(model, item),
         parameter=item.name,
-        unit="1" if item.value else item.unit,
+        unit=item.unit if in_unit else "1",
         larger=f"{item.name} higher by {{}} {unit}",
         smaller=f"{item.name} lower by {{}} {unit}",
-        **facts,
+        lower=lower if in_unit else max(lower, -0.99),
+        upper=upper if in_unit else min(upper, LARGEST_SHARE),
+        typical=min(usual, 0.5 * upper) or max(-usual, 0.5 * lower),
     )
 
 

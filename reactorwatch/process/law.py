@@ -8,7 +8,7 @@ outside of it the formula is a guess, and `outside` says so.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import casadi as ca
 import msgspec
@@ -268,6 +268,11 @@ class ExtendedLaw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                         "and need not hold outside"
                     )
         return sentences
+
+
+def laws_of(model: ProcessModel) -> tuple[ExtendedLaw, ...]:
+    """Laws that were added to a model."""
+    return cast(tuple[ExtendedLaw, ...], model.laws)
 
 
 def add_lag_states(

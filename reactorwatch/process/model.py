@@ -13,20 +13,16 @@ the model computes it from the other states and the inputs (`at_rest`). Some sta
 may have changed, such as a valve that sticks (`resets`).
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.places import Place
-
-if TYPE_CHECKING:
-    from reactorwatch.process.effect import Effect
-    from reactorwatch.process.law import ExtendedLaw
 
 MODEL_CACHE_SIZE = 64
 """Number of models whose functions are cached."""
@@ -98,6 +94,38 @@ class Clock:
     middle: ca.SX
 
 
+@dataclass(frozen=True)
+class Place:
+    """A part of a process in which something unknown may act.
+
+    Attributes:
+        name: name of the place, unique in its process.
+        location: location in a diagnosis; several places may share one.
+        kind: kind of the correction, see `places`.
+        of: state, input, parameter or output that is corrected; empty for a factor.
+        flows: for a factor, the name of the model's term in each balance, by state.
+        variables: states, inputs and terms that the correction may depend on, the likeliest first.
+        lag_min: time constant in minutes with which the correction follows its variables; 0: at once.
+        apart: a place whose correction may act here as well, such as another heat of reaction; empty: none.
+    """
+
+    name: str
+    location: str
+    kind: str
+    of: str = ""
+    flows: Mapping[str, str] = field(default_factory=dict)
+    variables: tuple[str, ...] = ()
+    lag_min: float = 0.0
+    apart: str = ""
+
+
+class Extension(Protocol):
+    """Addition to the equations of a model: an effect, or a law."""
+
+    def extend(self, model: "ProcessModel") -> "ProcessModel":
+        """Copy of the model with the extension."""
+
+
 def variable(
     name: str,
     unit: str,
@@ -164,15 +192,17 @@ class ProcessModel:
     resets: Mapping[str, ca.SX] = field(default_factory=dict)
     time_offset: ca.SX = field(default_factory=lambda: ca.SX(0))
     places: tuple[Place, ...] = ()
-    laws: tuple["ExtendedLaw", ...] = ()
-    effects: tuple["Effect", ...] | None = None
+    laws: tuple[Extension, ...] = ()
+    effects: tuple[Extension, ...] | None = None
     uncertain: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if not self.states:
+            raise ValueError("equations must have at least one state, got none; leave them out, and they are learned")
         if len(self.rhs) != len(self.states):
             raise ValueError(f"rhs must have one expression a state, {len(self.states)}, got {len(self.rhs)}")
-        names = [*self.state_names, *self.input_names, *self.parameter_names]
-        twice = sorted({name for name in names if names.count(name) > 1})
+        count = Counter((*self.state_names, *self.input_names, *self.parameter_names))
+        twice = sorted(name for name, times in count.items() if times > 1)
         if twice:
             raise ValueError(f"names in a model must differ, got {', '.join(twice)} more than once")
 
@@ -250,13 +280,11 @@ class ProcessModel:
         """
         if not changes:
             return self
-        values = self.values(changes)
-        return replace(
-            self,
-            parameters=tuple(
-                replace(item, value=float(value)) for item, value in zip(self.parameters, values, strict=True)
-            ),
-        )
+        parameters, values = list(self.parameters), self.values(changes)
+        for name in changes:
+            index = self._indices[name]
+            parameters[index] = replace(parameters[index], value=float(values[index]))
+        return replace(self, parameters=tuple(parameters))
 
     def term(self, name: str) -> ca.SX:
         """Look a part of the balances up by name.

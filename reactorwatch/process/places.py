@@ -15,49 +15,21 @@ them. So a place is recognised by what it does to each balance. A process declar
 for one that does not, they follow from its equations.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import casadi as ca
 
-if TYPE_CHECKING:
-    from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import Place, ProcessModel
 
 SOURCE, FACTOR, CAPACITY, INPUT, SENSOR = "source", "factor", "capacity", "input", "sensor"
 
 
-@dataclass(frozen=True)
-class Place:
-    """A part of a process in which something unknown may act.
-
-    Attributes:
-        name: name of the place, unique in its process.
-        location: location in a diagnosis; several places may share one.
-        kind: kind of the correction, see the module.
-        of: state, input, parameter or output that is corrected; empty for a factor.
-        flows: for a factor, the name of the model's term in each balance, by state.
-        variables: states, inputs and terms that the correction may depend on, the likeliest first.
-        lag_min: time constant in minutes with which the correction follows its variables; 0: at once.
-        apart: a place whose correction may act here as well, such as another heat of reaction; empty: none.
-    """
-
-    name: str
-    location: str
-    kind: str
-    of: str = ""
-    flows: Mapping[str, str] = field(default_factory=dict)
-    variables: tuple[str, ...] = ()
-    lag_min: float = 0.0
-    apart: str = ""
-
-
-def places_of(model: "ProcessModel") -> tuple[Place, ...]:
+def places_of(model: ProcessModel) -> tuple[Place, ...]:
     """Places of a model: the declared ones, or those that follow from its equations."""
     return model.places or _default_places(model)
 
 
-def find_place(model: "ProcessModel", name: str) -> Place:
+def find_place(model: ProcessModel, name: str) -> Place:
     """Find a place by its name.
 
     Raises:
@@ -69,7 +41,7 @@ def find_place(model: "ProcessModel", name: str) -> Place:
     raise ValueError(f"{model.name} has no place {name!r} (it has {', '.join(item.name for item in places_of(model))})")
 
 
-def correct(model: "ProcessModel", place: Place, correction: ca.SX) -> "ProcessModel":
+def correct(model: ProcessModel, place: Place, correction: ca.SX) -> ProcessModel:
     """Copy of a model with a correction in a place."""
     if place.kind == FACTOR:
         for state, term in place.flows.items():
@@ -90,7 +62,7 @@ def correct(model: "ProcessModel", place: Place, correction: ca.SX) -> "ProcessM
     return model.with_output(replace(output, expression=output.expression + correction))
 
 
-def unit_of(model: "ProcessModel", place: Place) -> str:
+def unit_of(model: ProcessModel, place: Place) -> str:
     """Unit of a correction in a place."""
     if place.kind in (FACTOR, CAPACITY):
         return "1"
@@ -98,13 +70,13 @@ def unit_of(model: "ProcessModel", place: Place) -> str:
     return f"{unit}/min" if place.kind == SOURCE else unit
 
 
-def unit_of_variable(model: "ProcessModel", name: str) -> str:
+def unit_of_variable(model: ProcessModel, name: str) -> str:
     """Unit of a state, input, output or parameter; 1 for a term."""
     units = {item.name: item.unit for item in model.parameters} | {item.name: item.unit for item in model.states}
     return (units | model.units).get(name, "1")
 
 
-def variable_expression(model: "ProcessModel", name: str) -> ca.SX:
+def variable_expression(model: ProcessModel, name: str) -> ca.SX:
     """Expression of a variable: a state, an input or a term."""
     for item in (*model.states, *model.inputs):
         if item.name == name:
@@ -115,7 +87,7 @@ def variable_expression(model: "ProcessModel", name: str) -> ca.SX:
     return model.term(name)
 
 
-def _default_places(model: "ProcessModel") -> tuple[Place, ...]:
+def _default_places(model: ProcessModel) -> tuple[Place, ...]:
     """A source in each balance, an error of each input and of each sensor."""
     variables = (*model.states, *model.inputs)
     sources = tuple(

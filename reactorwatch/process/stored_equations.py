@@ -13,8 +13,8 @@ import casadi as ca
 import msgspec
 
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import Output, Parameter, ProcessModel, Variable, new_clock
-from reactorwatch.process.places import Place
+from reactorwatch.limits import limits
+from reactorwatch.process.model import Output, Parameter, Place, ProcessModel, Variable, new_clock
 
 Step = tuple[int | float | str, ...]
 
@@ -112,7 +112,12 @@ def build_equations(name: str, stored: Mapping[str, Any]) -> ProcessModel:
         InputError: it is no such object.
     """
     try:
-        return _build(name, msgspec.convert(stored, StoredEquations))
+        equations = msgspec.convert(stored, StoredEquations)
+        for part in ("steps", "states", "inputs", "parameters", "outputs", "terms"):
+            limits().check("equations", f"equations: the number of {part}", len(getattr(equations, part)))
+        return _build(name, equations)
+    except InputError:
+        raise
     except (msgspec.ValidationError, ValueError, IndexError, KeyError) as error:
         raise InputError(f"equations: {error}; they must be as reactorwatch diagnose -o writes them") from error
 

@@ -4,7 +4,6 @@ import glob
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from errno import EDQUOT, ENOSPC
 from pathlib import Path
 
 from reactorwatch.errors import InputError
@@ -82,12 +81,3 @@ def wrap_write_errors(path: Path, temporary: Path | None = None) -> Iterator[Non
         if temporary is None or temporary.name not in str(error) or not isinstance(cause, OSError):
             raise
         raise InputError(f"cannot write {path}: {cause.strerror or cause}") from cause
-
-
-def is_disk_full(error: BaseException | None) -> bool:
-    """True if a write failed for lack of space on the disk, which may be temporary."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in (ENOSPC, EDQUOT):
-            return True
-        error = error.__cause__
-    return False

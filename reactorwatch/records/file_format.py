@@ -5,6 +5,7 @@ import re
 from dataclasses import dataclass, fields, replace
 
 from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.limits import limits
 
 SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 """Seconds in each unit of time."""
@@ -12,7 +13,6 @@ SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.
 TIME_UNITS = (*SECONDS, "iso")
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "\\t": "\t", "blank": " ", "blanks": " ", "pipe": "|"}
 _PERIOD = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)")
-_FIXED_ZONE = re.compile(r"(?:UTC|GMT)?([+-])(\d{1,2})(?::?(\d{2}))?")
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,17 @@ class FileFormat:
         time_unit: unit of a numeric time column: ns, us, ms, s, min, h or d; `iso` for timestamps (`--time-unit`).
         zone: time zone of local timestamps, such as `Europe/Berlin` or `+01:00` (`--zone`).
         time_format: format of timestamps, such as `%d.%m.%Y %H:%M:%S` (`--time-format`).
+        dates: order of day and month in dates such as 03/04/2026, `month-first` or `day-first` (`--dates`).
         period: sampling period of rows without a usable time column, such as `4 s` (`--period`).
         missing: cells that mean "not measured", beside the usual ones (`--missing`).
         separator: the character between cells, or its name (`--separator`).
         decimal: `.` or `,` (`--decimal`).
         header: whether the file has a header (`--header`, `--no-header`).
         transposed: whether each row is a signal (`--transposed`, `--no-transposed`).
+        tag: header or number of the column of tags in a table with a row for each value, or several with commas
+            between; `none`: each signal has a column (`--tag`).
+        value: header or number of the column of values in such a table (`--value`).
+        quality_good: qualities of usable values, alone or with commas between; `*`: all (`--quality-good`).
 
     Raises:
         InputError: a value is not one of those listed.
@@ -39,16 +44,26 @@ class FileFormat:
     time_unit: str | None = None
     zone: str | None = None
     time_format: str | None = None
+    dates: str | None = None
     period: str | None = None
     missing: tuple[str, ...] = ()
     separator: str | None = None
     decimal: str | None = None
     header: bool | None = None
     transposed: bool | None = None
+    tag: str | None = None
+    value: str | None = None
+    quality_good: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        limits().check("missing", '--missing: the number of cells that mean "not measured"', len(self.missing))
         if self.time_unit is not None and self.time_unit not in TIME_UNITS:
             raise InputError(describe_unknown("--time-unit", self.time_unit, TIME_UNITS))
+        if self.dates is not None:
+            from reactorwatch.records.timestamps import ORDERS  # only here: it imports NumPy, and help is to be fast
+
+            if self.dates not in ORDERS:
+                raise InputError(describe_unknown("--dates", self.dates, ORDERS))
         if self.decimal is not None and self.decimal not in (".", ","):
             raise InputError(f"--decimal must be '.' or ',', got {self.decimal!r}")
         if self.separator is not None:
@@ -60,6 +75,8 @@ class FileFormat:
                 raise InputError(f"--separator and --decimal must differ, got {separator!r} for both")
         if self.period is not None:
             self.period_s  # noqa: B018 # checks it
+        if self.period is not None and (self.value or self.tag not in (None, "none")):
+            raise InputError(f"--tag and --value need a time column, got --period {self.period!r}; state --time NAME")
         if self.zone is not None:
             _check_zone(self.zone)
         if self.time_format is not None:
@@ -94,18 +111,10 @@ GUESS = FileFormat()
 """Nothing is stated, all is guessed."""
 
 
-def fixed_offset_s(zone: str) -> int | None:
-    """Seconds by which a zone such as `+01:00` or `UTC+1` is ahead of UTC; None for a named zone."""
-    if zone.upper() in ("UTC", "GMT", "Z"):
-        return 0
-    match = _FIXED_ZONE.fullmatch(zone.upper())
-    if match is None:
-        return None
-    return (1 if match[1] == "+" else -1) * (int(match[2]) * 3600 + int(match[3] or 0) * 60)
-
-
 def _check_zone(zone: str) -> None:
     from zoneinfo import ZoneInfo
+
+    from reactorwatch.records.timestamps import fixed_offset_s
 
     if fixed_offset_s(zone) is not None:
         return

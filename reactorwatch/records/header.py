@@ -1,14 +1,26 @@
 """Header of a text table: names, units and the first row of data, guessed from the first lines."""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from reactorwatch.errors import InputError
-from reactorwatch.records.cells import EMPTY, NUMBER, TEXT, TIME, guess_decimal, kind_of
+from reactorwatch.records.cells import EMPTY, NUMBER, TEXT, TIME, find_decimal, kind_of, to_numbers, unquote_formula
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.layout import Layout, describe_separator, split_line, unit_of_name
+from reactorwatch.records.text_table import TextTable, find_body
+
+MIN_PLAIN = 3
+"""Fewest different integers below 1,000 beside grouped ones: one or two may stand for "off" or "out of range"."""
+
+LARGEST_STEP = 10.0
+"""Largest factor between neighbours of a column of integers; with a decimal sign, the step is 1,000 times as large."""
+
+_NUMBER = re.compile(rb"[+-]?\d[\d.,]*")
 
 
 class HeaderSearch:
@@ -119,7 +131,8 @@ class HeaderSearch:
     def _make(self, heads: list[tuple[int, list[str]]], first: int) -> Layout:
         filled = [sum(bool(cell.strip()) for cell in cells) for _, cells in heads]
         names_index = filled.index(max(filled)) if heads else 0
-        names = [" ".join(cell.split()) for cell in heads[names_index][1]] if heads else [""] * self._width
+        heading = map(unquote_formula, heads[names_index][1]) if heads else [""] * self._width
+        names = [" ".join(cell.split()) for cell in heading]
         below = heads[names_index + 1 :]
         units_row = min(below, key=lambda head: sum(map(len, head[1]))) if below else None
         units = (
@@ -164,13 +177,58 @@ class HeaderSearch:
         return row - sum(cell.count("\n") for cell in cells)
 
     def _guess_decimal(self, layout: Layout) -> str:
-        """Decimal sign, from all rows where the first ones leave it open."""
-        found = guess_decimal([cell for cells in layout.sample for cell in cells])
-        found = found or guess_decimal([cell for _, cells in layout.rows() for cell in cells])
-        if found is None:
-            cell = next(cell for cells in layout.sample for cell in cells if "," in cell)
+        """Decimal sign, by all rows.
+
+        Raises:
+            InputError: each sign may be a decimal sign or group thousands.
+        """
+        body = find_body(layout)
+        sign, at = find_decimal(body, layout.separator)
+        if sign is None and (group := _find_group_sign(layout)) is not None:
+            layout.notes.append(f"thousands grouped by `{group}`")
+            sign = "," if group == "." else "."
+        if sign is None:
+            row = layout.first_row + body.slice(0, at + 1).to_pybytes().count(b"\n")
+            cell = _NUMBER.search(body.slice(at).to_pybytes())[0].decode()  # type: ignore[index] # it starts a number
+            own, other, name = (".", ",", "point") if "." in cell else (",", ".", "comma")
             raise InputError(
-                f"{self._path}, row {layout.first_row}: {cell!r} may have a decimal comma (--decimal ,) or "
-                "group its thousands (--decimal .); state one of them"
+                f"{self._path}, row {row}: {cell!r} may have a decimal {name} (--decimal {own}) or group its thousands "
+                f"(--decimal {other}); state one of them, or decimal in [file] of the process's description"
             )
-        return found
+        return sign
+
+
+def _find_group_sign(layout: Layout) -> str | None:
+    """Sign that groups thousands in columns of integers; None: there is no evidence.
+
+    A column that passes from 963 to 1.007 holds integers: its neighbouring cells with and without the sign are within a
+    factor of `LARGEST_STEP`, and those without it are below 1,000 and differ.
+    """
+    import pyarrow.compute as pc
+
+    numbers, texts = (
+        [column for column, kind in enumerate(layout.kinds) if kind == wanted] for wanted in (NUMBER, TEXT)
+    )
+    table = TextTable(layout, [], [*numbers, *texts])
+    labels = np.zeros(table.rows, dtype=np.intp)
+    for column in texts:  # cells are neighbours if the texts of their rows are the same, such as the tag
+        codes = np.asarray(table.texts(column).dictionary_encode().indices)
+        labels = np.unique(labels * (codes.max() + 1) + codes, return_inverse=True)[1]
+    order, found = np.argsort(labels, kind="stable"), set()
+    for column in numbers:
+        cells = table.texts(column)
+        with_sign = pc.sum(pc.match_substring_regex(cells, "[.,]")).as_py() or 0
+        if not 0 < with_sign < table.rows:
+            continue
+        cells = cells.take(order)
+        readings = {sign: to_numbers(cells, sign, layout.missing)[0] for sign in ".,"}
+        filled = np.flatnonzero(np.isfinite(readings["."]) & np.isfinite(readings[","]))
+        point, comma = readings["."][filled], readings[","][filled]
+        group, values = (".", comma) if np.abs(comma).sum() > np.abs(point).sum() else (",", point)
+        is_plain = point == comma
+        plain = np.unique(values[is_plain & (values != 0.0)])
+        near = (is_plain[1:] != is_plain[:-1]) & (np.diff(labels[order][filled]) == 0) & (values[1:] * values[:-1] > 0)
+        if plain.size >= MIN_PLAIN and np.abs(plain).max() < 1000 and near.any():
+            steps = np.abs(np.diff(np.log10(np.where(values == 0.0, 1.0, np.abs(values)))))[near]
+            found |= {group} if np.median(steps) < np.log10(LARGEST_STEP) else set()
+    return found.pop() if len(found) == 1 else None

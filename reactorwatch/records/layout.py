@@ -56,11 +56,21 @@ class Layout:
 
     def find(self, name: str, *, by_number: bool = True) -> int | None:
         """Index of a column by its header, its name without unit or its number from 1; None: none, or several."""
-        for names in (list(self.names), [bare_name(each) for each in self.names]):
-            if names.count(name) == 1:
-                return names.index(name)
+        for positions in self._positions:
+            if len(found := positions.get(name, [])) == 1:
+                return found[0]
         is_number = by_number and name.isdecimal() and 1 <= int(name) <= len(self.names)
         return int(name) - 1 if is_number else None
+
+    @cached_property
+    def _positions(self) -> tuple[dict[str, list[int]], ...]:
+        """Indices of the columns of each header, and of each name without unit."""
+        headers: dict[str, list[int]] = {}
+        bare: dict[str, list[int]] = {}
+        for index, name in enumerate(self.names):
+            headers.setdefault(name, []).append(index)
+            bare.setdefault(bare_name(name), []).append(index)
+        return headers, bare
 
     def describe_names(self, name: str) -> str:
         """Names of the columns, with a hint at that which is closest to a name that was not found."""

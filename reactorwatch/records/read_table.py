@@ -1,6 +1,7 @@
 """Read a record from a table of any common form: what is not stated is guessed, and the guesses are noted."""
 
 import shlex
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,17 +9,27 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, hint_at_closest
 from reactorwatch.records.cells import EMPTY, NUMBER, TEXT
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.historian import LongFormat, find_long_format, read_tags
 from reactorwatch.records.layout import Layout, bare_name, unit_of_name
+from reactorwatch.records.quality import QualityFilter, check_stated, find_qualities
 from reactorwatch.records.record import Record
-from reactorwatch.records.row_checks import check_times, check_values, filled_rows, find_runs, numbered_runs
+from reactorwatch.records.row_checks import (
+    check_times,
+    check_values,
+    filled_rows,
+    find_runs,
+    join_repeats,
+    numbered_runs,
+)
+from reactorwatch.records.sentinels import describe_sentinels
 from reactorwatch.records.sniff import sniff
 from reactorwatch.records.source_text import read_text
 from reactorwatch.records.text_table import TextTable
-from reactorwatch.records.time_column import TimeColumn, choose_time, counts_rows
+from reactorwatch.records.time_column import MAX_SHARE_BACK, TimeColumn, choose_time, counts_rows, may_be_time
 from reactorwatch.records.times import Times, find_written_zero_ns, is_newest_first, read_times
 from reactorwatch.records.write_table import RUN
 from reactorwatch.units import UnknownUnitError, conversion
@@ -71,9 +82,15 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
     if long is not None:
         return _read_long(layout, long, signals, stated, notes)
     mapped = _find_columns(layout, signals or ())
+    notes += _find_in_other_case(layout, signals or (), mapped, stated)
     time = choose_time(layout, stated, [column for column in mapped.values() if column is not None])
     _check_required(layout, signals or (), mapped)
-    sources = _sources(layout, signals, mapped, time)
+    taken = {*time.columns, *(column for column in mapped.values() if column is not None)}
+    columns = [column for column in range(len(layout.names)) if column not in time.columns]
+    of = find_qualities(layout, [column for column in columns if column not in taken], stated, columns)
+    check_stated(layout, of, stated)
+    of = {column: values for column, values in of.items() if signals is None or taken.intersection(values)}
+    sources = _sources(layout, signals, mapped, (*time.columns, *of))
     texts = [column for signal, column in sources if _is_coded(layout, signal, column)]
     run = layout.names.index(RUN) if RUN in layout.names and RUN not in asked else None
     stamps = time.columns if time.pattern is not None else ()
@@ -83,19 +100,21 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
             *(time.columns if time.pattern is None else ()),
             *(column for _, column in sources if column not in texts),
         ],
-        [*stamps, *texts, *([] if run is None else [run])],
+        [*stamps, *texts, *of, *([] if run is None else [run])],
     )
     notes += table.notes
-    if is_newest_first(layout, time):
+    if is_newest_first(layout, time, stated.dates):
         table, notes = table.select(np.arange(table.rows)[::-1]), [*notes, "newest row first"]
-    return _make_record(table, time, read_times(table, time, stated), sources, run, notes)
+    qualities = QualityFilter(table, of, stated)
+    return _make_record(table, time, read_times(table, time, stated), sources, run, notes, qualities)
 
 
 def _check_names(layout: Layout, asked: Sequence[str] | None, stated: FileFormat) -> None:
     """Check that names of columns that may be read occur once: those asked for, or all columns of numbers."""
+    wanted, count = {*(asked or ()), stated.time}, Counter(layout.names)
     for name, kind in zip(layout.names, layout.kinds, strict=True):
-        is_read = kind == NUMBER if asked is None else name in (*asked, stated.time)
-        if is_read and layout.names.count(name) > 1:
+        is_read = kind == NUMBER if asked is None else name in wanted
+        if is_read and count[name] > 1:
             raise InputError(
                 f"{layout.path}, row {layout.header_row}: expected each column name once, got {name!r} more than once"
                 "; name it by its number, as in column = 3"
@@ -105,16 +124,46 @@ def _check_names(layout: Layout, asked: Sequence[str] | None, stated: FileFormat
 def _find_columns(layout: Layout, signals: Sequence[SignalColumn]) -> dict[str, int | None]:
     """Number of each signal's column; None: there is none."""
     found: dict[str, int | None] = {}
+    owners: dict[int | None, str] = {}
     for signal in signals:
         column = layout.find(signal.column or signal.name, by_number=bool(signal.column))
-        other = next((item for item, taken in found.items() if taken == column), None)
-        if column is not None and other is not None:
+        other = owners.setdefault(column, signal.name)
+        if column is not None and other != signal.name:
             raise InputError(
                 f"{layout.path}: each signal must have a column of its own, got column {column + 1}, "
                 f"{layout.names[column]!r}, for {other} and {signal.name}; leave one out"
             )
         found[signal.name] = column
     return found
+
+
+def _find_in_other_case(
+    layout: Layout, signals: Sequence[SignalColumn], mapped: dict[str, int | None], stated: FileFormat
+) -> list[str]:
+    """Add the columns of signals under names in another case; a note for each."""
+    free = [column for column in range(len(layout.names)) if column not in mapped.values()]
+    times = (
+        [column for column in free if may_be_time(layout, column)]
+        if stated.time is None
+        else [layout.find(stated.time)]
+    )
+    if stated.period is None and len(times) == 1:
+        free = [column for column in free if column not in times]
+    names = [bare_name(layout.names[column]) for column in free]
+    matched = _match_case([item.name for item in signals if not item.column and mapped[item.name] is None], names)
+    mapped |= {signal: free[names.index(name)] for signal, name in matched.items()}
+    return [f"{signal} from `{name}`" for signal, name in matched.items()]
+
+
+def _match_case(signals: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """Name of each signal in another case, where only one signal and only one name are alike."""
+    alike = Counter(map(str.casefold, signals)), Counter(map(str.casefold, names))
+    return {
+        signal: name
+        for signal in signals
+        for name in names
+        if name.casefold() == (key := signal.casefold()) and alike[0][key] == alike[1][key] == 1
+    }
 
 
 def _check_required(layout: Layout, signals: Sequence[SignalColumn], mapped: dict[str, int | None]) -> None:
@@ -130,20 +179,20 @@ def _check_required(layout: Layout, signals: Sequence[SignalColumn], mapped: dic
 
 
 def _sources(
-    layout: Layout, signals: Sequence[SignalColumn] | None, mapped: dict[str, int | None], time: TimeColumn
+    layout: Layout, signals: Sequence[SignalColumn] | None, mapped: dict[str, int | None], others: Sequence[int]
 ) -> list[tuple[SignalColumn, int]]:
     """Signals to be read, and their columns."""
     if signals is not None:
         pairs = ((signal, mapped[signal.name]) for signal in signals)
         return [(signal, column) for signal, column in pairs if column is not None]
     bare = [bare_name(name) for name in layout.names]
-    sources = []
+    sources, count = [], Counter(bare)
     for column, name in enumerate(layout.names):
         is_unnamed = layout.header_row is not None and name == str(column + 1)
         is_unnamed = is_unnamed and (layout.kinds[column] == EMPTY or counts_rows(layout, column))
-        if column in time.columns or name == RUN or is_unnamed or layout.kinds[column] not in (NUMBER, EMPTY):
+        if column in others or name == RUN or is_unnamed or layout.kinds[column] not in (NUMBER, EMPTY):
             continue
-        own = bare[column] if bare.count(bare[column]) == 1 else name
+        own = bare[column] if count[bare[column]] == 1 else name
         sources.append((SignalColumn(own), column))
     if not sources:
         raise InputError(
@@ -164,9 +213,10 @@ def _make_record(
     sources: Sequence[tuple[SignalColumn, int]],
     run: int | None,
     notes: list[str],
+    qualities: QualityFilter,
 ) -> Record:
     layout = table.layout
-    columns, units = {}, {}
+    columns, units, measured = {}, {}, dict[str, Array]()
     notes = [*notes, *times.notes]
     for signal, column in sources:
         name = signal.name
@@ -178,32 +228,39 @@ def _make_record(
             known = (f"{word} = {code:g}" for word, code in zip(words, codes, strict=True) if not np.isnan(code))
             notes.append(f"{name}: {', '.join(known)}")
         else:
-            columns[name] = table.numbers(column)
+            columns[name] = qualities.keep_good(column, table.numbers(column))
             check_values(table, column, columns[name])
+            if signal.role not in ("mode", "label"):
+                measured[name] = columns[name]
         columns[name], units[name] = _convert(layout, signal, column, layout.units[column], columns[name], notes)
+    notes += [*describe_sentinels(measured), *qualities.notes]
     minutes, zero_ns = times.since_first()
     zero_ns = zero_ns or find_written_zero_ns(layout, time, [column for _, column in sources])
     runs = numbered_runs(table, run)
-    kept = filled_rows(times, columns)
-    check_times(table, time, times, minutes, runs, kept)
-    first_row = table.first_row
-    if kept is not None and not kept.all():
-        first_row, minutes, runs = None, minutes[kept], None if runs is None else runs[kept]
-        columns = {name: values[kept] for name, values in columns.items()}
+    rows = filled_rows(times, columns)
+    if rows.size < table.rows:
+        minutes, runs = minutes[rows], None if runs is None else runs[rows]
+        columns = {name: values[rows] for name, values in columns.items()}
+    stay, columns, repeats = join_repeats(minutes, columns, runs, MAX_SHARE_BACK)
+    rows, minutes, runs = rows[stay], minutes[stay], None if runs is None else runs[stay]
+    check_times(table, time, times, minutes, runs, rows)
+    notes += [f"{text}: {count}" for text, count in repeats.items()]
     return Record(
         minutes,
         columns,
         layout.path.name,
         zero_ns,
-        first_row=first_row,
+        first_row=table.first_row if rows.size == table.rows else None,
         runs=find_runs(layout, time, minutes, runs),
         units={name: unit for name, unit in units.items() if unit},
-        read_as=", ".join([*notes, *_describe_texts(layout, time, sources)] if notes else notes),
+        read_as=", ".join(
+            [*notes, *_describe_texts(layout, [*time.columns, *qualities.columns], sources)] if notes else notes
+        ),
     )
 
 
-def _describe_texts(layout: Layout, time: TimeColumn, sources: Sequence[tuple[SignalColumn, int]]) -> list[str]:
-    used = {*time.columns, *(column for _, column in sources)}
+def _describe_texts(layout: Layout, others: Sequence[int], sources: Sequence[tuple[SignalColumn, int]]) -> list[str]:
+    used = {*others, *(column for _, column in sources)}
     unused = [column for column, kind in enumerate(layout.kinds) if kind == TEXT and column not in used]
     return [f"text left out: {', '.join(f'`{layout.names[column]}`' for column in unused)}"] if unused else []
 
@@ -231,14 +288,18 @@ def _convert(
 def _read_long(
     layout: Layout, long: LongFormat, signals: Sequence[SignalColumn] | None, stated: FileFormat, notes: list[str]
 ) -> Record:
-    """Read a table with a row for each value; the first of several values of a tag at one time counts."""
+    """Read a table with a row for each value; the last of several values of a tag at one time counts."""
     wanted = None if signals is None else [signal.column or signal.name for signal in signals]
     series, is_clock, guesses = read_tags(layout, long, stated, wanted)
     by_name = {bare_name(tag): tag for tag in series} | {tag: tag for tag in series}
+    missing = [item.name for item in signals or () if not item.column and item.name not in by_name]
+    matched = _match_case(missing, [name for name in map(bare_name, series) if name not in (wanted or ())])
+    by_name |= {signal: by_name[name] for signal, name in matched.items()}
+    notes = [*notes, *(f"{signal} from `{name}`" for signal, name in matched.items())]
     if signals is None:
         signals = [SignalColumn(bare_name(tag)) for tag in series]
     times = np.unique(np.concatenate([item.times for item in series.values()]))
-    columns, units, strays, notes = {}, {}, 0, [*notes, *guesses]
+    columns, units, measured, notes, repeats = {}, {}, dict[str, Array](), [*notes, *guesses], Counter[str]()
     for signal in signals:
         tag = by_name.get(signal.column or signal.name)
         if tag is None:
@@ -247,13 +308,18 @@ def _read_long(
                 found = ", ".join(map(repr, series)) + hint_at_closest(asked, series)
                 raise MissingColumnError(f"{layout.path}: expected rows of the tag {asked!r}, got {found}")
             continue
-        own, first = np.unique(series[tag].times, return_index=True)
-        strays += series[tag].times.size - own.size
+        order = np.argsort(series[tag].times, kind="stable")
+        own = series[tag].times[order]
+        stay, joined, counts = join_repeats(own, {tag: series[tag].values[order]})
+        repeats += counts
         values = np.full(times.size, np.nan)
-        values[np.searchsorted(times, own)] = series[tag].values[first]
+        values[np.searchsorted(times, own[stay])] = joined[tag]
+        measured[signal.name] = values
         columns[signal.name], units[signal.name] = _convert(
             layout, signal, long.value, unit_of_name(tag), values, notes
         )
+    notes += describe_sentinels(measured)
     minutes, zero_ns = Times(times, np.full(times.size, fill_value=True), is_clock, []).since_first()
     known = {name: unit for name, unit in units.items() if unit}
-    return Record(minutes, columns, layout.path.name, zero_ns, units=known, strays=strays, read_as=", ".join(notes))
+    notes += [f"{text}: {count}" for text, count in repeats.items()]
+    return Record(minutes, columns, layout.path.name, zero_ns, units=known, read_as=", ".join(notes))

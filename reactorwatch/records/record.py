@@ -77,6 +77,8 @@ class Record:
         units: units by signal name, without signals of unknown unit.
         strays: count of samples in no row, because their number or time fits neither those before nor those after.
         read_as: guesses about the file's format, for people; empty: there was nothing to guess.
+        excluded: by signal, the sampled values that are no measurements because they are out of the signal's bounds,
+            shape (rows,); NaN elsewhere, and `columns` are NaN there.
     """
 
     time_min: NDArray[np.float64]
@@ -88,9 +90,10 @@ class Record:
     units: Mapping[str, str] = field(default_factory=dict)
     strays: int = 0
     read_as: str = ""
+    excluded: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for signal, values in self.columns.items():
+        for signal, values in (*self.columns.items(), *self.excluded.items()):
             if values.shape != self.time_min.shape:
                 raise ValueError(
                     f"column {signal!r} must have as many rows as the times, {self.time_min.size}, got {values.size}"
@@ -100,6 +103,14 @@ class Record:
     def rows(self) -> int:
         """Number of rows."""
         return int(self.time_min.size)
+
+    @property
+    def raw_columns(self) -> dict[str, NDArray[np.float64]]:
+        """Values by signal as they were sampled: those of `columns`, and those that are excluded."""
+        excluded = {name: values for name, values in self.excluded.items() if name in self.columns}
+        return self.columns | {
+            name: np.where(np.isnan(values), self.columns[name], values) for name, values in excluded.items()
+        }
 
     @property
     def zero(self) -> str | None:
@@ -159,6 +170,7 @@ class Record:
                 time_min=self.time_min[first:end],
                 columns={signal: values[first:end] for signal, values in self.columns.items()},
                 runs=None,
+                excluded={signal: values[first:end] for signal, values in self.excluded.items()},
             )
             for first, end in pairwise((*starts, self.rows))
         ]
@@ -190,5 +202,9 @@ def join_runs(runs: list[Record]) -> Record:
         return runs[0]
     numbers = np.repeat(np.arange(1, len(runs) + 1), [run.rows for run in runs])
     columns = {signal: np.concatenate([run.columns[signal] for run in runs]) for signal in runs[0].columns}
+    excluded = {
+        signal: np.concatenate([run.excluded.get(signal, np.full(run.rows, np.nan)) for run in runs])
+        for signal in dict.fromkeys(signal for run in runs for signal in run.excluded)
+    }
     times = np.concatenate([run.time_min for run in runs])
-    return replace(runs[0], time_min=times, columns=columns, runs=numbers)
+    return replace(runs[0], time_min=times, columns=columns, runs=numbers, excluded=excluded)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.cells import EMPTY, MISSING, NUMBER, TEXT, TIME, kind_of
+from reactorwatch.records.cells import EMPTY, MISSING, NUMBER, TEXT, TIME, kind_of, to_numbers
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.header import HeaderSearch
 from reactorwatch.records.layout import COMMENT, Layout, split_line
@@ -105,6 +105,9 @@ def _guess_separator(lines: list[str], missing: frozenset[str]) -> str:
         cells = cells[:: max(1, len(cells) // 1000)]
         values = sum(kind_of(cell, missing) != TEXT for cell in cells) / max(len(cells), 1)
         scores.append((width > 1, round(values * len(regular) / len(rows), 2), separator))
+        has_blanks = [kind_of(cell, missing) for cell in cells if " " in cell.strip()]
+        if separator == "\t" and len(regular) == len(rows) and has_blanks and TEXT not in has_blanks:
+            return separator  # blanks in cells are those between a date and a time of day
     best = max(scores, key=lambda score: score[:2])  # the first of the best
     return best[2] if best[0] else ","
 
@@ -131,8 +134,9 @@ def _is_unlabelled_by_row(layout: Layout) -> bool:
     rows = [[kind_of(cell, layout.missing) for cell in cells] for cells in layout.sample]
     if any(kind not in (NUMBER, EMPTY) for kinds in rows for kind in kinds):
         return False
-    sign = str.maketrans(layout.decimal, ".")
-    cells = [[float(cell.translate(sign)) if cell.strip() else np.nan for cell in cells] for cells in layout.sample]
+    import pyarrow as pa
+
+    cells = [to_numbers(pa.array(row), layout.decimal, layout.missing)[0] for row in layout.sample]
     values = np.arcsinh(np.array(cells))
     return bool(np.nanvar(np.nanmean(values, axis=1)) > np.nanvar(np.nanmean(values, axis=0)))
 

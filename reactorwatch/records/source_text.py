@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from reactorwatch.errors import InputError
+from reactorwatch.records.cells import quote_formula
 from reactorwatch.records.input_file import wrap_read_errors
 
 TEXT_SUFFIXES = (".csv", ".tsv", ".tab", ".txt", ".dat", ".asc", ".prn", ".lvm", ".gz")
@@ -138,6 +139,7 @@ def _workbook(path: Path, data: bytes) -> tuple[bytes, str]:
             width = max(map(len, rows), default=0)  # empty cells at the end of a row may be absent
             lines = io.StringIO()
             writer = csv.writer(lines, lineterminator="\n")
+            rows[:1] = [[quote_formula(cell) for cell in row] for row in rows[:1]]  # as in a text that is written here
             writer.writerows([*row, *[""] * (width - len(row))] for row in rows)
             if lines.getvalue().strip('", \n'):
                 return lines.getvalue().encode(), str(sheet.title)
@@ -164,6 +166,7 @@ def _parquet(path: Path, data: bytes) -> bytes:
 
     try:
         table = pyarrow.parquet.read_table(pa.BufferReader(data))
+        table = table.rename_columns([quote_formula(name) for name in table.column_names])
         text = pa.BufferOutputStream()
         pyarrow.csv.write_csv(table, text)
     except pa.ArrowException as error:

@@ -46,7 +46,10 @@ class TextTable:
 
         self.layout = layout
         self._repeats, self._remarks = 0, list[str]()
-        self._body = _body(layout)
+        if not numbers:  # among texts, a repeat of the header would be a row
+            text, self._repeats = blank_repeats(layout)
+            self.layout = replace(layout, text=text)
+        self._body = find_body(self.layout)
         if not layout.sample and not bytes(self._body).strip():
             raise InputError(f"{layout.path}: expected rows below the header, got none")
         try:
@@ -54,8 +57,11 @@ class TextTable:
         except pa.ArrowInvalid:  # some cells are no plain numbers, a row is too short, or there are comments
             text, self._repeats = blank_repeats(layout)
             self.layout = replace(layout, text=COMMENT.sub(b"", text))
-            self._body = _body(self.layout)
-            self._table = self._parse({}, [*numbers, *texts])
+            self._body = find_body(self.layout)
+            try:
+                self._table = self._parse({}, [*numbers, *texts])
+            except pa.ArrowInvalid as error:
+                self._refuse_row(error)
         self._sentinels = find_sentinels(layout.missing)
         self._known: dict[int, NDArray[np.float64]] = {}
         self._chosen: NDArray[np.intp] | None = None
@@ -150,30 +156,25 @@ class TextTable:
         names = [str(column) for column in range(len(layout.names))]
         kept = {str(column): pa.string() for column in texts}
         self._remarks.clear()
-        try:
-            return pyarrow.csv.read_csv(
-                pa.BufferReader(self._body),
-                read_options=pyarrow.csv.ReadOptions(
-                    column_names=names,
-                    block_size=BLOCK_BYTES,
-                    use_threads=len(self._body) > BLOCK_BYTES,  # a thread that has just started can abort the exit
-                ),
-                parse_options=pyarrow.csv.ParseOptions(
-                    delimiter=layout.separator,
-                    newlines_in_values=b'"' in layout.text,
-                    invalid_row_handler=self._skip_remark,
-                ),
-                convert_options=pyarrow.csv.ConvertOptions(
-                    column_types={**types, **kept},
-                    include_columns=[*types, *kept],
-                    null_values=sorted(layout.missing),
-                    decimal_point=layout.decimal,
-                ),
-            )
-        except pa.ArrowInvalid as error:
-            if not types:
-                self._refuse_row(error)
-            raise
+        return pyarrow.csv.read_csv(
+            pa.BufferReader(self._body),
+            read_options=pyarrow.csv.ReadOptions(
+                column_names=names,
+                block_size=BLOCK_BYTES,
+                use_threads=len(self._body) > BLOCK_BYTES,  # a thread that has just started can abort the exit
+            ),
+            parse_options=pyarrow.csv.ParseOptions(
+                delimiter=layout.separator,
+                newlines_in_values=b'"' in layout.text,
+                invalid_row_handler=self._skip_remark,
+            ),
+            convert_options=pyarrow.csv.ConvertOptions(
+                column_types={**types, **kept},
+                include_columns=[*types, *kept],
+                null_values=sorted(layout.missing),
+                decimal_point=layout.decimal,
+            ),
+        )
 
     def _skip_remark(self, row: Any) -> str:
         """Decide about a row with another number of cells than the header."""
@@ -193,7 +194,7 @@ class TextTable:
         raise InputError(f"{self.layout.path}: expected {kind} cells: {str(error).partition(chr(10))[0]}") from error
 
 
-def _body(layout: Layout) -> Any:
+def find_body(layout: Layout) -> Any:
     """Buffer of the lines from the first row on, without line ends at the end."""
     import pyarrow as pa
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.cells import NUMBER
+from reactorwatch.records.cells import NUMBER, TIME
 from reactorwatch.records.file_format import SECONDS, FileFormat
 from reactorwatch.records.layout import Layout, bare_name
 from reactorwatch.records.timestamps import CLOCK, PATTERNS, Pattern, guess_pattern, stated_pattern
@@ -80,9 +80,12 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
         return _describe(layout, asked, stated)
     for name, unit in STANDARD.items():
         if name in layout.names and (column := layout.names.index(name)) not in taken:
-            if stated.time_unit is not None or stated.time_format is not None:
-                return _describe(layout, column, stated)
-            return TimeColumn((column,), unit, is_standard=True)
+            item = _describe(layout, column, stated)
+            is_stamp = layout.kinds[column] == TIME
+            if stated.time_unit is None and stated.time_format is None and not is_stamp:
+                return TimeColumn((column,), unit, is_standard=True)
+            if not is_stamp or (item.pattern or CLOCK).has_date:  # a time of day may have a date beside it
+                return item
     candidates = [_describe(layout, column, stated) for column in range(len(layout.names)) if column not in taken]
     stamps = [item for item in candidates if item.pattern is not None]
     if len(stamps) == 2 and {(item.pattern or CLOCK).has_date for item in stamps} == {True, False}:
@@ -91,6 +94,7 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
             columns = (*date.columns, *clock.columns)
             cells = [f"{one} {other}" for one, other in zip(*map(layout.cells, columns), strict=True)]
             return TimeColumn(columns, pattern=guess_pattern(cells))
+    stamps = [item for item in stamps if len(set(layout.cells(item.columns[0]))) > 2] or stamps  # not a query's ends
     named = [
         item
         for item in candidates
@@ -115,13 +119,19 @@ def _describe(layout: Layout, column: int, stated: FileFormat) -> TimeColumn:
         pattern = stated_pattern(stated.time_format)
         fits = stated.time is not None or guess_pattern(layout.cells(column), (pattern, *PATTERNS)) is not None
         return TimeColumn((column,), pattern=pattern if fits else None)
-    if stated.time_unit is not None and stated.time_unit != "iso":
-        return TimeColumn((column,), stated.time_unit)
+    if stated.time_unit not in (None, "iso") and layout.kinds[column] != TIME:
+        return TimeColumn((column,), stated.time_unit or "")
     name = layout.names[column]
     words = re.findall(r"[^\W\d_]+", layout.units[column] or "")[:1] or re.findall(r"[^\W\d_]+", name)[-1:]
     return TimeColumn(
         (column,), _UNIT_OF.get(words[0].lower(), "") if words else "", guess_pattern(layout.cells(column))
     )
+
+
+def may_be_time(layout: Layout, column: int) -> bool:
+    """True for a column of timestamps, or of numbers under a name of times."""
+    kind = layout.kinds[column]
+    return kind == TIME or (kind == NUMBER and _has_time_name(layout, TimeColumn((column,))))
 
 
 def _has_time_name(layout: Layout, item: TimeColumn) -> bool:

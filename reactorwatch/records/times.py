@@ -12,7 +12,7 @@ from reactorwatch.records.file_format import SECONDS, FileFormat
 from reactorwatch.records.layout import Layout
 from reactorwatch.records.record import MINUTE_NS, to_time_ns
 from reactorwatch.records.text_table import TextTable
-from reactorwatch.records.time_column import PLAIN, TimeColumn, find_epoch, sample_values
+from reactorwatch.records.time_column import MAX_SHARE_BACK, PLAIN, TimeColumn, find_epoch, sample_values
 from reactorwatch.records.timestamps import DAY_NS, Pattern, guess_pattern, parse
 from reactorwatch.records.write_table import CLOCK
 from reactorwatch.records.zones import HOUR_NS, to_utc
@@ -75,8 +75,8 @@ def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Time
     return Times(minutes, valid, is_clock=False, notes=notes)
 
 
-def is_newest_first(layout: Layout, column: TimeColumn) -> bool:
-    """True if each of the first rows is before the row above it."""
+def is_newest_first(layout: Layout, column: TimeColumn, dates: str | None) -> bool:
+    """True if the first rows are before the rows above them, but for blocks that were written again."""
     if not column.columns or len(layout.sample) < MIN_REVERSED:
         return False
     if column.pattern is None:
@@ -85,12 +85,10 @@ def is_newest_first(layout: Layout, column: TimeColumn) -> bool:
         import pyarrow as pa
 
         cells = [" ".join(row[number] for number in column.columns) for row in layout.sample]
-        try:
-            instants, _ = parse(pa.array(cells), column.pattern)
-        except ValueError:  # day and month are ambiguous, which is said where all times are read
-            return False
+        instants, _ = parse(pa.array(cells), column.pattern, dates)
         steps = np.diff(instants.local_ns[instants.valid])
-    return bool(steps.size and (steps < 0).all())
+    steps = steps[steps != 0]
+    return bool(steps.size and np.count_nonzero(steps > 0) < MAX_SHARE_BACK * steps.size)
 
 
 def find_written_zero_ns(layout: Layout, column: TimeColumn, taken: Collection[int]) -> int:
@@ -104,8 +102,8 @@ def find_written_zero_ns(layout: Layout, column: TimeColumn, taken: Collection[i
         return 0
     import pyarrow as pa
 
-    instants, _ = parse(pa.array([cell]), pattern)
-    if not instants.valid[0] or not np.isfinite(instants.offset_s[0]):
+    instants, form = parse(pa.array([cell]), pattern)
+    if form is None or not instants.valid[0] or not np.isfinite(instants.offset_s[0]):
         return 0
     return int(instants.local_ns[0]) - int(instants.offset_s[0]) * 1_000_000_000 - to_time_ns(float(minutes))
 
@@ -119,15 +117,16 @@ def _read_stamps(table: TextTable, column: TimeColumn, pattern: Pattern, stated:
     import pyarrow.compute as pc
 
     cells = pc.binary_join_element_wise(*(pc.fill_null(table.texts(number), "") for number in column.columns), " ")
-    try:
-        instants, form = parse(cells, pattern)
-    except ValueError as error:
-        cure = "state --time-format %d/%m/%Y or %m/%d/%Y, with the time of day"
-        raise InputError(f"{table.layout.path}, column {name}: day and month are ambiguous; {cure}") from error
+    instants, form = parse(cells, pattern, stated.dates)
+    if form is None:
+        rule = f"day and month are ambiguous in all rows, such as {str(cells[0])!r}"
+        raise InputError(f"{table.layout.path}, column {name}: {rule}; state --dates month-first or --dates day-first")
     at = column.columns[0]
     wrong = np.flatnonzero(~instants.valid & ~np.asarray(pc.equal(pc.utf8_trim_whitespace(cells), "")))
     if wrong.size:
-        table.refuse(int(wrong[0]), at, f"expected a time of the form {form}", "state --time-format if it is another")
+        table.refuse(
+            int(wrong[0]), at, f"expected a time of the form {form}", "state --time-format or --dates if it is another"
+        )
     notes, local_ns = [f"time {name} {form}"], instants.local_ns
     if not pattern.has_date:
         local_ns = local_ns + DAY_NS * np.cumsum(np.diff(local_ns, prepend=local_ns[:1]) < -12 * HOUR_NS)
@@ -165,7 +164,8 @@ def _to_clock(
     steps = np.diff(local_ns)
     usual = float(np.median(steps)) if (steps <= 0).any() else 0.0
     is_hour_back = np.abs(steps + HOUR_NS - usual) < max(usual / 2, 1e9) if usual < HOUR_NS else steps == 0
-    back = np.flatnonzero(is_hour_back & (steps <= 0))
+    is_sunday_night = ((local_ns[1:] // DAY_NS + 4) % 7 == 0) & (local_ns[1:] % DAY_NS < 4 * HOUR_NS)
+    back = np.flatnonzero(is_hour_back & ((steps < 0) | (steps == 0) & is_sunday_night))  # others are of one time
     if back.size:
         rule = "expected increasing times; the clock steps back by an hour, as at the end of summer time"
         table.refuse(int(back[0]) + 1, at, rule, "state the zone, such as --zone Europe/Berlin (--zone UTC: none)")

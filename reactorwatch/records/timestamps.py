@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.file_format import fixed_offset_s
 
 _NAMES = "jan feb mar apr may jun jul aug sep oct nov dec"
 _MONTHS = {name: number for number, name in enumerate(_NAMES.split(), start=1)}
@@ -24,8 +23,7 @@ _DAY = r"(?P<d>\d{1,2})"
 _MONTH_NAME = r"(?P<n>\pL{3,9})\.?"
 _DATES = {
     "yyyy-mm-dd": r"(?P<y>\d{4})[-/.](?P<m>\d{1,2})[-/.](?P<d>\d{1,2})",
-    "dd.mm.yyyy": rf"{_DAY}[.-](?P<m>\d{{1,2}})[.-]{_YEAR}",
-    "day and month/yyyy": rf"(?P<a>\d{{1,2}})/(?P<b>\d{{1,2}})/{_YEAR}",
+    **{f"{{}}{sign}{{}}{sign}yyyy": rf"(?P<a>\d{{1,2}})[{sign}](?P<b>\d{{1,2}})[{sign}]{_YEAR}" for sign in "./-"},
     "dd-Mon-yyyy": rf"{_DAY}[-. ]\s?{_MONTH_NAME}[- ]{_YEAR}",
     "Mon dd, yyyy": rf"{_MONTH_NAME} {_DAY},? (?P<y>\d{{4}})",
 }
@@ -51,6 +49,9 @@ _OFFSETS_H |= {"EET": 2, "EEST": 3, "EST": -5, "EDT": -4, "CST": -6, "CDT": -5, 
 _OFFSETS_H |= {"PDT": -7, "JST": 9}
 
 DAY_NS = 86_400_000_000_000
+
+ORDERS = DAY_FIRST, MONTH_FIRST = "day-first", "month-first"
+_FIXED_ZONE = re.compile(r"(?:UTC|GMT)?([+-])(\d{1,2})(?::?(\d{2}))?")
 
 
 class Pattern(NamedTuple):
@@ -139,18 +140,17 @@ def stated_pattern(text: str) -> Pattern:
     return Pattern(text, f"^\\s*{regex}\\s*$")
 
 
-def parse(cells: Any, pattern: Pattern) -> tuple[Instants, str]:
+def parse(cells: Any, pattern: Pattern, dates: str | None = None) -> tuple[Instants, str | None]:
     """Parse cells to times.
 
     Args:
         cells: strings, a pyarrow array of shape (rows,).
         pattern: form of the timestamps.
+        dates: order of day and month where it is not written, one of `ORDERS`; None: by all cells.
 
     Returns:
-        The times, and the name of the pattern with the order of day and month.
-
-    Raises:
-        ValueError: day and month are ambiguous.
+        The times, and the name of the pattern with the order of day and month; None: it is ambiguous, and taken as
+        day-first in the times.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -178,20 +178,24 @@ def parse(cells: Any, pattern: Pattern) -> tuple[Instants, str]:
         found = pc.if_else(pc.equal(pc.utf8_length(text(name)), 0), None, found)
         return np.asarray(pc.fill_null(pc.cast(found, pa.int64()), default))
 
-    year, month, day, form = number("y", 1970), number("m", 1), number("d", 1), pattern.name
+    year, month, day = number("y", 1970), number("m", 1), number("d", 1)
+    hour, minute, second = number("H"), number("M"), number("S")
+    form: str | None = pattern.name
     year = year + np.where(year < 100, np.where(year < 70, 2000, 1900), 0)
-    if "a" in names:
-        first, second = number("a", 1), number("b", 1)
-        month, day = _order_day_and_month(year, first, second)
-        form = form.replace("day and month", "dd/mm" if day is first else "mm/dd")
     if "n" in names:
         values = pc.utf8_slice_codeunits(pc.utf8_lower(text("n")), 0, 3)
         index = pc.index_in(values, pa.array(list(_MONTHS)))
         month = np.array([*_MONTHS.values(), 0])[np.asarray(pc.fill_null(index, len(_MONTHS)))]
-    hour, minute, second = number("H"), number("M"), number("S")
     if "p" in names:
         half = np.asarray(pc.fill_null(pc.utf8_lower(text("p")), "").to_numpy(zero_copy_only=False), dtype=object)
         hour = np.where(half == "", hour, hour % 12 + 12 * (half == "p"))
+    if "a" in names:
+        one, other = number("a", 1), number("b", 1)
+        clock_s = (hour * 60 + minute) * 60 + second
+        order = dates or _find_order(year[valid], one[valid], other[valid], clock_s[valid])
+        order = DAY_FIRST if order is None and pattern.name.startswith("{}.") else order  # points are European
+        day, month = (other, one) if order == MONTH_FIRST else (one, other)
+        form = pattern.name.format(*(("mm", "dd") if order == MONTH_FIRST else ("dd", "mm"))) if order else None
     days = _days(year, month, day)
     one = np.ones_like(day)
     in_month = _days(year + month // 12, month % 12 + 1, one) - _days(year, month, one)
@@ -211,19 +215,22 @@ def _days(year: NDArray[np.int64], month: NDArray[np.int64], day: NDArray[np.int
     return np.asarray(months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + day - 1)
 
 
-def _order_day_and_month(
-    year: NDArray[np.int64], first: NDArray[np.int64], second: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Month and day of dates such as 03/04/2026: months are at most 12, and a record is short."""
-    if (first > 12).any() or np.array_equal(first, second):
-        return second, first
-    if (second > 12).any():
-        return first, second
-    as_month, as_day = (_days(year, first, second), _days(year, second, first))
-    spans = [int(days.max() - days.min()) for days in (as_month, as_day)]
-    if spans[0] == spans[1]:
-        raise ValueError
-    return (first, second) if spans[0] < spans[1] else (second, first)
+def _find_order(
+    year: NDArray[np.int64], first: NDArray[np.int64], second: NDArray[np.int64], clock_s: NDArray[np.int64]
+) -> str | None:
+    """Order of day and month in dates such as 03/04/2026; None: both are possible.
+
+    Months are at most 12, times are in order, and rows of several a date are days apart, not months.
+    """
+    if (first > 12).any() or (second > 12).any() or np.array_equal(first, second):
+        return MONTH_FIRST if (second > 12).any() and not (first > 12).any() else DAY_FIRST
+    times_s = [_days(year, month, day) * 86_400 + clock_s for day, month in ((first, second), (second, first))]
+    in_order = [bool((np.diff(time) >= 0).all() or (np.diff(time) <= 0).all()) for time in times_s]
+    if in_order[0] != in_order[1]:
+        return ORDERS[in_order.index(True)]
+    spans = [int(np.ptp(time)) for time in times_s]
+    dates = 1 + np.count_nonzero(np.diff(first) | np.diff(second))
+    return None if spans[0] == spans[1] or 2 * dates > first.size else ORDERS[int(np.argmin(spans))]
 
 
 def _offsets(cells: Any) -> NDArray[np.float64]:
@@ -235,3 +242,13 @@ def _offsets(cells: Any) -> NDArray[np.float64]:
         values.append(_OFFSETS_H.get(text.upper(), np.nan) * 3600 if offset_s is None else offset_s)
     index = np.asarray(encoded.indices.fill_null(len(values)))
     return np.asarray(np.array([*values, np.nan], dtype=np.float64)[index], dtype=np.float64)
+
+
+def fixed_offset_s(zone: str) -> int | None:
+    """Seconds by which a zone such as `+01:00` or `UTC+1` is ahead of UTC; None for a named zone."""
+    if zone.upper() in ("UTC", "GMT", "Z"):
+        return 0
+    match = _FIXED_ZONE.fullmatch(zone.upper())
+    if match is None:
+        return None
+    return (1 if match[1] == "+" else -1) * (int(match[2]) * 3600 + int(match[3] or 0) * 60)

@@ -11,6 +11,7 @@ import numpy as np
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.cells import quote_formula
 from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN, MINUTE_NS, Record
 from reactorwatch.records.source_text import PARQUET_SUFFIXES, import_openpyxl
 
@@ -55,7 +56,7 @@ def _columns(record: Record, clock: bool) -> dict[str, list[Any]]:
                 f"({', '.join(own)}); give it another name, with column = {name!r} in the description of its process"
             )
     columns: dict[str, list[Any]] = {TIME: record.time_min.tolist()}
-    for signal, values in record.columns.items():
+    for signal, values in record.raw_columns.items():
         if (np.abs(values) >= LARGEST_VALUE).any():
             raise ValueError(
                 f"column {signal!r} must be below {LARGEST_VALUE:g} or NaN to be read again, "
@@ -83,7 +84,7 @@ def _write_text(path: Path, record: Record, clock: bool, *, compress: bool = Fal
         packed = gzip.GzipFile("", "wb", fileobj=file, mtime=0) if compress else file
         with io.TextIOWrapper(packed, encoding="utf-8", newline="") as text:
             writer = csv.writer(text, lineterminator="\n")  # writes a float as its repr, which reads back exactly
-            writer.writerow(columns)
+            writer.writerow(map(quote_formula, columns))
             writer.writerows(zip(*columns.values(), strict=True))
 
 
@@ -95,11 +96,24 @@ def _write_workbook(path: Path, record: Record, clock: bool) -> None:
     columns, openpyxl = _columns(record, clock), import_openpyxl(path)
     book = openpyxl.Workbook(write_only=True)
     sheet = book.create_sheet("record")
-    sheet.append(list(columns))
+    sheet.append([_text_cell(openpyxl, sheet, path, name) for name in columns])
     for row in zip(*columns.values(), strict=True):
         sheet.append(row)
     with atomic_write(path) as temporary:
         book.save(temporary)
+
+
+def _text_cell(openpyxl: Any, sheet: Any, path: Path, text: str) -> Any:
+    """Cell of a text, which the library would take for a formula if it starts with =, and a spreadsheet on editing."""
+    try:
+        cell = openpyxl.cell.WriteOnlyCell(sheet, text)
+    except openpyxl.utils.exceptions.IllegalCharacterError as error:
+        raise InputError(
+            f"{path}: a workbook cannot hold the control characters in the name {text!r}; write .csv or .parquet"
+        ) from error
+    cell.data_type = "s"
+    cell.quotePrefix = quote_formula(text) != text
+    return cell
 
 
 def _write_parquet(path: Path, record: Record, clock: bool) -> None:

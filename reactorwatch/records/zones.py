@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.file_format import fixed_offset_s
+from reactorwatch.records.timestamps import fixed_offset_s
 
 HOUR_NS = 3_600_000_000_000
 
@@ -55,7 +55,8 @@ def to_utc(local_ns: NDArray[np.int64], zone: str, refuse: Callable[[int, str], 
     twice = np.flatnonzero(late > early)
     for stretch in np.split(twice, np.flatnonzero(np.diff(twice) > 1) + 1) if twice.size else ():
         first, end = int(stretch[0]), int(stretch[-1]) + 1
-        back = np.flatnonzero(np.diff(local_ns[first:end]) <= 0)
+        steps = np.diff(local_ns[first:end])  # among several, one of 0 is a duplicate row
+        back = np.flatnonzero((steps < 0) | ((steps == 0) & (steps.size == 1)))
         if back.size:
             second = first + int(back[0]) + 1
             early[second:end] = late[second:end]

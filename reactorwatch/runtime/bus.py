@@ -84,6 +84,9 @@ class Bus(Protocol):
     def undeclare_token(self, key: str) -> None:
         """Remove a token that was declared here."""
 
+    def query_tokens(self, key_expression: str) -> list[str]:
+        """Liveliness tokens that exist now."""
+
     def subscribe_liveliness(self, key_expression: str, handler: Callable[[str, bool], None]) -> None:
         """Call the handler with (key, True) for tokens that exist or appear, (key, False) when they disappear."""
 

@@ -16,6 +16,8 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 
 from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.limits import Limits, parse_toml, set_limits
+from reactorwatch.records.input_file import read_regular
 from reactorwatch.runtime.setting_rules import (
     LAST_PORT,
     check_bounds,
@@ -24,9 +26,8 @@ from reactorwatch.runtime.setting_rules import (
     check_values,
     valid_choices,
 )
-from reactorwatch.toml_text import parse_toml
 
-SECTIONS = ("bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log")
+SECTIONS = ("bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log", "limits")
 """Valid tables of a settings file."""
 
 IDENTITY = ("ca", "certificate", "key")
@@ -119,15 +120,15 @@ _NO_CHOICE = "Invalid enum value"
 
 
 def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
-    """Read the tables of a settings file; empty without a file.
+    """Read the tables of a settings file, and set the limits that it states; empty without a file.
 
     Raises:
-        InputError: the file does not exist, is not TOML, or holds an unknown table.
+        InputError: the file does not exist, is not TOML, or holds an unknown table or invalid limits.
     """
     if path is None:
         return {}
     try:
-        tables = parse_tables(path.read_bytes())
+        tables = parse_tables(read_regular(path))
     except OSError as error:
         raise InputError(f"settings file {path}: cannot be read: {error.strerror}") from error
     except InputError as error:
@@ -135,6 +136,8 @@ def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
     for name in tables:
         if name not in SECTIONS:
             raise InputError(f"settings file {path}: {describe_unknown('table', name, SECTIONS)}")
+    if "limits" in tables:
+        set_limits(section(Limits, "limits", tables, {}))
     bus = tables.get("bus", {})
     for name in IDENTITY:
         if isinstance(bus.get(name), str):  # a folder with settings and certificates can be moved
@@ -160,7 +163,8 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
 
     Args:
         kind: class of the settings, with their defaults. If it has `presets`, settings by name, the key `preset` names
-            one. If it has `older_keys`, by older name the present one and a conversion of the value, both are valid.
+            one. If it has `older_keys`, by older name the present one and a conversion of the value, both are valid;
+            a key whose present name is empty has no effect any more.
         name: name of the table in the file.
         tables: the tables from `read_settings`.
         flags: values of the command line, by key; None: not given.
@@ -212,5 +216,7 @@ def _rename_older(kind: type[Section], name: str, values: dict[str, Any]) -> dic
             continue
         if key in values:
             raise InputError(f"settings [{name}]: {older!r} is an older name of {key!r}, got both; leave {older!r} out")
-        renamed[key] = convert(renamed.pop(older))
+        value = renamed.pop(older)
+        if key:
+            renamed[key] = convert(value)
     return renamed

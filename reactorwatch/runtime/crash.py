@@ -1,7 +1,8 @@
 """Last error handler of every process: an unhandled error ends in one line and an exit code.
 
-Unusable input, and a file or disk that the system refuses, end with 2. Everything else is a fault of this software: it
-ends with 70, and the line names a file with the traceback.
+Unusable input, and a file or disk that the system refuses, end with 2; a record that holds too little to be judged ends
+with 3. Everything else is a fault of this software: it ends with 70, and the line names a file with the traceback. A
+node that ends for a reason that can pass without a person ends with 1, so that a supervisor restarts it.
 """
 
 import errno
@@ -14,9 +15,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from reactorwatch import __version__
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, UnavailableError, describe_exception
 from reactorwatch.terminal import printable
+from reactorwatch.version import this_build
 
 EXIT_CODE = 70
 """EX_SOFTWARE of sysexits.h, used for no other reason."""
@@ -48,9 +49,9 @@ def guard(name: str, run: Callable[[], int]) -> int:
         return run()
     except KeyboardInterrupt:
         return INTERRUPTED
-    except InputError as error:
+    except (InputError, UnavailableError) as error:
         print_error(name, str(error))
-        return UNUSABLE
+        return error.exit_code
     except Exception as error:  # noqa: BLE001 (only here an unexpected error becomes a report)
         if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
             print_error(name, f"{error.filename or 'standard output cannot be written'}: {error.strerror}")
@@ -81,7 +82,7 @@ def report_crash(error: BaseException) -> str:
     Returns:
         A line for people: the error, and the path of the report or, if none can be written, the line of the code.
     """
-    reason = " ".join(f"{type(error).__name__}: {error}".split())
+    reason = " ".join(describe_exception(error).split())
     if len(reason) > _MAX_REASON:
         reason = f"{reason[:_MAX_REASON]}…"
     path = _write(_report(error))
@@ -95,7 +96,7 @@ def report_crash(error: BaseException) -> str:
 
 def _report(error: BaseException) -> str:
     lines = [
-        f"reactorwatch {__version__}, Python {platform.python_version()}, {platform.platform()}",
+        f"reactorwatch {this_build()}, Python {platform.python_version()}, {platform.platform()}",
         f"folder: {Path.cwd()}",
         f"command: {sys.argv}",
         "",

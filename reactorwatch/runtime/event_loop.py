@@ -68,13 +68,21 @@ def _no_publications(_now_ns: int) -> list[Publication]:
 
 
 class _Inbox:
-    """Bounded queue between the bus's threads and the loop; messages wait for room in it."""
+    """Bounded queue between the bus's threads and the loop; messages wait for room in it.
+
+    While the loop waits for the bus to take a publication, it makes no room. The bus may take it only when a thread
+    that waits for room has received another message, so after `POLL_S` messages wait no longer for that publication.
+
+    Attributes:
+        publication: number of the publication that the loop waits for, from 1; 0 if it waits for none.
+    """
 
     def __init__(self, stop: "StopSignal") -> None:
         self._items: SimpleQueue[_Item] = SimpleQueue()
         self._lock, self._room = threading.Lock(), threading.Event()
         self._messages = self._bytes = 0
-        self._stop, self._closed = stop, False
+        self._stop, self._closed, self._was_full = stop, False, False
+        self.publication = self._blocked = 0
         stop.call_on_set(lambda: self.put(_no_publications))
         stop.call_on_set(self._room.set)
 
@@ -87,9 +95,11 @@ class _Inbox:
     ) -> None:
         """Append a function to call; from threads of the bus. One with messages blocks until there is room."""
         if messages:
-            while self._is_full and not (self._stop.is_set or self._closed):
+            while self._is_full and not (self._stop.is_set or self._closed or self._is_blocked):
+                self._was_full, publication = True, self.publication
                 self._room.clear()
-                self._room.wait(POLL_S)
+                if not self._room.wait(POLL_S) and publication == self.publication:
+                    self._blocked = publication
             self._count(messages, payload)
         self._items.put((function, arguments, messages, payload))
 
@@ -98,6 +108,7 @@ class _Inbox:
         try:
             item = self._items.get(timeout=timeout_s) if timeout_s > 0 else self._items.get_nowait()
         except Empty:
+            self._was_full = self._was_full and timeout_s <= 0
             return None
         if item[2]:
             self._count(-item[2], -item[3])
@@ -116,6 +127,16 @@ class _Inbox:
         return self._items.qsize()
 
     @property
+    def has_backlog(self) -> bool:
+        """True if messages wait here, or have waited for room since the loop last waited for messages."""
+        return self._messages > 0 or self._was_full
+
+    @property
+    def _is_blocked(self) -> bool:
+        """True if the loop has waited for one publication for `POLL_S`."""
+        return 0 < self._blocked == self.publication
+
+    @property
     def _is_full(self) -> bool:
         return self._messages >= MAX_INBOX_MESSAGES or self._bytes >= MAX_INBOX_BYTES
 
@@ -126,22 +147,31 @@ class _Inbox:
 
 
 class StopSignal:
-    """Flag set once, by a signal or another thread, that wakes a waiting loop."""
+    """Flag set once, by a signal or another thread, that wakes a waiting loop.
+
+    Attributes:
+        interrupted: True if it was set by SIGINT (Ctrl-C).
+    """
 
     def __init__(self) -> None:
-        self._set = False
+        self.interrupted = False
+        self._set = threading.Event()
         self._callbacks: list[Callable[[], None]] = []
 
     def set(self) -> None:
         """Ask the loop to end."""
-        self._set = True
+        self._set.set()
         for callback in self._callbacks:
             callback()
 
     @property
     def is_set(self) -> bool:
         """True once the loop was asked to end."""
-        return self._set
+        return self._set.is_set()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until the loop is asked to end, at most so long; returns True if it is."""
+        return self._set.wait(timeout_s)
 
     def call_on_set(self, callback: Callable[[], None]) -> None:
         """Register a function that `set` calls."""
@@ -149,14 +179,21 @@ class StopSignal:
 
 
 @contextlib.contextmanager
-def stop_on_signals() -> Iterator[StopSignal]:
-    """Stop signal that SIGINT (Ctrl-C) and SIGTERM set, while the context lasts.
+def stop_on_signals(*, is_supervisor: bool = False) -> Iterator[StopSignal]:
+    """Stop signal that SIGINT (Ctrl-C) and SIGTERM set, while the context lasts, and SIGHUP in a terminal.
+
+    SIGHUP is ignored without a terminal that could be closed, unless the process supervises others, and where it was
+    ignored before, as under `nohup`.
 
     Python runs a handler in the main thread, between two of its instructions: while that thread may hold any lock, and
     only after a wait that began just before the signal has ended. So the handler does nothing. The interpreter writes
     the signal's number into a pipe at once (`signal.set_wakeup_fd`), and a thread that reads the pipe sets the stop.
     """
     stop = StopSignal()
+    terminals = [number for number in range(3) if os.isatty(number)]
+    stopping = {signal.SIGINT, signal.SIGTERM}
+    if (is_supervisor or terminals or _has_terminal()) and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        stopping.add(signal.SIGHUP)
     source, sink = os.pipe()
     os.set_blocking(sink, False)
 
@@ -165,12 +202,18 @@ def stop_on_signals() -> Iterator[StopSignal]:
 
     def wake_on_request() -> None:
         while _END not in (numbers := os.read(source, 64)):
-            if set(numbers) & {signal.SIGINT, signal.SIGTERM}:
+            if signal.SIGHUP in numbers:
+                previous[signal.SIGHUP] = signal.SIG_IGN  # the shell sends a second one
+                _leave_terminals(terminals)
+            stop.interrupted = stop.interrupted or signal.SIGINT in numbers
+            if stopping & set(numbers):
                 stop.set()
 
     waker = threading.Thread(target=wake_on_request, name="stop", daemon=True)
     waker.start()
-    previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.signal(number, handler) for number in stopping}
+    if signal.SIGHUP not in stopping:
+        previous[signal.SIGHUP] = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     previous_fd = signal.set_wakeup_fd(sink, warn_on_full_buffer=False)
     try:
         yield stop
@@ -184,6 +227,23 @@ def stop_on_signals() -> Iterator[StopSignal]:
         os.close(sink)
 
 
+def _has_terminal() -> bool:
+    """True if the process has a controlling terminal, also with its streams redirected."""
+    with contextlib.suppress(OSError):
+        os.close(os.open("/dev/tty", os.O_RDWR | os.O_NOCTTY))
+        return True
+    return False
+
+
+def _leave_terminals(streams: list[int]) -> None:
+    """Redirect standard streams whose terminal was closed: each write to it would be an error."""
+    null = os.open(os.devnull, os.O_RDWR)
+    for stream in streams:
+        if not os.isatty(stream):
+            os.dup2(null, stream)
+    os.close(null)
+
+
 class EventLoop:
     """Runs a node until it is finished or asked to stop.
 
@@ -194,6 +254,7 @@ class EventLoop:
         drain_timeout_s: once asked to stop, the loop runs on until nothing has arrived for this long, for at most
             `MAX_DRAIN_FACTOR` times as long.
         on_publish: called with each publication of the node, in the loop's thread, before it is sent.
+        on_backlog: called before each tick with True if messages have arrived that the node has not handled.
     """
 
     def __init__(
@@ -204,12 +265,15 @@ class EventLoop:
         *,
         drain_timeout_s: float = 0.0,
         on_publish: Callable[[Publication], None] | None = None,
+        on_backlog: Callable[[bool], None] = lambda _has_backlog: None,
     ) -> None:
+        self._on_backlog = on_backlog
         self._node, self._bus, self._stop = node, bus, stop
         self._drain_timeout_s = drain_timeout_s
         self._on_publish = on_publish
         self._clock = SteadyClock()
         self._inbox = _Inbox(stop)
+        self._published = 0
 
     def subscribe(
         self,
@@ -295,6 +359,7 @@ class EventLoop:
         """Tick if it is due; otherwise wait for items, and handle up to `BATCH` messages."""
         wait_s = (self._node.next_tick_ns() - self._clock.now_ns()) / 1e9
         if wait_s <= 0:
+            self._on_backlog(self._inbox.has_backlog)
             self._publish(self._node.on_tick(self._clock.now_ns()))
         handled = 0
         while handled < BATCH and (messages := self._handle_next(min(wait_s, MAX_WAIT_S))):
@@ -336,4 +401,7 @@ class EventLoop:
         for publication in publications:
             if self._on_publish is not None:
                 self._on_publish(publication)
+            self._published += 1
+            self._inbox.publication = self._published
             self._bus.publish(encode(publication))
+            self._inbox.publication = 0

@@ -7,12 +7,14 @@ Prometheus takes a falling counter for a restart.
 
 The node's loop passes each publication on (`Metrics.on_publish`); a scrape reads, in a thread of the server,
 references that are replaced as a whole. A node of many plants has one page for all.
+A port that cannot be listened at stops no node: it is tried again until it can be, and health says so.
 """
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from threading import Event, Thread
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -23,6 +25,8 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import MetricsConfig
+from reactorwatch.runtime.http_guard import PageServer, guard_application
+from reactorwatch.runtime.retry import retry
 
 if TYPE_CHECKING:
     from prometheus_client import Metric
@@ -83,12 +87,15 @@ class Metrics:
         plants: by name of a plant, a function that returns its alarms, or None if they have not changed; it is called
             in the thread of the caller. None: the node has no alarms.
         free_bytes: returns the free space of its disk; None: it writes no files.
+
+    Attributes:
+        trouble: why the page is not served at the moment; empty: it is.
     """
 
     def __init__(
         self, node: str, plants: Mapping[str, Alarms] = NO_PLANTS, free_bytes: Callable[[], int] | None = None
     ) -> None:
-        self.node = node
+        self.node, self.trouble = node, ""
         self._free_bytes = free_bytes
         self._plants = {plant: _Plant(alarms) for plant, alarms in plants.items()}
 
@@ -102,8 +109,10 @@ class Metrics:
         self._plants.pop(plant, None)
 
     def on_publish(self, publication: Publication) -> None:
-        """Take the counts and alarm states from a publication of the node."""
+        """Take the counts and alarm states from a publication of the node; its health says why there is no page."""
         message = publication.message
+        if isinstance(message, Health) and self.trouble and not message.waiting_for:
+            message.waiting_for = self.trouble
         if not isinstance(message, Health | Alarm):
             return
         topic = keys.parse(publication.key)
@@ -177,7 +186,7 @@ def serve_metrics(config: MetricsConfig, metrics: Metrics) -> Iterator[Metrics |
         The page; None without a port.
 
     Raises:
-        InputError: Prometheus' library is not installed, or the port cannot be listened at.
+        InputError: Prometheus' library is not installed.
     """
     if config.port is None:
         yield None
@@ -185,22 +194,40 @@ def serve_metrics(config: MetricsConfig, metrics: Metrics) -> Iterator[Metrics |
     port = config.port + PORT_OFFSET[metrics.node]
     address = f"{config.address}:{port}"
     try:
-        from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
+        from prometheus_client import CollectorRegistry, ProcessCollector, make_wsgi_app
     except ImportError as missing:
         raise InputError("[metrics] needs prometheus-client: pip install 'reactorwatch[metrics]'") from missing
     registry = CollectorRegistry()
     registry.register(metrics)
     ProcessCollector(registry=registry)
-    try:
-        server, thread = start_http_server(port, config.address, registry)
-    except OSError as error:
-        raise InputError(
-            f"[metrics] port {config.port}: the {metrics.node} cannot listen at {address}: {error.strerror}"
-        ) from error
-    log.info("metrics", page=f"http://{address}/metrics")
+    tried, ended = Event(), Event()
+
+    def serve() -> None:
+        served = retry(
+            lambda: PageServer((config.address, port), guard_application(make_wsgi_app(registry))),
+            ended.wait,
+            on_failure,
+            lambda error: isinstance(error, OSError),
+        )
+        if served is None:
+            return
+        metrics.trouble = ""
+        log.info("metrics", page=f"http://{address}/metrics")
+        tried.set()
+        with served.serving():
+            ended.wait()
+
+    def on_failure(why: str, is_new: bool) -> None:
+        metrics.trouble = f"[metrics] port {config.port}: the {metrics.node} cannot listen at {address}: {why}"
+        if is_new:
+            log.warning(metrics.trouble)
+        tried.set()
+
+    server_thread = Thread(target=serve, name="metrics")
+    server_thread.start()
+    tried.wait()
     try:
         yield metrics
     finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+        ended.set()
+        server_thread.join()

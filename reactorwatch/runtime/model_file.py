@@ -7,6 +7,7 @@ from typing import Any
 from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.input_file import read_regular
 
 
 def read_extended_model(path: Path) -> ExtendedModel:
@@ -16,7 +17,7 @@ def read_extended_model(path: Path) -> ExtendedModel:
         InputError: the file cannot be read, or holds no model; the text starts with its path.
     """
     try:
-        return parse_extended_model(path.read_bytes())
+        return parse_extended_model(read_regular(path))
     except OSError as error:
         raise InputError(f"model file {path}: cannot be read: {error.strerror}") from error
     except InputError as error:

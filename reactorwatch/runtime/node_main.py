@@ -1,6 +1,9 @@
 """Entry of a node's process: `python -m NODE [settings.toml]`."""
 
+import os
+import signal
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -12,6 +15,9 @@ from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, rea
 from reactorwatch.runtime.crash import UNUSABLE, guard, print_error
 
 Config = TypeVar("Config", bound=msgspec.Struct)
+
+SUPERVISED = "--supervised"
+"""Last argument of a node that ends, as by SIGTERM, when its standard input does: its supervisor has ended."""
 
 
 def main(module: str, table: str, kind: type[Config], run: Callable[[Config, BusConfig, MetricsConfig], object]) -> int:
@@ -27,6 +33,9 @@ def main(module: str, table: str, kind: type[Config], run: Callable[[Config, Bus
         The exit code, see `crash`.
     """
     arguments = sys.argv[1:]
+    if arguments[-1:] == [SUPERVISED]:
+        arguments.pop()
+        threading.Thread(target=_end_with_supervisor, name="supervisor", daemon=True).start()
     if len(arguments) > 1:
         print_error(table, f"usage: python -m {module} [settings.toml]")
         return UNUSABLE
@@ -43,3 +52,9 @@ def main(module: str, table: str, kind: type[Config], run: Callable[[Config, Bus
         return 0
 
     return guard(table, run_node)
+
+
+def _end_with_supervisor() -> None:
+    while os.read(sys.stdin.fileno(), 1024):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)

@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.codegen.numba_kernel import Entry, inline
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Shown, SignalChart, finite
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, Judgement, Shown, SignalChart, finite
+from reactorwatch.stored_state import Memory
 
 # The first rows of a chart's column: what comes in and what goes out. After them come its settings, where its memory
 # starts, and its memory.
@@ -46,18 +47,16 @@ class Judgements(NamedTuple):
     out: NDArray[np.bool_]
 
 
-class SignalState(ChartState, frozen=True):
-    """State of a chart of one signal, or of a bank of them.
+class SignalMemory(Memory):
+    """Memory of a chart of one signal, or of a bank of them.
 
     Attributes:
         chart: name of the chart.
-        plants: number of plants.
-        numbers: little-endian doubles, shape (numbers of one chart, plants).
+        numbers: its settings and what it remembers, shape (numbers of one chart, plants).
     """
 
     chart: str
-    plants: int
-    numbers: bytes
+    numbers: Array
 
 
 class CompiledChart(SignalChart):
@@ -68,14 +67,18 @@ class CompiledChart(SignalChart):
         start: memory of the chart before the first value.
     """
 
-    State = SignalState
+    memory_type = SignalMemory
     numbers: ClassVar[int]  # how many settings and twice how many memories it has
     memories: ClassVar[int]
 
     def __init__(self, settings: Iterable[float], start: Sequence[float]) -> None:
-        column = [0.0] * SETTINGS + [*settings, *start, *start]
-        self._columns: Array = np.array(column, dtype=np.float64).reshape(-1, 1)
-        self._columns[PRESENT] = 1.0
+        self._use(SignalMemory(self.name, np.array([*settings, *start, *start], dtype=np.float64).reshape(-1, 1)))
+
+    def _use(self, memory: SignalMemory) -> None:
+        """See `Chart`."""
+        if memory.numbers.shape[1] != 1:
+            raise ValueError(f"a chart's memory must be of one plant, got {memory.numbers.shape[1]}: use Bank")
+        self.memory, self._columns = memory, columns_of(type(self), memory)
 
     @staticmethod
     @abstractmethod
@@ -90,28 +93,6 @@ class CompiledChart(SignalChart):
     @abstractmethod
     def explain(cls, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`; from the judgement alone, as the memory is in a bank."""
-
-    @classmethod
-    def from_state(cls, state: SignalState) -> Self:
-        """Resume a chart, bit for bit, from its state.
-
-        Raises:
-            ValueError: the state is of another chart or of several plants, or damaged.
-        """
-        if state.plants != 1:
-            raise ValueError(f"state must be of one plant, got {state.plants}: use Bank")
-        return cls._of(_columns(cls, state))
-
-    @classmethod
-    def _of(cls, columns: Array) -> Self:
-        chart = cls.__new__(cls)
-        chart._columns = columns
-        return chart
-
-    @property
-    def state(self) -> SignalState:
-        """A copy of the full state."""
-        return SignalState(self.name, 1, self._columns[SETTINGS:].astype("<f8").tobytes())
 
     def update(self, x: float) -> Judgement:
         """See `Chart`."""
@@ -148,23 +129,24 @@ class Bank(Generic[Kind]):
         if len(kinds) != 1:
             raise InputError(f"charts must be one or more of one kind, got {sorted(kind.__name__ for kind in kinds)}")
         (self._kind,) = kinds
-        self._hold(np.concatenate([chart._columns for chart in charts], axis=1))
+        columns = np.concatenate([chart.memory.numbers for chart in charts], axis=1)
+        self._use(self._kind, SignalMemory(self._kind.name, columns))
 
     @classmethod
-    def from_state(cls, kind: type[Kind], state: SignalState) -> Self:
-        """Resume the charts, bit for bit, from their state.
+    def resume(cls, kind: type[Kind], memory: SignalMemory) -> Self:
+        """Charts of a kind that go on from a memory, which they update.
 
         Raises:
-            ValueError: the state is of another chart, or damaged.
+            ValueError: the memory is of another chart, or damaged.
         """
         bank = cls.__new__(cls)
-        bank._kind = kind
-        bank._hold(_columns(kind, state))
+        bank._use(kind, memory)
         return bank
 
-    def _hold(self, columns: Array) -> None:
-        self._columns = np.ascontiguousarray(columns)
-        plants, self._kernel = columns.shape[1], _entry(self._kind)
+    def _use(self, kind: type[Kind], memory: SignalMemory) -> None:
+        self._kind, self.memory = kind, memory
+        self._columns = columns = columns_of(kind, memory)
+        plants, self._kernel = columns.shape[1], _entry(kind)
         self._numbers = self._columns.reshape(-1).data  # all of them, one row after the other
         self._come, self._out = Struct(f"{2 * plants}d").pack_into, Struct(f"{plants}d").unpack_from
         self._out_offset = OUT * plants * self._columns.itemsize
@@ -173,12 +155,6 @@ class Bank(Generic[Kind]):
     def numbers(self) -> Array:
         """Settings and memory of the charts, shape (numbers of one chart, plants): a view, contiguous."""
         return self._columns[SETTINGS:]
-
-    @property
-    def state(self) -> SignalState:
-        """A copy of the full state of the charts."""
-        numbers = self._columns[SETTINGS:].astype("<f8").tobytes()
-        return SignalState(self._kind.name, self._columns.shape[1], numbers)
 
     def update(self, values: ArrayLike, present: NDArray[np.bool_] | None = None) -> Judgements:
         """Update the charts with the next value of every plant.
@@ -243,9 +219,7 @@ class Bank(Generic[Kind]):
         """
         if not 0 <= plant < self._columns.shape[1]:
             raise IndexError(f"plant must be in 0..{self._columns.shape[1] - 1}, got {plant}")
-        columns = self._columns[:, plant : plant + 1].copy()
-        columns[PRESENT] = 1.0
-        return self._kind._of(columns)
+        return self._kind.resume(SignalMemory(self._kind.name, self._columns[SETTINGS:, plant : plant + 1].copy()))
 
 
 @cache
@@ -258,18 +232,18 @@ def _restart(columns: Array, memories: int, plants: Any) -> None:
         columns[-memories:, plants] = columns[-2 * memories : -memories, plants]
 
 
-def _columns(kind: type[CompiledChart], state: SignalState) -> Array:
-    """The columns of charts of a kind, from their state."""
-    if state.chart != kind.name:
-        raise ValueError(f"state must be of the chart {kind.name}, got {state.chart}")
-    if state.plants < 1 or len(state.numbers) != 8 * kind.numbers * state.plants:
-        raise ValueError(
-            f"state of {state.plants} charts {kind.name} must have {8 * kind.numbers * state.plants} bytes, "
-            f"got {len(state.numbers)}"
-        )
-    columns = np.zeros((SETTINGS + kind.numbers, state.plants))
-    columns[PRESENT] = 1.0
-    columns[SETTINGS:] = np.frombuffer(state.numbers, dtype="<f8").reshape(kind.numbers, state.plants)
-    if not np.all(np.isfinite(columns)):
-        raise ValueError(f"state of the chart {kind.name} must hold finite numbers")
+def columns_of(kind: type[CompiledChart], memory: SignalMemory) -> Array:
+    """Columns of charts of a kind, whose numbers are the memory's from now on.
+
+    Raises:
+        ValueError: the memory is of another chart, or damaged.
+    """
+    numbers = memory.numbers
+    if memory.chart != kind.name:
+        raise ValueError(f"the memory must be of the chart {kind.name}, got {memory.chart}")
+    if numbers.ndim != 2 or len(numbers) != kind.numbers or not numbers.size or not np.all(np.isfinite(numbers)):
+        raise ValueError(f"charts {kind.name} must have {kind.numbers} finite numbers each, got {numbers.tolist()}")
+    columns = np.zeros((SETTINGS + kind.numbers, numbers.shape[1]))
+    columns[PRESENT], columns[SETTINGS:] = 1.0, numbers
+    memory.numbers = columns[SETTINGS:]
     return columns

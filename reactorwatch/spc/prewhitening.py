@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
-from reactorwatch.stored_state import StoredState
 
 LARGEST_ORDER = 6
 ROWS_A_COEFFICIENT = 10
@@ -231,6 +230,11 @@ def _innovations(numbers: Any, z: Array) -> int:
 _EXPECTED_VALUE, _INNOVATION, _INNOVATIONS = Entry(_expected_value), Entry(_innovation), Entry(_innovations)
 
 
+def expected_values(numbers: NDArray[np.void]) -> list[float]:
+    """Predictions of the next values of several filters, see `Prewhitener.expected_value`."""
+    return [_EXPECTED_VALUE.call(numbers[i : i + 1]) for i in range(len(numbers))]
+
+
 def innovations(numbers: NDArray[np.void], z: Sequence[float]) -> list[float]:
     """Innovations of the next values of several filters, see `Prewhitener.update`.
 
@@ -244,19 +248,15 @@ def innovations(numbers: NDArray[np.void], z: Sequence[float]) -> list[float]:
     return e
 
 
-class PrewhitenerState(StoredState, frozen=True):
-    """The autoregression, and the last values, newest first."""
-
-    learned: Prewhitening
-    past: list[float]
-
-
 class Prewhitener:
     """Computes the innovations of a residual, value by value.
 
     Args:
         learned: the autoregression; None: the numbers have it.
         numbers: numbers of the filter, shape (1,), as a view of those of a plant; None: its own.
+
+    Attributes:
+        numbers: the autoregression and the last values: what runs, and what is stored.
     """
 
     def __init__(self, learned: Prewhitening | None, numbers: NDArray[np.void] | None = None) -> None:
@@ -270,14 +270,6 @@ class Prewhitener:
                 *(past, 0.0, learned.rows, order, 0),
             )
 
-    @classmethod
-    def from_state(cls, state: PrewhitenerState, numbers: NDArray[np.void] | None = None) -> "Prewhitener":
-        """Resume, bit for bit, from a state."""
-        whitener = cls(state.learned, numbers)
-        p = whitener.numbers[0]
-        p["past"][: len(state.past)], p["count"] = state.past, len(state.past)
-        return whitener
-
     @property
     def autoregression(self) -> Prewhitening:
         """The autoregression."""
@@ -290,12 +282,6 @@ class Prewhitener:
             float(p["sd_variance"]),
             float(p["passed_variance"]),
         )
-
-    @property
-    def state(self) -> PrewhitenerState:
-        """A copy of the full state."""
-        p = self.numbers[0]
-        return PrewhitenerState(self.autoregression, p["past"][: p["count"]].tolist())
 
     @property
     def is_ready(self) -> bool:

@@ -21,14 +21,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from reactorwatch.spc.charts.base import Array, ChartState, Judgement, positive, vector
+from reactorwatch.errors import positive
+from reactorwatch.spc.charts.base import Array, Judgement, vector
 from reactorwatch.spc.charts.residual_space import BLOCKS, adjustment, average_rows, fill_missing
 from reactorwatch.spc.false_alarm_budget import degrees_of_freedom
 from reactorwatch.spc.prewhitening import Prewhitening, learn
 from reactorwatch.spc.run_length.design import ewma_limit
 from reactorwatch.spc.training_errors import TrainingErrors, student_tail
 from reactorwatch.spc.value_chart import ValueBaseline, ValueChart, student_limit
-from reactorwatch.stored_state import pack_numbers, unpack_numbers
+from reactorwatch.stored_state import Memory
 
 OUTLIER = 6.0
 """Largest deviation of a row's cube root that counts, in standard deviations."""
@@ -49,16 +50,26 @@ Model: TypeAlias = dict[str, Array]
 """Arrays of a model, by name."""
 
 
-class StatisticsState(ChartState, frozen=True):
-    """State of such a chart: arrays of its model and limits by name, each with its shape, and its memory."""
+class StatisticsMemory(Memory):
+    """Memory of such a chart.
 
-    names: list[str]
+    Attributes:
+        names: names of the signals.
+        weight: lambda.
+        limit: limit of the averages in standard deviations.
+        model: arrays of the model and of the limits, by name.
+        averages: average of each statistic.
+        parts: averages of the signals' parts of them, shape (statistics, signals).
+        before: rows before the next one, shape (at most `rows_before`, signals).
+    """
+
+    names: tuple[str, ...]
     weight: float
     limit: float
-    model: dict[str, tuple[list[int], bytes]]
-    averages: bytes
-    parts: bytes
-    before: bytes
+    model: Model
+    averages: Array
+    parts: Array
+    before: Array
 
 
 def standardise(values: Array) -> tuple[Array, Array, Array]:
@@ -111,7 +122,7 @@ class StatisticsChart(ValueChart):
         reason: what a large statistic means, for the text of an alarm.
     """
 
-    State = StatisticsState
+    memory_type = StatisticsMemory
     labels: ClassVar[tuple[str, ...]]
     rows_before: ClassVar[int] = 0
     pieces: ClassVar[int] = 1
@@ -120,13 +131,20 @@ class StatisticsChart(ValueChart):
     reason: ClassVar[str]
 
     def __init__(self, names: Sequence[str], model: Mapping[str, Array], weight: float, limit: float) -> None:
-        self.names, self.weight, self.limit = tuple(names), float(weight), positive("limit", limit)
-        self.model: Model = {name: np.ascontiguousarray(item, np.float64) for name, item in model.items()}
+        arrays = {name: np.ascontiguousarray(item, np.float64) for name, item in model.items()}
+        labels, signals = len(self.labels), len(names)
+        memory = np.zeros(labels), np.zeros((labels, signals)), np.empty((0, signals))
+        self._use(StatisticsMemory(tuple(names), float(weight), positive("limit", limit), arrays, *memory))
+
+    def _use(self, memory: StatisticsMemory) -> None:
+        """See `Chart`."""
+        self.memory, self.names, self.model = memory, memory.names, memory.model
+        self.weight, self.limit = memory.weight, memory.limit
+        self._newest: Array = np.zeros(len(self.names))
         if any(self.model[name].shape != (len(self.labels),) for name in ("root_means", "root_sds", "average_sds")):
             raise ValueError(f"a chart of {', '.join(self.labels)} must have a mean and deviations of each")
-        self._averages, self._parts = np.zeros(len(self.labels)), np.zeros((len(self.labels), len(self.names)))
-        self._before: Array = np.empty((0, len(self.names)))
-        self._newest: Array = np.zeros(len(self.names))
+        if memory.averages.shape != (len(self.labels),) or not np.all(np.isfinite(memory.averages)):
+            raise ValueError(f"averages must be {len(self.labels)} finite numbers, got {memory.averages.tolist()}")
 
     @classmethod
     @abstractmethod
@@ -236,44 +254,22 @@ class StatisticsChart(ValueChart):
         beyond = student_tail(cls.limit_of(baseline, averages), averages.freedom, errors)
         return np.asarray(len(baseline.names) * beyond / special.ndtr(-known))
 
-    @classmethod
-    def from_state(cls, state: StatisticsState) -> Self:
-        """Resume a chart, bit for bit, from its state.
-
-        Raises:
-            ValueError: the state is damaged.
-        """
-        model = {name: unpack_numbers(data, 1).reshape(shape) for name, (shape, data) in state.model.items()}
-        chart = cls(state.names, model, state.weight, state.limit)
-        averages, parts = unpack_numbers(state.averages, 1)[:, 0], unpack_numbers(state.parts, len(state.names))
-        if averages.shape != chart._averages.shape or not np.all(np.isfinite(averages)):
-            raise ValueError(f"averages must be {chart._averages.size} finite numbers, got {averages.tolist()}")
-        chart._averages, chart._parts, chart._before = averages, parts, unpack_numbers(state.before, len(state.names))
-        return chart
-
-    @property
-    def state(self) -> StatisticsState:
-        """A copy of the full state."""
-        model = {name: (list(item.shape), pack_numbers(item)) for name, item in self.model.items()}
-        memory = (pack_numbers(item) for item in (self._averages, self._parts, self._before))
-        return StatisticsState(list(self.names), self.weight, self.limit, model, *memory)
-
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (signals,)."""
-        self._newest = vector(x, len(self.names))
-        window = np.concatenate([self._before, self._newest[None]])
-        self._before = window[max(len(window) - self.rows_before, 0) :]
+        memory, self._newest = self.memory, vector(x, len(self.names))
+        window = np.concatenate([memory.before, self._newest[None]])
+        memory.before = window[max(len(window) - self.rows_before, 0) :]
         if len(window) > self.rows_before:
             off = np.cbrt(self.statistics(self.model, window)) - self.model["root_means"]
             off = np.minimum(off, OUTLIER * self.model["root_sds"]) / self.model["average_sds"]
-            averages = (1.0 - self.weight) * self._averages + self.weight * off
-            self._averages = np.minimum(averages, RELEASE * self.limit)
-            if self._averages.max() > SUSPICIOUS * self.limit:
+            averages = (1.0 - self.weight) * memory.averages + self.weight * off
+            memory.averages = np.minimum(averages, RELEASE * self.limit)
+            if memory.averages.max() > SUSPICIOUS * self.limit:
                 parts = self.parts(self.model, window) - self.model["usual_parts"]
-                self._parts = (1.0 - self.weight) * self._parts + self.weight * parts
+                memory.parts = (1.0 - self.weight) * memory.parts + self.weight * parts
             else:
-                self._parts = np.zeros_like(self._parts)
-        statistic = max(float(self._averages.max()), 0.0)
+                memory.parts = np.zeros_like(memory.parts)
+        statistic = max(float(memory.averages.max()), 0.0)
         return Judgement(statistic, 0.0, 0.0, self.limit, statistic > self.limit)
 
     def fill(self, x: Array) -> Array | None:
@@ -282,21 +278,23 @@ class StatisticsChart(ValueChart):
 
     def explain(self) -> tuple[str, dict[str, float]]:
         """See `ValueChart`: shares of what the signals' parts of the largest statistic have gained."""
-        largest = int(np.argmax(self._averages))
-        gains = np.maximum(self._parts[largest], 0.0) + 1e-300
+        averages, parts = self.memory.averages, self.memory.parts
+        largest = int(np.argmax(averages))
+        gains = np.maximum(parts[largest], 0.0) + 1e-300
         order = np.argsort(-gains, kind="stable").tolist()
         shares = {self.names[i]: float(gains[i] / gains.sum()) for i in order}
         named = " and ".join(f"{name} ({100 * share:.0f} %)" for name, share in list(shares.items())[:NAMED])
         text = (
-            f"{self.labels[largest]} of the signals {self.reason}: on average {self._averages[largest]:.1f} sd above "
+            f"{self.labels[largest]} of the signals {self.reason}: on average {averages[largest]:.1f} sd above "
             f"that of the training (allowed: {self.limit:.1f} sd), most of it of {named}"
         )
         return text, shares
 
     def restart(self) -> None:
         """Forget the rows seen."""
-        self._averages, self._parts = np.zeros(len(self.labels)), np.zeros_like(self._parts)
-        self._before = np.empty((0, len(self.names)))
+        memory = self.memory
+        memory.averages, memory.parts = np.zeros(len(self.labels)), np.zeros_like(memory.parts)
+        memory.before = np.empty((0, len(self.names)))
 
 
 def skewed_sds(found: Averages, roots: Array, weight: float, limit: float) -> Array:

@@ -34,11 +34,9 @@ from reactorwatch.spc.prewhitening import (
     LARGEST_ORDER,
     WHITENER,
     Prewhitener,
-    PrewhitenerState,
     Prewhitening,
     expected_value,
 )
-from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
 
 ONSETS = 20
 """Rows since an onset that is still tested."""
@@ -68,24 +66,6 @@ STEP_TEST = np.dtype(
     align=True,
 )
 """Numbers of the test of one signal."""
-
-
-class StepTestState(StoredState, frozen=True):
-    """State of the test of a signal.
-
-    Attributes:
-        learned: prewhitening of the residual.
-        past: newest residuals, newest first.
-        numbers: the response to a step of one unit, and the newest innovations, newest first; doubles.
-        limit: limit of the statistic.
-        marginal_sd: standard deviation of the residual.
-    """
-
-    learned: Prewhitening
-    past: list[float]
-    numbers: bytes
-    limit: float
-    marginal_sd: float
 
 
 class StepPoint(NamedTuple):
@@ -181,10 +161,13 @@ class StepTests:
 
     Args:
         numbers: numbers of the tests, shape (signals,), see `STEP_TEST`.
+
+    Attributes:
+        numbers: the same: what runs, and what is stored.
     """
 
     def __init__(self, numbers: NDArray[np.void]) -> None:
-        self._numbers = numbers
+        self.numbers = numbers
         self._statistics: Array = np.empty(len(numbers))
 
     @classmethod
@@ -212,36 +195,9 @@ class StepTests:
         tests.restart()
         return tests
 
-    @classmethod
-    def from_state(cls, state: list[StepTestState]) -> "StepTests":
-        """Resume, bit for bit, from a state.
-
-        Raises:
-            ValueError: the state is damaged.
-        """
-        numbers = np.zeros(len(state), STEP_TEST)
-        for i, item in enumerate(state):
-            p = numbers[i]
-            Prewhitener.from_state(PrewhitenerState(item.learned, item.past), numbers["whitener"][i : i + 1])
-            p["response"], p["recent"] = unpack_numbers(item.numbers, ROWS)
-            p["limit"], p["marginal_sd"] = item.limit, item.marginal_sd
-        return cls(numbers)
-
-    @property
-    def state(self) -> list[StepTestState]:
-        """A copy of the full state, one a signal."""
-        states = []
-        for i, p in enumerate(self._numbers):
-            whitener = Prewhitener(None, self._numbers["whitener"][i : i + 1]).state
-            numbers = pack_numbers(np.vstack([p["response"], p["recent"]]))
-            states.append(
-                StepTestState(whitener.learned, whitener.past, numbers, float(p["limit"]), float(p["marginal_sd"]))
-            )
-        return states
-
     def point(self, signal: int) -> StepPoint:
         """Newest result of a signal."""
-        p = self._numbers[signal]
+        p = self.numbers[signal]
         return StepPoint(float(self._statistics[signal]), float(p["limit"]), float(p["size"]), int(p["rows"]))
 
     def update(self, z: list[float]) -> bool:
@@ -250,15 +206,15 @@ class StepTests:
         Args:
             z: residual of each signal; NaN where there is none.
         """
-        return bool(_UPDATE.call(self._numbers, np.array(z), self._statistics))
+        return bool(_UPDATE.call(self.numbers, np.array(z), self._statistics))
 
     def _update(self, z: Array) -> Array:
-        _UPDATE.call(self._numbers, np.ascontiguousarray(z), self._statistics)
+        _UPDATE.call(self.numbers, np.ascontiguousarray(z), self._statistics)
         return self._statistics.copy()
 
     def sensitivity(self, signal: int) -> float:
         """Statistic after a lasting step of one unit of a signal, without noise: what no outlier explains of it."""
-        step = self._numbers[signal]["response"][:ONSETS]
+        step = self.numbers[signal]["response"][:ONSETS]
         outlier, explained = np.diff(step, prepend=0.0), 0.0
         for row in range(ONSETS):
             shape = np.r_[np.zeros(row), outlier[: ONSETS - row]]
@@ -267,11 +223,11 @@ class StepTests:
 
     def limit(self, signal: int) -> float:
         """Limit of the statistic of a signal."""
-        return float(self._numbers[signal]["limit"])
+        return float(self.numbers[signal]["limit"])
 
     def restart(self) -> None:
         """Forget the rows seen."""
-        self._numbers["recent"], self._numbers["whitener"]["count"] = nan, 0
+        self.numbers["recent"], self.numbers["whitener"]["count"] = nan, 0
 
 
 def step_response(residual: Array, learned: Prewhitening) -> Array:

@@ -2,10 +2,13 @@
 
 Segments allow to draw a recording larger than memory and a run that has not ended. A segment therefore carries the
 context of earlier segments that panels need.
+
+Signals have meanings and roles from their process, or from the catalogue of processes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,21 +16,21 @@ from numpy.typing import NDArray
 
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.description.process import Process
+from reactorwatch.process import MODELS
+from reactorwatch.process.model import ProcessModel
 
 Times = NDArray[np.int64]
 Values = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class SampleColumns:
+class SampleColumns(NamedTuple):
     """Samples of a signal, each array of shape (samples,), in order of time; NaN where not measured."""
 
     time_ns: Times
     value: Values
 
 
-@dataclass(frozen=True)
-class EstimateColumns:
+class EstimateColumns(NamedTuple):
     """Predictions of a signal, each array of shape (estimates,); limits are NaN during training."""
 
     time_ns: Times
@@ -36,25 +39,13 @@ class EstimateColumns:
     lower_limit: Values
     upper_limit: Values
 
-    def convert(self, scale: float, offset: float) -> "EstimateColumns":
-        """Columns in another unit, in which a value is `scale * value + offset`."""
-        levels = (scale * item + offset for item in (self.prediction, self.lower_limit, self.upper_limit))
-        prediction, lower, upper = levels
-        return EstimateColumns(self.time_ns, prediction, scale * self.residual, lower, upper)
-
     @property
-    def residual_lower_limit(self) -> Values:
-        """Lower limit of the residual."""
-        return self.lower_limit - self.prediction
-
-    @property
-    def residual_upper_limit(self) -> Values:
-        """Upper limit of the residual."""
-        return self.upper_limit - self.prediction
+    def residual_limits(self) -> tuple[Values, Values]:
+        """Lower and upper limit of the residual."""
+        return self.lower_limit - self.prediction, self.upper_limit - self.prediction
 
 
-@dataclass(frozen=True)
-class ChartColumns:
+class ChartColumns(NamedTuple):
     """Points of a control chart, each array of shape (points,); `out` is 1 outside the limits, else 0."""
 
     time_ns: Times
@@ -65,82 +56,17 @@ class ChartColumns:
     out: Values
 
 
-@dataclass(frozen=True)
-class ReconstructionColumns:
+class ReconstructionColumns(NamedTuple):
     """Reconstructed signal while its sensor is suspected, each array of shape (points,)."""
 
     time_ns: Times
     value: Values
     sd: Values
 
-    def convert(self, scale: float, offset: float) -> "ReconstructionColumns":
-        """Columns in another unit, in which a value is `scale * value + offset`."""
-        return ReconstructionColumns(self.time_ns, scale * self.value + offset, scale * self.sd)
-
-
-class AlarmChange(NamedTuple):
-    """Change of an alarm; `state` is a `messages.AlarmState`, `event` its cause."""
-
-    time_ns: int
-    alarm: str
-    state: int
-    priority: int
-    text: str
-    event: str
-    suspects: Sequence[messages.Suspect]
-
 
 ADAPTIVE, FROZEN, REFERENCE, EQUATIONS = "adaptive", "frozen", "reference", "equations"
 """Purposes of a model: adaptive; frozen since the training and compared with the adaptive one; reference of the charts;
 equations as the reference, with noise levels as parameters."""
-
-
-class Snapshot(NamedTuple):
-    """Model of a signal; `parameters` maps a name to (value, standard deviation)."""
-
-    time_ns: int
-    parameters: Mapping[str, tuple[float, float]]
-    excitation: float
-    condition: float
-
-
-class HealthReport(NamedTuple):
-    """Health report of a node.
-
-    Attributes:
-        time_ns: time of the newest sample when the report was received. Reports carry clock time, the axis of a run is
-            sample time, and the two are unrelated for an accelerated plant.
-        phase: phase of the node, in a word.
-        lag_ms: time from receipt to the end of processing, in milliseconds.
-        counts: number of problems, by kind.
-        reference: reference by which a monitor judges rows; empty for other nodes.
-    """
-
-    time_ns: int
-    phase: str
-    lag_ms: float
-    counts: Mapping[str, int]
-    reference: str = ""
-
-
-class PromiseReport(NamedTuple):
-    """Promise of false alarms: as stated, and as the alarms so far bear it out.
-
-    Attributes:
-        time_ns: time of the newest row.
-        found: number of alarms so far that chance can raise.
-        expected: number promised so far.
-        holds: False if the training or the alarms show that it is not kept.
-        text: one sentence.
-        power: deviations with the sizes that are seen, one line each.
-    """
-
-    time_ns: int
-    found: int
-    expected: float
-    holds: bool
-    text: str
-    power: tuple[str, ...]
 
 
 class SignalStatistics(NamedTuple):
@@ -160,22 +86,26 @@ class SegmentContext:
         first_ns: time of the first sample; None if there was none.
         last_samples: newest two samples by signal, as samples of one time may be in two segments.
         alarm_states: state of each alarm that was published.
-        suspects_ns: time of the last suspects.
         onset_ns: onset of the first fault; None if there was none.
         reference: reference by which rows are judged; empty if unknown.
+        levels: mean of each signal in the first segment that has it: the steady states of a run are computed there.
     """
 
     first_ns: int | None = None
     last_samples: Mapping[str, SampleColumns] = field(default_factory=dict)
     alarm_states: Mapping[str, int] = field(default_factory=dict)
-    suspects_ns: int | None = None
     onset_ns: int | None = None
     reference: str = ""
+    levels: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class RunColumns:
     """Run of one plant, or a segment of it.
+
+    Messages that are drawn one by one have the time of the run as `time_ns`. That of a health report is the time of the
+    newest sample when it was received: reports carry clock time, which is unrelated to sample time for an accelerated
+    plant.
 
     Attributes:
         plant: name of the plant; empty without messages.
@@ -185,11 +115,12 @@ class RunColumns:
         estimates_beside: predictions by the recursive ARX model beside it, by signal.
         charts: chart points by chart and signal, such as `ewma/T`.
         alarms: changes of alarms in order of time.
+        incidents: incidents with new suspects in order of time.
         faults: changes of faults in order of time.
         reconstructions: reconstructed signals.
         models: snapshots in order of time, by signal and purpose of the model, such as `ADAPTIVE`.
         health: health reports in order of time, by node.
-        promises: reports on the promise of false alarms in order of time.
+        promises: promises of false alarms in order of time.
         statistics: statistics of each signal up to the end of the segment.
         context: data of earlier segments.
         given_zero_ns: time that minutes count from; None for the first sample.
@@ -201,12 +132,13 @@ class RunColumns:
     samples: dict[str, SampleColumns]
     estimates: dict[str, EstimateColumns]
     charts: dict[str, ChartColumns]
-    alarms: tuple[AlarmChange, ...]
+    alarms: tuple[messages.Alarm, ...]
     faults: tuple[messages.Fault, ...]
+    incidents: tuple[messages.Incident, ...] = ()
     reconstructions: dict[str, ReconstructionColumns] = field(default_factory=dict)
-    models: dict[tuple[str, str], tuple[Snapshot, ...]] = field(default_factory=dict)
-    health: dict[str, tuple[HealthReport, ...]] = field(default_factory=dict)
-    promises: tuple[PromiseReport, ...] = ()
+    models: dict[tuple[str, str], tuple[messages.ModelSnapshot, ...]] = field(default_factory=dict)
+    health: dict[str, tuple[messages.Health, ...]] = field(default_factory=dict)
+    promises: tuple[messages.Promise, ...] = ()
     statistics: dict[str, SignalStatistics] = field(default_factory=dict)
     context: SegmentContext = SegmentContext()
     given_zero_ns: int | None = None
@@ -234,3 +166,76 @@ class RunColumns:
     def zero_ns(self) -> int:
         """Time that minutes count from."""
         return self.first_ns if self.given_zero_ns is None else self.given_zero_ns
+
+
+def signal_title(name: str, unit: str, process: Process | None = None) -> str:
+    """Name of a signal, with its meaning if its process has a variable of that name.
+
+    Args:
+        name: name of the signal.
+        unit: unit of the signal.
+        process: process of the signal; None: any of the catalogue whose variable has this unit, too.
+    """
+    variables = [
+        item
+        for model in _models_of(process)
+        for item in (*model.inputs, *model.states)
+        if item.name == name and (item.unit == unit or process is not None)
+    ]
+    meaning = variables[0].meaning if variables else ""
+    return f"{name}: {meaning}" if meaning else name
+
+
+def signal_roles(units: Mapping[str, str], process: Process | None = None) -> dict[str, str]:
+    """Roles of signals by name: those of the process in its order, then all others as outputs.
+
+    Args:
+        units: units of the signals, by name; empty: unknown.
+        process: process of the signals; None: the one of the catalogue that has all of them, or all of whose signals
+            are there.
+    """
+    if process is not None:
+        roles = {signal.name: signal.role for signal in process.signals}
+    else:
+        model = find_model(units) or _find_model_with(units)
+        roles = {} if model is None else {name: _role(model, name) for name in model.units}
+    return {
+        **{name: role for name, role in roles.items() if name in units},
+        **{name: "output" for name in units if name not in roles},
+    }
+
+
+def find_model(units: Mapping[str, str], process: Process | None = None) -> ProcessModel | None:
+    """Equations whose inputs and outputs are all present, with the same units; None if there are none.
+
+    Args:
+        units: units of the present signals, by name.
+        process: process of the signals; None: any of the catalogue.
+    """
+    return next((model for model in _models_of(process) if model.units.items() <= units.items()), None)
+
+
+def _find_model_with(units: Mapping[str, str]) -> ProcessModel | None:
+    """Model of the catalogue that has all of the signals, none of them in another unit."""
+    for model in _models():
+        if all(name in model.units and unit in ("", model.units[name]) for name, unit in units.items()):
+            return model
+    return None
+
+
+def _role(model: ProcessModel, name: str) -> str:
+    return "input" if name in model.input_names else "output"
+
+
+def _models_of(process: Process | None) -> tuple[ProcessModel, ...]:
+    """Equations of a process; without its own, those of the catalogue under its name."""
+    if process is None:
+        return _models()
+    if process.model is not None:
+        return (process.model,)
+    return tuple(model for model in _models() if model.name == process.name)
+
+
+@cache
+def _models() -> tuple[ProcessModel, ...]:
+    return tuple(build() for build in MODELS)

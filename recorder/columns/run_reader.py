@@ -9,47 +9,45 @@ segment.
 from array import array
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from google.protobuf.message import Message
-from numpy.typing import NDArray
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import DecodeError, Encoded, decode
-from reactorwatch.contract.promise_text import describe_sizes, promise_fields
+from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.units import conversion
-from recorder.columns.measurement import measured_value
+from recorder import RecordedMessage
 from recorder.columns.run import (
     ADAPTIVE,
     EQUATIONS,
     FROZEN,
     REFERENCE,
-    AlarmChange,
     ChartColumns,
     EstimateColumns,
-    HealthReport,
-    PromiseReport,
     ReconstructionColumns,
     RunColumns,
     SampleColumns,
     SegmentContext,
     SignalStatistics,
-    Snapshot,
 )
-from recorder.columns.run_splitter import ContinuousTime
-from recorder.message import RecordedMessage
+from recorder.columns.samples import ContinuousTime, content_of, measured_value
 
 SEGMENT_MESSAGES = 100_000
 """Messages in a segment, which take about 20 MB while they are drawn."""
 
 SUSPECTED = "suspected"
-"""Event of alarms with new suspects."""
+"""Event of alarms with new suspects, of monitors before 0.3, which published no incidents."""
 LISTED = "listed"
 """Event of alarms from a list of active alarms; the time of the last change is unknown."""
+_CHANGE = ("time_ns", "state", "priority", "text", "event")
+"""Fields that, with the suspects, tell one change of an alarm from another."""
+BESIDE = "/arx"
+"""End of the names of predictions by the recursive ARX model beside another reference."""
 
 
 def read_run(recording: Iterable[RecordedMessage | Encoded]) -> RunColumns:
@@ -84,13 +82,11 @@ def read_segments(
     Raises:
         InputError: see `read_run`.
     """
-    reader, taken = RunReader(given_zero_ns, process), 0
-    for entry in recording:
+    reader = RunReader(given_zero_ns, process)
+    for count, entry in enumerate(recording, 1):
         reader.add(entry)
-        taken += 1
-        if taken == segment_messages:
+        if count % segment_messages == 0:
             yield reader.next_segment()
-            taken = 0
     yield reader.next_segment()
 
 
@@ -105,13 +101,9 @@ class RunReader:
     def __init__(self, given_zero_ns: int | None = None, process: Process | None = None) -> None:
         self._given_zero_ns, self._process = given_zero_ns, process
         self._plant = ""
-        self._columns: dict[str, _KeyColumns | None] = {}
-        self._alarms: list[AlarmChange] = []
-        self._newest_changes: dict[str, AlarmChange] = {}
-        self._faults: list[messages.Fault] = []
-        self._models: dict[tuple[str, str], list[Snapshot]] = {}
-        self._health: dict[str, list[HealthReport]] = {}
-        self._promises: list[PromiseReport] = []
+        self._keys: dict[str, _Key | None] = {}
+        self._newest_changes: dict[str, tuple[object, ...]] = {}
+        self._newest_suspects: dict[int, list[messages.Suspect]] = {}  # by incident
         self._newest_ns: int | None = None
         self._clock = ContinuousTime()
         self._statistics: dict[str, SignalStatistics] = {}
@@ -124,47 +116,51 @@ class RunReader:
             InputError: it is of another plant than earlier messages.
         """
         key = entry.key
-        if key not in self._columns:
-            self._columns[key] = _KeyColumns.of(key)
-        into = self._columns[key]
+        if key not in self._keys:
+            topic = keys.parse(key)
+            self._keys[key] = _Key(topic, _KINDS[topic.kind]) if topic is not None and topic.kind in _KINDS else None
+        into = self._keys[key]
         if into is None:
             return
-        try:
-            decoded = decode(entry.payload, entry.encoding)
-        except DecodeError:
-            return
         kind = into.topic.kind
-        if type(decoded) is not _KINDS[kind].message:
+        content = content_of(entry)
+        if type(content) is not into.kind.message:
             return
-        message: Any = decoded
+        message: Any = content
         if into.topic.plant != self._plant:
             if self._plant:
                 raise InputError(
                     f"a run is of one plant; name one of {', '.join(sorted((self._plant, into.topic.plant)))}"
                 )
             self._plant = into.topic.plant
-        if kind == keys.HEALTH:  # without a sample it has no time in the run
-            if self._newest_ns is not None:
-                self._health.setdefault(message.node, []).append(_report(message, self._newest_ns))
-            return
-        time_ns = self._clock.continuous_ns(key, message)
-        if _KINDS[kind].numbers is not None:
+        if kind == keys.HEALTH:
+            if self._newest_ns is None:
+                return  # without a sample it has no time in the run
+            time_ns = self._newest_ns
+        else:
+            time_ns = self._clock.continuous_ns(key, message)
+        if into.kind.numbers is not None:
             into.append(message, time_ns)
             if kind == keys.SAMPLE and (self._newest_ns is None or time_ns > self._newest_ns):
                 self._newest_ns = time_ns
+            return
+        if kind == keys.ALARM and message.event == SUSPECTED:
+            kind, message = keys.INCIDENT, messages.Incident(number=message.incident, suspects=message.suspects)
+            topic = keys.Topic(self._plant, kind, str(message.number))
+            into = self._keys[keys.key(*topic)] = self._keys.get(keys.key(*topic)) or _Key(topic, _KINDS[kind])
+        if kind == keys.INCIDENT:
+            if not message.suspects or list(message.suspects) == self._newest_suspects.get(message.number):
+                return
+            self._newest_suspects[message.number] = list(message.suspects)
         elif kind == keys.ALARM:
-            change = AlarmChange(*(getattr(message, name) for name in AlarmChange._fields))
-            if self._newest_changes.get(change.alarm) != change:  # a restarted monitor publishes its newest again
-                self._newest_changes[change.alarm] = change
-                self._alarms.append(change._replace(time_ns=time_ns))
+            change = (*(getattr(message, name) for name in _CHANGE), list(message.suspects))
+            if self._newest_changes.get(message.alarm) == change:
+                return  # a restarted monitor publishes its newest again
+            self._newest_changes[message.alarm] = change
         elif kind == keys.FAULT:
             message.onset_ns += time_ns - message.time_ns
-            message.time_ns = time_ns
-            self._faults.append(message)
-        elif kind == keys.MODEL:
-            self._models.setdefault((into.topic.name, _purpose(message)), []).append(_snapshot(message, time_ns))
-        elif kind == keys.PROMISE:
-            self._promises.append(_promise(message, time_ns))
+        message.time_ns = time_ns
+        into.messages.append(message)
 
     def set_zero(self, time_ns: int) -> None:
         """Set the time that minutes count from, before the first segment."""
@@ -177,43 +173,49 @@ class RunReader:
 
     def next_segment(self) -> RunColumns:
         """Return the messages since the last call as a segment."""
-        found = [item for item in self._columns.values() if item is not None]
-
-        def of_kind(kind: str) -> Iterator[tuple[str, list[Any]]]:
-            return ((item.topic.name, item.in_order()) for item in found if item.topic.kind == kind and item.times)
-
-        samples = {name: SampleColumns(*columns) for name, columns in of_kind(keys.SAMPLE)}
-        self._statistics |= {
-            name: _update_statistics(self._statistics.get(name), item) for name, item in samples.items()
-        }
+        found = [item for item in self._keys.values() if item is not None]
         # a signal is drawn in the unit of its samples; the monitor may publish in that of the equations
         published = {(item.topic.kind, item.topic.name): item.unit for item in found if item.unit}
         sampled = {name: unit for (kind, name), unit in published.items() if kind == keys.SAMPLE}
 
-        def in_unit(columns: _Convertible, kind: str, name: str) -> _Convertible:
-            unit = published.get((kind, name), "")
-            return _convert(columns, unit, sampled.get(name.partition("/")[0]) or unit)
+        def columns(kind: str) -> dict[str, Any]:
+            return {
+                item.topic.name: item.columns(sampled.get(item.topic.name.partition("/")[0], item.unit))
+                for item in found
+                if item.topic.kind == kind and item.times
+            }
 
-        estimates = {
-            name: in_unit(EstimateColumns(*columns), keys.ESTIMATE, name) for name, columns in of_kind(keys.ESTIMATE)
+        def messages_of(kind: str) -> list[Any]:
+            items = (message for item in found if item.topic.kind == kind for message in item.messages)
+            return sorted(items, key=attrgetter("time_ns"))
+
+        samples = columns(keys.SAMPLE)
+        self._statistics |= {
+            name: _update_statistics(self._statistics.get(name), item) for name, item in samples.items()
         }
+        estimates = columns(keys.ESTIMATE)
         beside = {name: name.removesuffix(BESIDE) for name in estimates if name.endswith(BESIDE)}
+        models = {
+            (item.topic.name, purpose): _last_of_each_time([m for m in item.messages if _purpose(m) == purpose])
+            for item in found
+            if item.topic.kind == keys.MODEL
+            for purpose in dict.fromkeys(map(_purpose, item.messages))
+        }
+        reports = [item.messages for item in found if item.topic.kind == keys.HEALTH and item.messages]
         run = RunColumns(
             plant=self._plant,
             units={**{name: unit for (_, name), unit in published.items()}, **sampled},
             samples=samples,
-            estimates={name: columns for name, columns in estimates.items() if name not in beside},
+            estimates={name: item for name, item in estimates.items() if name not in beside},
             estimates_beside={signal: estimates[name] for name, signal in beside.items()},
-            charts={name: ChartColumns(*columns) for name, columns in of_kind(keys.CHART)},
-            alarms=tuple(sorted(self._alarms, key=lambda change: change.time_ns)),
-            faults=tuple(sorted(self._faults, key=lambda change: change.time_ns)),
-            reconstructions={
-                name: in_unit(ReconstructionColumns(*columns), keys.RECONSTRUCTION, name)
-                for name, columns in of_kind(keys.RECONSTRUCTION)
-            },
-            models={name: _last_of_each_time(items) for name, items in self._models.items()},
-            health={node: _last_of_each_time(items) for node, items in self._health.items()},
-            promises=_last_of_each_time(self._promises),
+            charts=columns(keys.CHART),
+            alarms=tuple(messages_of(keys.ALARM)),
+            incidents=tuple(messages_of(keys.INCIDENT)),
+            faults=tuple(messages_of(keys.FAULT)),
+            reconstructions=columns(keys.RECONSTRUCTION),
+            models=models,
+            health={of_node[-1].node: _last_of_each_time(of_node) for of_node in reports},
+            promises=_last_of_each_time(messages_of(keys.PROMISE)),
             statistics=dict(self._statistics),
             context=self._context,
             given_zero_ns=self._given_zero_ns,
@@ -222,21 +224,7 @@ class RunReader:
         self._context = _next_context(run)
         for item in found:
             item.clear()
-        self._alarms, self._faults, self._models, self._health, self._promises = [], [], {}, {}, []
         return run
-
-
-_Convertible = TypeVar("_Convertible", EstimateColumns, ReconstructionColumns)
-
-
-def _convert(columns: _Convertible, unit: str, wanted: str) -> _Convertible:
-    """Columns in another unit; unchanged where the units are equal or measure different quantities."""
-    if unit == wanted:
-        return columns
-    try:
-        return columns.convert(*conversion(unit, wanted, "signal"))
-    except InputError:
-        return columns
 
 
 def _next_context(run: RunColumns) -> SegmentContext:
@@ -249,11 +237,9 @@ def _next_context(run: RunColumns) -> SegmentContext:
         first_ns=run.first_ns if run.samples or before.first_ns is not None else None,
         last_samples={**before.last_samples, **newest},
         alarm_states={**before.alarm_states, **{change.alarm: change.state for change in run.alarms}},
-        suspects_ns=max(
-            (change.time_ns for change in run.alarms if change.event == SUSPECTED), default=before.suspects_ns
-        ),
         onset_ns=next(onsets, None) if before.onset_ns is None else before.onset_ns,
         reference=run.reference,
+        levels={**{name: item.mean for name, item in run.statistics.items() if item.rows}, **before.levels},
     )
 
 
@@ -267,25 +253,19 @@ def _newest(before: SampleColumns | None, item: SampleColumns) -> SampleColumns:
 
 def _update_statistics(before: SignalStatistics | None, item: SampleColumns) -> SignalStatistics:
     values = item.value[np.isfinite(item.value)]
-    now = (
-        SignalStatistics(values.size, float(values.mean()), float(values.min()), float(values.max()))
-        if values.size
-        else _NOTHING
+    before = before or SignalStatistics(0, float("nan"), float("inf"), -float("inf"))
+    if not values.size:
+        return before
+    rows = before.rows + values.size
+    mean = float(values.mean())
+    if before.rows:
+        mean = before.mean + (mean - before.mean) * values.size / rows
+    return SignalStatistics(
+        rows, mean, min(before.lowest, float(values.min())), max(before.highest, float(values.max()))
     )
-    if before is None or not before.rows or not now.rows:
-        return now if now.rows or before is None else before
-    rows = before.rows + now.rows
-    mean = before.mean + (now.mean - before.mean) * now.rows / rows
-    return SignalStatistics(rows, mean, min(before.lowest, now.lowest), max(before.highest, now.highest))
 
 
-_NOTHING = SignalStatistics(0, float("nan"), float("inf"), -float("inf"))
-
-BESIDE = "/arx"
-"""End of the names of predictions by the recursive ARX model beside another reference."""
-
-
-_Dated = TypeVar("_Dated", Snapshot, HealthReport, PromiseReport)
+_Dated = TypeVar("_Dated", messages.ModelSnapshot, messages.Health, messages.Promise)
 
 
 def _last_of_each_time(items: list[_Dated]) -> tuple[_Dated, ...]:
@@ -303,37 +283,29 @@ def _purpose(message: messages.ModelSnapshot) -> str:
     return FROZEN if message.held else ADAPTIVE
 
 
-def _snapshot(message: messages.ModelSnapshot, time_ns: int) -> Snapshot:
-    parameters = {item.name: (item.value, item.sd) for item in message.parameters}
-    return Snapshot(time_ns, parameters, message.excitation, message.condition)
-
-
-def _report(message: messages.Health, time_ns: int) -> HealthReport:
-    counts = {name: getattr(message, name) for name in ("lost", "late", "refused", "duplicated", "out_of_order")}
-    return HealthReport(time_ns, message.phase, message.lag_ms, counts, message.reference)
-
-
-def _promise(message: messages.Promise, time_ns: int) -> PromiseReport:
-    holds = message.kept and not message.drifted
-    power = tuple(describe_sizes(item) for item in promise_fields(message)["power"])
-    return PromiseReport(time_ns, message.found, message.expected_so_far, holds, message.text, power)
-
-
 class _Kind(NamedTuple):
+    """Kind of messages that are drawn.
+
+    Attributes:
+        message: type of the messages.
+        numbers: returns the numbers of a message, in the order of the columns; None: messages are kept.
+        columns: type of the columns.
+        is_level: for each column, 1 if the offset between two units applies, 0 if not, as for a difference.
+    """
+
     message: type[Message]
-    numbers: Callable[[Any], tuple[float, ...]] | None = (
-        None  # in the order of the columns; None without numeric columns
-    )
+    numbers: Callable[[Any], tuple[float, ...]] | None = None
+    columns: type[SampleColumns | EstimateColumns | ChartColumns | ReconstructionColumns] = SampleColumns
+    is_level: tuple[int, ...] = ()
 
 
 _KINDS = {
     keys.SAMPLE: _Kind(messages.Sample, lambda m: () if (value := measured_value(m)) is None else (value,)),
-    keys.ESTIMATE: _Kind(messages.Estimate, lambda m: (m.prediction, m.residual, m.lower_limit, m.upper_limit)),
-    keys.CHART: _Kind(
-        messages.ChartPoint, lambda m: (m.statistic, m.centre, m.lower_limit, m.upper_limit, float(m.out))
-    ),
-    keys.RECONSTRUCTION: _Kind(messages.Reconstruction, lambda m: (m.value, m.sd)),
+    keys.ESTIMATE: _Kind(messages.Estimate, attrgetter(*EstimateColumns._fields[1:]), EstimateColumns, (1, 0, 1, 1)),
+    keys.CHART: _Kind(messages.ChartPoint, attrgetter(*ChartColumns._fields[1:]), ChartColumns),
+    keys.RECONSTRUCTION: _Kind(messages.Reconstruction, attrgetter("value", "sd"), ReconstructionColumns, (1, 0)),
     keys.ALARM: _Kind(messages.Alarm),
+    keys.INCIDENT: _Kind(messages.Incident),
     keys.FAULT: _Kind(messages.Fault),
     keys.MODEL: _Kind(messages.ModelSnapshot),
     keys.HEALTH: _Kind(messages.Health),
@@ -341,41 +313,39 @@ _KINDS = {
 }
 
 
-class _KeyColumns:
-    """Numbers of one key, in the order of receipt."""
+class _Key:
+    """Numbers or messages of one key, in the order of receipt."""
 
-    def __init__(self, topic: keys.Topic) -> None:
-        self.topic = topic
+    def __init__(self, topic: keys.Topic, kind: _Kind) -> None:
+        self.topic, self.kind = topic, kind
         self.unit = ""
-        self.times = array("q")
-        self._numbers = array("d")  # row by row
-        self._of = _KINDS[topic.kind].numbers or (lambda message: ())
+        self.clear()
 
-    @classmethod
-    def of(cls, key: str) -> "_KeyColumns | None":
-        """Columns of a key; None if it is not drawn."""
-        topic = keys.parse(key)
-        return cls(topic) if topic is not None and topic.kind in _KINDS else None
+    def clear(self) -> None:
+        """Clear the numbers and messages."""
+        self.times, self._numbers = array("q"), array("d")  # numbers are row by row
+        self.messages: list[Any] = []
 
     def append(self, message: Any, time_ns: int) -> None:
         """Add the numbers of a message, if any, at a time."""
-        numbers = self._of(message)
-        if not numbers:
-            return
-        if not self.unit:
-            self.unit = getattr(message, "unit", "")
-        self.times.append(time_ns)
-        self._numbers.extend(numbers)
+        numbers = self.kind.numbers(message) if self.kind.numbers is not None else ()
+        if numbers:
+            self.unit = self.unit or getattr(message, "unit", "")
+            self.times.append(time_ns)
+            self._numbers.extend(numbers)
 
-    def in_order(self) -> list[NDArray[Any]]:
-        """Times and columns, in order of time."""
+    def columns(self, unit: str) -> Any:
+        """Columns in order of time, in a unit where it measures the same quantity."""
         times = np.array(self.times, np.int64)
-        columns = list(np.array(self._numbers).reshape(times.size, -1).T.copy())
+        numbers = np.array(self._numbers).reshape(times.size, -1).T.copy()
         if (np.diff(times) < 0).any():
             order = np.argsort(times, kind="stable")
-            return [times[order], *(column[order] for column in columns)]
-        return [times, *columns]
-
-    def clear(self) -> None:
-        """Clear the numbers."""
-        self.times, self._numbers = array("q"), array("d")
+            times, numbers = times[order], numbers[:, order]
+        if self.kind.is_level and unit != self.unit:
+            try:
+                scale, offset = conversion(self.unit, unit, "signal")
+            except InputError:
+                pass
+            else:
+                numbers = scale * numbers + offset * np.array(self.kind.is_level)[:, None]
+        return self.kind.columns(times, *numbers)

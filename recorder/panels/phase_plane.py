@@ -4,15 +4,17 @@ In the plane a disturbance is a closed loop, and a reactor that leaves its opera
 both look alike at first.
 """
 
+import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.process.steady_state import SteadyState
-from recorder.columns.process_annotations import find_model, operating_branch, steady_states_at
-from recorder.columns.run import RunColumns, Times, Values
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.steady_state import SteadyState, steady_states
+from recorder.columns.run import RunColumns, Times, Values, find_model
 from recorder.panels.base import (
     ALARM,
     FAULT,
@@ -28,6 +30,10 @@ from recorder.panels.base import (
 
 MAX_POINTS = 4000
 """Largest number of points of a path in a segment; beyond it only extreme rows are drawn."""
+MAX_BRANCH_POINTS = 32
+"""Largest number of points of a branch."""
+FARTHEST = 2.0
+"""Largest distance between neighbouring points of a branch, in scales of the states."""
 MARGIN = 0.05
 """Share of the mean level of the input by which the drawn branch extends to either side at least."""
 
@@ -44,10 +50,11 @@ def draw(run: RunColumns) -> tuple[PlanePlot, ...]:
     time_ns, x, y = _paired_samples(run, x_output.name, y_output.name)
     if not (level.rows and np.isfinite(x).any()):
         return ()
-    around = MARGIN * abs(level.mean)
-    ends = (min(level.lowest, level.mean - around), max(level.highest, level.mean + around))
-    branch = operating_branch(model, *ends, level.mean)
-    rounded = float(f"{level.mean:.4g}")
+    operating = run.context.levels.get(input_.name, level.mean)
+    around = MARGIN * abs(operating)
+    ends = (min(level.lowest, operating - around), max(level.highest, operating + around))
+    branch = operating_branch(model, *ends, operating)
+    rounded = float(f"{operating:.4g}")
     states = steady_states_at(model, rounded) if branch else ()
     data = Box(x_seen.lowest, x_seen.highest, y_seen.lowest, y_seen.highest)
     near, far = (_around(points, data) for points in (branch, (*branch, *states)))
@@ -65,6 +72,60 @@ def draw(run: RunColumns) -> tuple[PlanePlot, ...]:
         ),
         path._replace(title="Among all steady states", box=far, shown=_union(far, data), marks=marks),
     )
+
+
+@lru_cache(maxsize=256)
+def steady_states_at(model: ProcessModel, level: float) -> tuple[SteadyState, ...]:
+    """All steady states of a process with one input; the last is the operating point.
+
+    Args:
+        model: the process.
+        level: level of its input.
+    """
+    return tuple(steady_states(model, np.array([level])))
+
+
+def operating_branch(model: ProcessModel, lowest: float, highest: float, level: float) -> list[SteadyState]:
+    """Steady states of the operating branch between two levels of the input.
+
+    Args:
+        model: a process with one input.
+        lowest: lowest level of the input.
+        highest: highest level of the input.
+        level: operating level of the input.
+
+    Returns:
+        The steady states by rising level, as far as the branch extends. The grid of levels does not depend on the ends
+        unless they are far apart. Empty if the process has no steady state at `level`.
+    """
+    bounds = model.inputs[0]
+    if not bounds.lower <= level <= bounds.upper:
+        return []
+    lowest, highest = max(lowest, bounds.lower), min(highest, bounds.upper)
+    step = 10.0 ** math.floor(math.log10(max(abs(level), 1e-9))) / 40
+    while (highest - lowest) / step > MAX_BRANCH_POINTS:
+        step *= 2.0
+    first, last, start = math.ceil(lowest / step), math.floor(highest / step), round(level / step)
+    operating = steady_states_at(model, start * step)[-1:]
+    if not operating:
+        return []
+    below = _continue_branch(model, operating[0], [index * step for index in range(start - 1, first - 1, -1)])
+    above = _continue_branch(model, operating[0], [index * step for index in range(start + 1, last + 1)])
+    return [*reversed(below), *operating, *above]
+
+
+def _continue_branch(model: ProcessModel, state: SteadyState, levels: list[float]) -> list[SteadyState]:
+    """Continue the branch of a steady state from level to level until it ends."""
+    scale = np.array([variable.scale for variable in model.states])
+    branch: list[SteadyState] = []
+    for level in levels:
+        candidates = steady_states_at(model, level)
+        distances = [float(np.linalg.norm((item.state - state.state) / scale)) for item in candidates]
+        if not candidates or min(distances) > FARTHEST:
+            break
+        state = candidates[int(np.argmin(distances))]
+        branch.append(state)
+    return branch
 
 
 def _paired_samples(run: RunColumns, x_name: str, y_name: str) -> tuple[Times, Values, Values]:

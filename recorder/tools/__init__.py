@@ -1,1 +1,1 @@
-"""Work on whole recordings: inspect, cut, merge, convert, play back."""
+"""Work on whole recordings: inspect, cut, convert, play back."""

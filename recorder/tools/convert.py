@@ -1,11 +1,16 @@
 """Convert between recordings (MCAP) and records (tables)."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from array import array
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import encode
+from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import convert_to_process, read_signals
@@ -13,14 +18,24 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.output import refuse_source
-from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, to_time_ns
+from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, join_runs, to_time_ns
 from reactorwatch.records.several_files import join_files
 from reactorwatch.records.source_text import is_table
 from reactorwatch.records.write_table import write_table
-from recorder.columns.run_splitter import ContinuousTime
-from recorder.message import RecordedMessage
-from recorder.storage.process_metadata import PROCESS, to_metadata
-from recorder.tools.mcap_file import CLOCK, NO_CLOCK, ZERO_NS, RecordingWriter, read_record
+from recorder import RecordedMessage
+from recorder.columns.run import signal_roles
+from recorder.columns.samples import ContinuousTime, SampleSeries, decode_messages
+from recorder.files.metadata import CLOCK, NO_CLOCK, PROCESS, ZERO_NS, process_metadata
+from recorder.files.recording import (
+    has_clock,
+    live_file,
+    one_plant_in,
+    read_messages,
+    read_metadata,
+    recorded_process,
+    zero_from,
+)
+from recorder.files.writer import RecordingWriter
 from recorder.tools.player import samples_of
 
 
@@ -69,7 +84,7 @@ def import_csv(
         atomic_write(mcap) as temporary,
         RecordingWriter(temporary, {**metadata, ZERO_NS: str(zero_ns)}) as writer,
     ):
-        writer.add_metadata(PROCESS, to_metadata(plant, process, record))
+        writer.add_metadata(PROCESS, process_metadata(plant, process, record))
         for publication in samples_of(record, plant, zero_ns):
             encoded = encode(publication)
             received_ns = received.continuous_ns(*publication)
@@ -115,6 +130,60 @@ def export_csv(
         record = convert_to_process(read_record(mcap, plant, process), process)
     write_table(csv, record, clock=clock)
     return record
+
+
+def read_record(path: Path, plant: str | None = None, process: Process | None = None) -> Record:
+    """Samples of one plant as rows of equal sample time; runs are split by `RunSplitter`.
+
+    Args:
+        path: the recording.
+        plant: name of the plant; None if the recording has only one.
+        process: process whose signals are read, its inputs and outputs in any case; None: all recorded signals.
+
+    Returns:
+        The signals in the units in which they were published, in the order of their process if there is one; NaN where
+        a signal has no sample at the time of another one, or no valid one. The first of duplicate samples in a run
+        counts, and stray samples are counted as `strays`. Time counts from `zero_ns` of the metadata, else from the
+        first sample of the first run.
+
+    Raises:
+        InputError: as `read_messages` and `one_plant_in`; or there are no samples of the process.
+    """
+    plant = one_plant_in(path, plant)
+    wanted = None if process is None else {signal.name for signal in process.signals}
+    series = SampleSeries()
+    for topic, sample in decode_messages(read_messages(path, {keys.SAMPLE}, plant)):
+        if isinstance(sample, Sample) and (wanted is None or topic.name in wanted):
+            series.add(topic.name, sample)
+    runs, splitter, units = series.runs, series.splitter, series.units
+    if not runs:
+        sought = "that can be used" if process is None else f"of {', '.join(item.name for item in process.signals)}"
+        raise InputError(f"{path}: holds no samples {sought} of plant {plant!r}")
+    metadata = read_metadata(path)
+    zero_ns = zero_from(metadata, splitter.runs[0].first_ns)
+    present = {name: units.get(name, "") for of_run in runs for name in of_run}
+    needed = () if process is None else (*process.inputs, *process.outputs)
+    if process is None and (process := recorded_process(path, plant)) is not None:
+        needed = tuple(signal.name for signal in process.signals)
+    columns = signal_roles({**dict.fromkeys(needed, ""), **present}, process)
+    full = [of_run for of_run in runs if any(times for times, _ in of_run.values())]
+    rows = [_rows(of_run, columns, zero_ns, path.name) for of_run in full]
+    clock_ns = zero_ns if has_clock(metadata) else 0
+    live = live_file(path)
+    read_as = "" if live is None else f"the intact part of {live.name}, which is still being recorded"
+    return replace(join_runs(rows), zero_ns=clock_ns, strays=splitter.strays, units=units, read_as=read_as)
+
+
+def _rows(
+    series: dict[str, tuple["array[int]", "array[float]"]], names: Iterable[str], zero_ns: int, name: str
+) -> Record:
+    """Rows of one run, from times and values by signal."""
+    all_times = np.unique(np.concatenate([np.asarray(times, np.int64) for times, _ in series.values()]))
+    columns = {signal: np.full(all_times.size, np.nan) for signal in names}
+    for signal, (times, values) in series.items():
+        own_times, first = np.unique(np.asarray(times, np.int64), return_index=True)
+        columns[signal][np.searchsorted(all_times, own_times)] = np.asarray(values)[first]
+    return Record((all_times - zero_ns) / MINUTE_NS, columns, name)
 
 
 def plant_name(plant: str | None, process: Process) -> str:

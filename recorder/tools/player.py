@@ -12,19 +12,19 @@ from typing import NamedTuple, cast
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.commands import decode_command
+from reactorwatch.contract.codec import Body, Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS, Record, to_time_ns
-from recorder.columns.run_splitter import ContinuousTime
-from recorder.message import RecordedMessage
+from recorder import RecordedMessage
+from recorder.columns.samples import ContinuousTime, decode_messages
+
+LONG_WAIT_NS = MINUTE_NS
+JUMP = 2.0
+"""Spacings of rows beyond which the time to the next row is a jump of the recorded clock."""
 
 BATCH = 256
 """Largest number of messages published in one tick, so that the loop notices a stop."""
-
-COMMANDS = dict.fromkeys(("pause", "resume", "step", "set_rate"), messages.ReplayCommand)
-"""Message type by command."""
 
 SAMPLES = frozenset({keys.SAMPLE})
 EVERYTHING = frozenset(
@@ -34,6 +34,7 @@ EVERYTHING = frozenset(
         keys.MODEL,
         keys.CHART,
         keys.ALARM,
+        keys.INCIDENT,
         keys.ALARM_KPIS,
         keys.RECONSTRUCTION,
         keys.BASELINE,
@@ -53,12 +54,13 @@ def samples_of(record: Record, plant: str, zero_ns: int = 0) -> Iterator[Publica
         zero_ns: time that the record's minutes count from.
 
     Yields:
-        The measured samples; for a row without any, one sample of bad quality, so that the row is not lost. Sequence
-        numbers count from 0 for each signal. They restart where a run starts at a later time, as after a restart of
-        the plant, and continue where the clock steps back, as after a change of the clock.
+        The samples, also those out of their signal's bounds, which a monitor checks; for a row without any, one sample
+        of bad quality, so that the row is not lost. Sequence numbers count from 0 for each signal. They restart where a
+        run starts at a later time, as after a restart of the plant, and continue where the clock steps back, as after a
+        change of the clock.
     """
     sequences = dict.fromkeys(record.columns, 0)
-    columns = {signal: values.tolist() for signal, values in record.columns.items()}
+    columns = {signal: values.tolist() for signal, values in record.raw_columns.items()}
     names = {signal: keys.key(plant, keys.SAMPLE, signal) for signal in columns}
     times_min = record.time_min.tolist()
     restarts = {row for row in record.run_starts[1:] if times_min[row] > times_min[row - 1]}
@@ -96,23 +98,28 @@ def filter_playable(
     Yields:
         The publications, without undecodable messages and keys of other programs.
     """
-    for entry in recording:
-        topic = keys.parse(entry.key)
-        if topic is None or topic.kind not in kinds:
+    for topic, message in decode_messages(recording):
+        if topic.kind not in kinds:
             continue
         if signals is not None and topic.kind == keys.SAMPLE and topic.name not in signals:
             continue
-        try:
-            message = decode(entry.payload, entry.encoding)
-        except DecodeError:
-            continue  # the recorder counted it as refused
         if hasattr(message, "time_ns"):
             yield Publication(keys.key(plant or topic.plant, topic.kind, topic.name), cast(Body, message))
 
 
 def filter_time(publications: Iterable[Publication], from_ns: int, to_ns: int) -> Iterator[Publication]:
-    """Publications about samples within a time, both ends included."""
-    return (publication for publication in publications if from_ns <= publication.message.time_ns <= to_ns)
+    """Publications about samples within a time, both ends included, after the alarms that are standing at its start."""
+    standing: dict[str, Publication] | None = {}
+    for publication in publications:
+        message, time_ns = publication.message, publication.message.time_ns
+        if time_ns < from_ns and isinstance(message, messages.Alarm) and standing is not None:
+            standing.pop(publication.key, None)
+            if message.state != messages.ALARM_STATE_NORMAL:
+                standing[publication.key] = publication
+        elif from_ns <= time_ns <= to_ns:
+            yield from (standing or {}).values()
+            standing = None
+            yield publication
 
 
 class _Scheduled(NamedTuple):
@@ -125,12 +132,20 @@ class _Scheduled(NamedTuple):
 def _schedule(tape: Iterable[Publication]) -> Iterator[_Scheduled]:
     """Add to each publication its time, continuous over the runs of its plant."""
     clocks: dict[str, ContinuousTime] = {}
+    first: list[Publication] | None = []  # alarms before all else: they are due with what follows them
     for publication in tape:
+        if first is not None and isinstance(publication.message, messages.Alarm):
+            first.append(publication)
+            continue
         plant = publication.key.split("/", 2)[1]
         clock = clocks.get(plant)
         if clock is None:
             clock = clocks[plant] = ContinuousTime()
-        yield _Scheduled(publication, clock.continuous_ns(*publication))
+        time_ns = clock.continuous_ns(*publication)
+        yield from (_Scheduled(alarm, time_ns) for alarm in first or ())
+        first = None
+        yield _Scheduled(publication, time_ns)
+    yield from (_Scheduled(alarm, alarm.message.time_ns) for alarm in first or ())
 
 
 class Player:
@@ -140,6 +155,7 @@ class Player:
         open_tape: returns the publications from the start, each time it is called.
         rate: plant time over clock time; inf does not wait.
         loop: True to restart at the end, one row after the last row.
+        on_wait: called with a wait in seconds that is long and much longer than those between the rows before.
 
     Attributes:
         paused: True while it waits to be resumed or stepped.
@@ -147,15 +163,22 @@ class Player:
         published: number of published messages.
     """
 
-    def __init__(self, open_tape: Callable[[], Iterator[Publication]], rate: float, *, loop: bool = False) -> None:
-        self._open_tape = open_tape
+    def __init__(
+        self,
+        open_tape: Callable[[], Iterator[Publication]],
+        rate: float,
+        *,
+        loop: bool = False,
+        on_wait: Callable[[float], None] = lambda _wait_s: None,
+    ) -> None:
+        self._open_tape, self._on_wait = open_tape, on_wait
         self._tape = _schedule(open_tape())
         self.rate = rate
         self._loop = loop
         self.paused = False
         self._next = next(self._tape, None)
         self._first_ns = self._next.time_ns if self._next is not None else 0
-        self._spacing_ns = 0  # between the last two rows
+        self._spacing_ns, self._is_jump = 0, False  # between the last two rows
         self._anchor: tuple[int, int] | None = None  # (clock time, plant time) of one moment
         self.published = 0
 
@@ -167,6 +190,10 @@ class Player:
         while self._next is not None and len(due) < BATCH and self.next_tick_ns() <= now_ns:
             due.append(self._take(self._next))
         self.published += len(due)
+        if due and self._next is not None and self._is_jump and not self.paused:
+            wait_ns = self.next_tick_ns() - now_ns
+            if wait_ns > LONG_WAIT_NS:
+                self._on_wait(wait_ns / 1e9)
         return due
 
     def next_tick_ns(self) -> int:
@@ -188,22 +215,8 @@ class Player:
         return []
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """Execute a command: pause, resume, step or set the rate. A refusal is a reply with the reason."""
-        try:
-            name, command = decode_command(question, COMMANDS)
-            assert isinstance(command, messages.ReplayCommand), "the catalogue holds no others"
-            publications: list[Publication] = []
-            if name == "step":
-                publications = self.step(command.rows or 1, now_ns)
-            elif name == "set_rate":
-                self.set_rate(command.rate, now_ns)
-            elif name == "pause":
-                self.pause(now_ns)
-            else:
-                self.resume(now_ns)
-        except (InputError, DecodeError) as error:
-            return CommandReply(accepted=False, text=str(error)), []
-        return CommandReply(accepted=True, text=self.status), publications
+        """Never called: a replay declares no commands."""
+        raise AssertionError(question.key)
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish nothing."""
@@ -282,7 +295,9 @@ class Player:
         """Advance to the next message, at the end of a loop to the first."""
         self._next = next(self._tape, None)
         if self._next is not None:
-            self._spacing_ns = self._next.time_ns - due.time_ns or self._spacing_ns
+            spacing_ns = self._next.time_ns - due.time_ns
+            self._is_jump = spacing_ns > JUMP * self._spacing_ns
+            self._spacing_ns = spacing_ns or self._spacing_ns
         elif self._loop:
             self._tape = _schedule(self._open_tape())
             self._next = next(self._tape, None)

@@ -1,7 +1,17 @@
-"""Replay a recording or a record on the bus; as a process: `python -m recorder.tools.replay [settings.toml]`."""
+"""Replay a recording or a record on the bus; as a process: `python -m recorder.tools.replay [settings.toml]`.
 
+The keys of its terminal control it, those of `ros2 bag play`: space pauses and resumes, the right arrow publishes the
+next row of a paused replay, up and down double and halve the rate. A line shows its position.
+"""
+
+import os
+import re
+import select
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from math import inf, isinf
 from pathlib import Path
 
@@ -14,17 +24,16 @@ from reactorwatch.description.read import read_signals
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import NEVER_NS, to_time_ns
 from reactorwatch.records.source_text import is_table
-from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.liveliness import wait_alive
 from reactorwatch.runtime.node_main import main
+from reactorwatch.runtime.start import instance_name, join
 from recorder.config import ReplayConfig
+from recorder.files.recording import no_samples_error, read_messages, sample_topics_in
 from recorder.tools.convert import plant_name
 from recorder.tools.inspect import zero_ns_of
-from recorder.tools.mcap_file import read_messages, sample_topics_in
 from recorder.tools.player import (
-    COMMANDS,
     EVERYTHING,
     SAMPLES,
     Player,
@@ -32,7 +41,98 @@ from recorder.tools.player import (
     filter_time,
     samples_of,
 )
-from recorder.tools.replay_keys import control_by_keys
+
+REFRESH_S = 0.25
+RATES = (1e-3, 1e6)
+"""Slowest and fastest rate that keys set."""
+
+HELP = "space: pause, right: next row, up and down: rate"
+
+_KEYS = re.compile(rb" |\x1b[\[O]([ABC])")
+_SPACE, _UP, _DOWN = b"", b"A", b"B"
+_TO_LINE_START, _CLEAR_REST = "\r", "\x1b[K"
+
+
+@contextmanager
+def control_by_keys(player: Player, loop: EventLoop) -> Iterator[None]:
+    """Read keys and show the position while the context lasts."""
+    if not _is_in_foreground():
+        yield
+        return
+    import termios  # not everywhere: systems without it have no such terminal either
+    import tty
+
+    keyboard = sys.stdin.fileno()
+    before = termios.tcgetattr(keyboard)
+    source, sink = os.pipe()
+    reader = threading.Thread(target=_read_keys, args=(player, loop, keyboard, source), name="keys", daemon=True)
+    tty.setcbreak(keyboard)
+    reader.start()
+    try:
+        yield
+    finally:
+        os.close(sink)
+        reader.join()
+        os.close(source)
+        termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
+        _show("")
+
+
+def _is_in_foreground() -> bool:
+    """True if the terminal's keys are for this process: one in the background would be stopped by reading them."""
+    if sys.stdin is None or not (sys.stdin.isatty() and sys.stderr.isatty()):
+        return False
+    try:
+        return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+    except OSError:  # the terminal is another session's
+        return False
+
+
+def _read_keys(player: Player, loop: EventLoop, keyboard: int, end: int) -> None:
+    """Hand keys to the loop, and refresh the line, until `end` is closed or the terminal is."""
+    while True:
+        ready, _, _ = select.select([keyboard, end], [], [], REFRESH_S)
+        if end in ready:
+            return
+        if keyboard in ready:
+            try:
+                typed = os.read(keyboard, 64)
+            except OSError:
+                return
+            if not typed:
+                return
+            for key in _KEYS.finditer(typed):
+                loop.call(partial(_act, player, key[1] or _SPACE))
+        loop.call(partial(_show_position, player))
+
+
+def _act(player: Player, key: bytes, now_ns: int) -> list[Publication]:
+    if key == _SPACE:
+        (player.resume if player.paused else player.pause)(now_ns)
+    elif key in (_UP, _DOWN):
+        slowest, fastest = RATES
+        player.set_rate(min(max(player.rate * (2.0 if key == _UP else 0.5), slowest), fastest), now_ns)
+    else:
+        try:
+            return player.step(1, now_ns)
+        except InputError:  # it is playing: there the next row comes by itself
+            return []
+    return []
+
+
+def _show_position(player: Player, now_ns: int) -> list[Publication]:
+    minutes = player.position_min(now_ns)
+    if minutes == minutes:  # not before the start, nor at the end
+        _show(f"{minutes:.1f} min, {player.status} ({HELP})")
+    return []
+
+
+def _show(text: str) -> None:
+    """Write the line, and leave the cursor at its start, so that a line of the log replaces it."""
+    width = os.get_terminal_size(sys.stderr.fileno()).columns or 80
+    sys.stderr.write(f"{_TO_LINE_START}{text[: width - 1]}{_CLEAR_REST}{_TO_LINE_START}")
+    sys.stderr.flush()
+
 
 __all__ = ["Player", "ReplayConfig", "replay", "run_replay", "samples_of"]
 
@@ -61,26 +161,24 @@ def replay(config: ReplayConfig, bus_config: BusConfig, stop: StopSignal) -> int
         InputError: as `run_replay`.
     """
     plants, tape = open_tape(config)
-    player = Player(tape, config.rate, loop=config.loop)
+    player = Player(tape, config.rate, loop=config.loop, on_wait=_log_wait)
     if player.finished:
         begin = "the start" if isinf(config.from_min) else f"{config.from_min:g} min"
         end = "the end" if isinf(config.to_min) else f"{config.to_min:g} min"
         raise InputError(f"{config.file}: holds nothing to play from {begin} to {end}")
-    bus = bus_zenoh.connect(bus_config, NODE, stop)
-    if bus is None:
-        return 0
-    try:
+    name = instance_name()
+    tokens = [keys.instance_token(plant, NODE, name) for plant in plants]
+    with join(bus_config, NODE, stop, *tokens) as bus:
+        if bus is None:
+            return 0
         for plant in plants:
             wait_alive(bus, plant, config.wait_for, stop, NODE)
         log.info("replaying", file=config.file, plant=", ".join(plants), rate=config.rate)
         for plant in plants:
             bus.declare_token(keys.key(plant, keys.ALIVE, NODE))
         loop = EventLoop(player, bus, stop)
-        loop.accept_commands(*(keys.key(plant, keys.COMMAND, name) for plant in plants for name in COMMANDS))
         with control_by_keys(player, loop):
             loop.run()
-    finally:
-        bus.close()
     log.info("replayed", file=config.file, messages=player.published, to_the_end=player.finished)
     return player.published
 
@@ -108,7 +206,7 @@ def open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Itera
     topics = [topic for topic in sample_topics_in(path) if signals is None or topic.name in signals]
     plants = tuple(sorted({topic.plant for topic in topics}))
     if not plants:
-        raise InputError(f"{path}: holds no samples")
+        raise no_samples_error(path)
     if not config.plant:
         for plant in plants:
             try:
@@ -127,6 +225,11 @@ def open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Itera
         return filter_time(played, from_ns, to_ns)
 
     return (config.plant,) if config.plant else plants, tape
+
+
+def _log_wait(wait_s: float) -> None:
+    """Say that nothing is published for long, because the recorded clock jumps."""
+    log.warning("waiting: the recorded clock jumps", seconds=round(wait_s), cure="a higher --rate, or --from behind it")
 
 
 def _check_signals(path: Path, names: Iterable[str]) -> None:

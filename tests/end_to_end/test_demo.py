@@ -17,7 +17,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Estimate, Fault, Health, ModelSnapshot, Sample
 from reactorwatch.records.record import to_time_ns
-from recorder.tools.mcap_file import read_messages
+from recorder.files.recording import read_messages
 
 from .conftest import COMMAND_WITHIN_S, REACTORWATCH
 

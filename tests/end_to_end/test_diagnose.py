@@ -137,7 +137,9 @@ def test_several_files_give_one_line_each_in_their_order_and_a_bad_one_stops_non
     files = ["short.csv", "quiet.csv", "nowhere.csv", "again/quiet.csv"]
     done = called("diagnose", *files, "--json", "--jobs", "1", "-o", "all", cwd=folder)
     assert done.returncode == 2
-    found = [json.loads(line) for line in done.stdout.splitlines()]
+    short, *found = [json.loads(line) for line in done.stdout.splitlines()]
+    assert (short["file"], short["watched"]) == ("short.csv", False)
+    assert "needs at least 200 rows, got 2" in short["why"]
     assert [item["file"] for item in found] == ["quiet.csv", "again/quiet.csv"]
     assert {item["verdict"] for item in found} == {"nominal"}
     assert [item["location"] for item in found] == [None, None]
@@ -152,7 +154,7 @@ def test_several_files_give_one_line_each_in_their_order_and_a_bad_one_stops_non
         "summary.json",
     ]
     rows = json.loads((folder / "all" / "summary.json").read_text())
-    assert (rows["files"], rows["failed"]) == (4, 2)
+    assert (rows["files"], rows["failed"], rows["not_watched"]) == (4, 1, 1)
     assert [row["verdict"] for row in rows["results"]] == [None, "nominal", None, "nominal"]
     assert rows["results"][2]["error"] == "there is no such file"
 

@@ -25,18 +25,21 @@ DECISIONS = sorted((ROOT / "docs" / "decisions").glob("*.md"))
 DOCUMENTS = [*PAGES, ROOT / "CHANGELOG.md", ROOT / "tests" / "README.md", *DECISIONS]
 JOINS_THE_BUS = (
     *("up", "demo", "plant", "monitor", "record", "replay", "router"),
-    *("view", "alive", "doctor", "status", "alarm", "playback"),
+    *("view", "alive", "doctor", "status", "alarm"),
 )
 """Commands that run as processes on the page's machine; others are called within this process, which is faster."""
 
 SCREEN = "needs a screen"
 ROOT_ONLY = "is for root and a running systemd, tests/integration/test_systemd.py checks the units"
+ENGINE = "needs an engine for containers"
 REGISTRY = "needs a registry of images"
 INDEX = "needs a package index"
 OTHERS = "is for several machines, tests/unit/runtime/test_jobs.py has a cluster on loopback"
 NOT_HERE = {
     "docs/dashboards.md": [("rerun run.rrd", SCREEN)],
     "docs/deployment.md": [
+        ("docker build --target nodes --build-arg COMMIT=$(git rev-parse HEAD) .", ENGINE),
+        ("COMMIT=$(git rev-parse HEAD) docker compose build", ENGINE),
         ("docker buildx imagetools inspect --format '{{.Manifest.Digest}}' python:3.13.9-slim-trixie", REGISTRY),
         ("docker buildx imagetools inspect --format '{{.Manifest.Digest}}' eclipse/zenoh:1.10.2", REGISTRY),
         ("cp deploy/systemd/*.service /etc/systemd/system/", ROOT_ONLY),

@@ -8,7 +8,7 @@ import pytest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.records.write_table import write_table
-from recorder.tools.mcap_file import RecordingWriter
+from recorder.files.writer import RecordingWriter
 from tests.tables import read_csv
 
 from .conftest import Command
@@ -32,17 +32,17 @@ def test_info_tells_people_and_machines_what_is_in_it(recording: Path, called: C
     assert [topic["topic"].rsplit("/", 1)[1] for topic in told["topics"]] == ["C", "T", "qc"]
 
 
-def test_a_cut_keeps_the_minutes_of_the_whole_and_a_merge_brings_them_together(
+def test_a_cut_keeps_the_minutes_of_the_recording_and_a_folder_of_cuts_is_one_recording(
     recording: Path, tmp_path: Path, called: Command
 ) -> None:
+    (tmp_path / "both").mkdir()
     for name, arguments in {"a": ["--to", "9.9min"], "b": ["--from", "10min", "--to", "1h"]}.items():
-        done = called("cut", recording, *arguments, "-o", tmp_path / f"{name}.mcap")
+        done = called("cut", recording, *arguments, "-o", tmp_path / "both" / f"{name}.mcap")
         assert done.returncode == 0, done.stderr
-    assert called("export", tmp_path / "b.mcap", "-o", tmp_path / "b.csv").returncode == 0
+    assert called("export", tmp_path / "both" / "b.mcap", "-o", tmp_path / "b.csv").returncode == 0
     assert read_csv(tmp_path / "b.csv").time_min[[0, -1]].tolist() == [10.0, 29.9]
-    done = called("merge", tmp_path / "b.mcap", tmp_path / "a.mcap", "-o", tmp_path / "both.mcap")
-    assert "900 messages" in done.stdout
-    assert called("export", tmp_path / "both.mcap", "-o", tmp_path / "both.csv").returncode == 0
+    assert "900 messages" in called("info", tmp_path / "both").stdout
+    assert called("export", tmp_path / "both", "-o", tmp_path / "both.csv").returncode == 0
     assert (tmp_path / "both.csv").read_bytes() == (tmp_path / "run.csv").read_bytes()
 
 

@@ -17,7 +17,7 @@ from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_port
 from reactorwatch.runtime.security.provisioning import make_site
-from recorder.tools.mcap_file import read_messages
+from recorder.files.recording import read_messages
 
 from .conftest import PATIENCE_S, Command, Start
 

@@ -69,7 +69,7 @@ def test_from_a_clean_clone_to_a_named_cause_in_a_reader_s_own_file(
     assert header != "time_min,qc,C,T", "the columns have the reader's names"
     set_up, alarms, cause = (run(clone, command) for command in block.commands)
     assert "reactorwatch compile" in set_up
-    assert "likely cause: 15 % of the coolant lost" in alarms
+    assert "Detected since 120 min: 15 % of the coolant lost (" in alarms
     assert "coolant leak" in cause
     assert (clone / "report" / "report.html").is_file()
 

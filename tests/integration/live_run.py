@@ -17,12 +17,12 @@ from plant_node.record import simulate_record
 from reactorwatch.cli.processes import MODULES, Processes, write_settings
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode
-from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Health, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Health, Incident, Sample
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 from recorder.config import RecorderConfig
-from recorder.tools.mcap_file import read_messages
+from recorder.files.recording import read_messages
 from recorder.tools.player import samples_of
 
 WITHIN_S = 120.0
@@ -81,7 +81,8 @@ class LiveRun:
         self.bus = connect_client(self.config)
         self.nodes = Processes(dict.fromkeys(MODULES, settings), folder)
         self.alarms: list[Alarm] = []
-        """As heard."""
+        """As heard, like the incidents."""
+        self.incidents: list[Incident] = []
         self.health = Health()
         """The monitor's last."""
         self._changed = threading.Condition()
@@ -89,7 +90,7 @@ class LiveRun:
         self.now_min = self._judged_min = 0.0
         self._alive: set[str] = set()
         self.bus.subscribe_liveliness(f"reactor/{PLANT}/alive/*", self._on_alive)
-        for kind in (keys.SAMPLE, keys.ESTIMATE, keys.ALARM, keys.HEALTH):
+        for kind in (keys.SAMPLE, keys.ESTIMATE, keys.ALARM, keys.INCIDENT, keys.HEALTH):
             self.bus.subscribe(keys.all_keys(PLANT, kind), self._on_message)
 
     def start(self, node: str) -> "subprocess.Popen[bytes]":
@@ -153,6 +154,8 @@ class LiveRun:
                 self._judged_min = max(self._judged_min, (body.time_ns - self._first_ns) / MINUTE_NS)
             elif isinstance(body, Alarm):
                 self.alarms.append(body)
+            elif isinstance(body, Incident):
+                self.incidents.append(body)
             elif isinstance(body, Health) and body.node == "monitor":
                 self.health = body
             self._changed.notify_all()

@@ -26,8 +26,7 @@ class OneAttempt(StopSignal):
         super().__init__()
         self._asked = 0
 
-    @property
-    def is_set(self) -> bool:
+    def wait(self, timeout_s: float | None = None) -> bool:
         self._asked += 1
         return self._asked > 1
 

@@ -38,13 +38,13 @@ class Control:
     def __init__(self, bus: ZenohBus, endpoint: str, folder: Path, called: Command) -> None:
         self.bus = bus
         self._called = called
-        self.file = folder / "alarms.state"
+        self.file = folder / "monitor.state"
         self.heard: list[Message] = []
         self.alive = False
         self._changed = threading.Condition()
         self._settings = folder / "settings.toml"
         self._settings.write_text(
-            f'[bus]\nendpoint = "{endpoint}"\n[monitor]\nalarm_state_file = "{self.file}"\n', encoding="utf-8"
+            f'[bus]\nendpoint = "{endpoint}"\n[monitor]\nstate_file = "{self.file}"\n', encoding="utf-8"
         )
         bus.subscribe_liveliness("reactor/cstr/alive/monitor", self._on_alive)
         bus.subscribe("reactor/**", self._on_message)
@@ -164,8 +164,8 @@ def test_a_damaged_file_ends_the_monitor_with_one_line_and_is_left_alone(control
         capture_output=True, text=True, timeout=WITHIN_S, check=False,
     )  # fmt: skip
     assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert line.startswith(f"monitor: alarm_state_file {control.file}: is no alarm state: ")
+    line = done.stderr.splitlines()[-1]  # after those of its connection
+    assert line.startswith(f"monitor: state_file {control.file}: is no state of a monitor: ")
     assert control.file.read_bytes() == b"no state"
 
 

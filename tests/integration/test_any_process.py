@@ -18,12 +18,12 @@ from reactorwatch.contract.messages_pb2 import Alarm, Estimate
 from reactorwatch.description.find import find_process
 from reactorwatch.runtime.loopback import free_endpoint
 from recorder.columns.run_reader import read_segments
-from recorder.dashboard.file import write_rrd
-from recorder.panels import overview
+from recorder.files.recording import read_messages
+from recorder.panels import signals
 from recorder.panels.base import TimePlot
 from recorder.tools.convert import export_csv
 from recorder.tools.inspect import inspect
-from recorder.tools.mcap_file import read_messages
+from recorder.view.file import write_rrd
 from tests.unit.plant_node.test_plant_of_any_process import RIG
 
 WITHIN_S = 120.0
@@ -89,7 +89,7 @@ def test_it_is_verified_with_no_option_and_without_its_file(rig: Path, capsys: p
 def test_it_is_drawn_by_signal_and_role_with_no_option(rig: Path, tmp_path: Path) -> None:
     source = open_messages(rig)
     (run,) = read_segments(source.messages, process=source.process)
-    plots = [plot for plot in overview.draw(run) if isinstance(plot, TimePlot)]
+    plots = [plot for plot in signals.draw_overview(run) if isinstance(plot, TimePlot)]
     assert [(plot.title, plot.unit) for plot in plots] == [
         ("h1: level of tank 1", "mm"),
         ("h2: level of tank 2", "cm"),

@@ -4,6 +4,7 @@ import itertools
 import random
 import signal
 import subprocess
+import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +19,7 @@ from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.config import BusConfig
 
-from .live_run import PLANT, SILENCE, LiveRun, is_of_plant
+from .live_run import PLANT, SILENCE, WITHIN_S, LiveRun, is_of_plant
 
 DURATION_MIN, SPEED = 40.0, 240.0
 LARGE, GARBAGE = 30, 20_000
@@ -89,6 +90,38 @@ def flood(config: BusConfig) -> None:
                 Encoded(keys.key(PLANT, keys.SAMPLE, "T"), random.Random(number).randbytes(10_000_000), encoding)
             )
     bus.close()
+
+
+FLOOD = """
+import sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", f'["{sys.argv[1]}"]')
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config) as session:
+    publisher = session.declare_publisher(sys.argv[2], congestion_control=zenoh.CongestionControl.DROP)
+    start = time.monotonic()
+    for second in range(int(sys.argv[3])):
+        for _ in range(200_000):
+            publisher.put(bytes(30))
+        time.sleep(max(0.0, start + second + 1 - time.monotonic()))
+"""
+"""A program that sends 200,000 short messages of garbage a second, for some seconds."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [60.0], indirect=True)
+@pytest.mark.parametrize("signal", ["T", "unknown"])
+def test_a_sound_plant_is_not_silent_during_a_flood(run: LiveRun, signal: str) -> None:
+    """The flood takes more time than the plant has before it is taken to be silent."""
+    _, plant = run.start_all()
+    run.wait_until(10.0)
+    refused = run.health.refused
+    key = keys.key(PLANT, keys.SAMPLE, signal)
+    subprocess.run([sys.executable, "-c", FLOOD, run.config.endpoint, key, "15"], check=True, timeout=WITHIN_S)
+    run.wait(lambda: run.health.refused > refused)
+    run.end(plant)
+    assert SILENCE not in {alarm.alarm for alarm in run.alarms}
 
 
 def memory_mb(process: "subprocess.Popen[bytes]") -> float:

@@ -87,4 +87,4 @@ def test_what_a_service_writes_is_on_a_volume(file: Path) -> None:
 @both
 def test_images_have_versions(file: Path) -> None:
     for name, service in services_of(file).items():
-        assert re.search(r":\d+\.\d+\.\d+(@sha256:[0-9a-f]{64})?$", service["image"]), name
+        assert re.search(r":\d+\.\d+\.\d+(\.dev\d+)?(@sha256:[0-9a-f]{64})?$", service["image"]), name

@@ -10,7 +10,7 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.event_loop import StopSignal
-from recorder.tools.mcap_file import read_messages
+from recorder.files.recording import read_messages
 
 from .compose import NODES, SECURE, Services, run_nodes, services_of
 from .site import Site, settings

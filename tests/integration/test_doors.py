@@ -398,3 +398,32 @@ def test_an_answer_says_what_was_done(site: Site) -> None:
     question = Encoded("reactor/cstr/command/acknowledge", *encode_message(AlarmCommand(alarm="a", by="Anna")))
     (answer,) = site.join("cstr/operator").query(question, WITHIN_S)
     assert decode(answer.payload, answer.encoding) == CommandReply(accepted=True, text="seen")
+
+
+WILDCARDS = ("sample/*", "sample/**", "sample/T$*", "sample/$*T", "**", "*/T")
+
+
+def test_a_message_on_many_keys_at_once_reaches_no_node(site: Site) -> None:
+    """A router refuses what leaves the rights of its publisher; what does not is refused by the nodes."""
+    viewer, plant = site.join("cstr/viewer"), site.join("cstr/plant")
+    came, last = list[str](), threading.Semaphore(0)
+
+    def note(message: Encoded) -> None:
+        came.append(message.key)
+        if message.key.endswith("/last"):
+            last.release()
+
+    def note_all(messages: list[Encoded]) -> None:
+        for message in messages:
+            note(message)
+
+    viewer.subscribe("reactor/cstr/**", note)
+    viewer.subscribe_batched("reactor/cstr/sample/**", note_all)
+    viewer.subscribe_uncached("reactor/cstr/sample/*", note)
+    plant.publish(Encoded("reactor/cstr/sample/first", b"", ""))
+    for wildcard in WILDCARDS:
+        plant._session.put(f"reactor/cstr/{wildcard}", b"made up")
+    plant.publish(Encoded("reactor/cstr/sample/last", b"", ""))
+    for _ in range(3):
+        assert last.acquire(timeout=WITHIN_S)
+    assert set(came) == {"reactor/cstr/sample/first", "reactor/cstr/sample/last"}

@@ -1,8 +1,7 @@
-"""Monitors of a fleet on a real router: plants are discovered, and a monitor that dies is replaced."""
+"""Monitors of a fleet on a real router: plants are discovered, shards divide them, and a killed monitor resumes."""
 
 import contextlib
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -17,12 +16,11 @@ from urllib.request import urlopen
 import msgspec
 import pytest
 
-from benchmarks.link_cuts import Proxy
 from monitor_node.fleet.config import FleetConfig
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode_message
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, ListAlarms, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, ListAlarms
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
@@ -143,19 +141,14 @@ def test_what_is_counted_of_each_plant_is_on_the_monitor_s_page(bus_config: BusC
         assert f'reactorwatch_messages_received_total{{node="monitor",plant="{plant}"}} 0.0' in page
 
 
-def test_one_monitor_answers_for_each_plant_and_another_takes_over_the_plants_of_one_that_is_killed(
+def test_each_plant_is_watched_by_the_monitor_of_its_shard_which_answers_its_commands(
     bus_config: BusConfig, tmp_path: Path
 ) -> None:
     payload, encoding = encode_message(ListAlarms())
-    with (
-        client(bus_config) as bus,
-        monitor(bus_config, tmp_path, "1/2"),
-        monitor(bus_config, tmp_path, "2/2") as second,
-    ):
+    with client(bus_config) as bus, monitor(bus_config, tmp_path, "1/2"), monitor(bus_config, tmp_path, "2/2"):
         watchers = Watchers()
         bus.subscribe_liveliness("reactor/*/alive/monitor", watchers.on_token)
-        crew_are = crew_of(bus)
-        crew_are(2)
+        crew_of(bus)(2)
         for plant in PLANTS:
             bus.declare_token(f"reactor/{plant}/alive/plant")
         watchers.wait_for(set(PLANTS))
@@ -164,18 +157,6 @@ def test_one_monitor_answers_for_each_plant_and_another_takes_over_the_plants_of
             reply = decode(answer.payload, answer.encoding)
             assert isinstance(reply, CommandReply)
             assert "ewma/T" in [alarm.alarm for alarm in reply.alarms]
-        alarms: SimpleQueue[str] = SimpleQueue()
-        bus.subscribe("reactor/*/alarm/**", lambda message: alarms.put(_raised(message)))
-        second.send_signal(signal.SIGKILL)
-        second.wait()
-        crew_are(1)
-        watchers.wait_for(set(PLANTS))
-        for plant in PLANTS:
-            for message in run_of(plant, 2, leak_min=30.0, span_min=35.0):
-                bus.publish(message)
-        raised = set[str]()
-        while len({name.split("/")[1] for name in raised if name}) < len(PLANTS):
-            raised.add(alarms.get(timeout=WITHIN_S))
 
 
 class Told:
@@ -223,11 +204,11 @@ def test_what_is_told_again_and_again_waits_on_new_keys_if_there_were_many_latel
 ) -> None:
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.MAX_NEW_KEYS", 2)
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.NEW_KEYS_PER_S", 0)
-    heard: SimpleQueue[str] = SimpleQueue()
+    heard: SimpleQueue[tuple[str, bytes]] = SimpleQueue()
     bus = bus_zenoh.connect(bus_config, "test", StopSignal(), uncached=("health",))
     with client(bus_config) as listener:
         assert bus is not None
-        listener.subscribe("reactor/*/*/monitor", lambda message: heard.put(message.key))
+        listener.subscribe("reactor/*/*/monitor", lambda message: heard.put((message.key, message.payload)))
         while heard.empty():  # what is not cached is lost as long as the subscription is on its way
             bus.publish(Encoded("reactor/a/health/monitor", b"", ""))
             with contextlib.suppress(Empty):
@@ -235,8 +216,9 @@ def test_what_is_told_again_and_again_waits_on_new_keys_if_there_were_many_latel
         for _ in range(2):
             for plant in "abc":
                 bus.publish(Encoded(f"reactor/{plant}/health/monitor", b"", ""))
-        bus.publish(Encoded("reactor/a/alarm/monitor", b"", ""))
-        keys_heard = list(iter(partial(heard.get, timeout=WITHIN_S), "reactor/a/alarm/monitor"))
+        last = "reactor/a/health/monitor", b"the last"  # an alarm would overtake what has a lower priority
+        bus.publish(Encoded(*last, ""))
+        keys_heard = [key for key, _ in iter(partial(heard.get, timeout=WITHIN_S), last)]
         bus.close()
     assert keys_heard[-4:] == ["reactor/a/health/monitor", "reactor/b/health/monitor"] * 2
     assert set(keys_heard[:-4]) == {"reactor/a/health/monitor"}
@@ -257,8 +239,11 @@ def test_payloads_of_ten_megabytes_are_all_counted_and_take_no_room(bus_config: 
 
         bus.subscribe("reactor/*/health/monitor", on_health)
         crew_of(bus)(1)
-        bus.publish(run_of("alpha", 1, span_min=1.0)[0])
-        assert refused.get(timeout=WITHIN_S) == 0
+        for sample in run_of("alpha", 1):  # the first may come before the router knows who subscribes
+            bus.publish(sample)
+            with contextlib.suppress(Empty):
+                assert refused.get(timeout=1.0) == 0
+                break
         before, most = memory_bytes(process), 0
         for number in range(50):
             bus.publish(Encoded("reactor/alpha/sample/T", bytes(LARGE), f"x{number}"))
@@ -277,19 +262,19 @@ KILLED_AT = (120, 280, 330)
 
 
 @pytest.mark.slow
-def test_kills_of_monitors_that_share_a_folder_neither_lose_an_alarm_nor_tell_one_twice(
-    bus_config: BusConfig, tmp_path: Path
-) -> None:
+def test_kills_of_monitors_neither_lose_an_alarm_nor_publish_one_twice(bus_config: BusConfig, tmp_path: Path) -> None:
     runs = {plant: run_of(plant, seed, leak_min=30.0, span_min=40.0) for seed, plant in enumerate(PLANTS, start=40)}
     expected = {
         plant: [change(item.message) for item in alone(plant, run) if isinstance(item.message, Alarm)]
         for plant, run in runs.items()
     }
-    (tmp_path / "states").mkdir()
-    processes = {shard: started(bus_config, tmp_path, f"{shard}/2", tmp_path / "states") for shard in (1, 2)}
+    processes = {shard: started(bus_config, tmp_path, f"{shard}/2", tmp_path / f"states{shard}") for shard in (1, 2)}
     with client(bus_config) as bus:
-        told, crew_are = Told(bus), crew_of(bus)
-        crew_are(2)
+        told, crew_are, watchers = Told(bus), crew_of(bus), Watchers()
+        bus.subscribe_liveliness("reactor/*/alive/monitor", watchers.on_token)
+        for plant in PLANTS:
+            bus.declare_token(f"reactor/{plant}/alive/plant")
+        watchers.wait_for(set(PLANTS))  # both have subscribed
         try:
             for row in range(len(runs["alpha"]) // 3):
                 for run in runs.values():
@@ -301,7 +286,7 @@ def test_kills_of_monitors_that_share_a_folder_neither_lose_an_alarm_nor_tell_on
                     processes[shard].kill()
                     processes[shard].wait()
                     crew_are(1)
-                    processes[shard] = started(bus_config, tmp_path, f"{shard}/2", tmp_path / "states")
+                    processes[shard] = started(bus_config, tmp_path, f"{shard}/2", tmp_path / f"states{shard}")
                     crew_are(2)
             told.wait_for(len(runs["alpha"]) // 3, sum(map(len, expected.values())))
             for process in processes.values():
@@ -313,67 +298,3 @@ def test_kills_of_monitors_that_share_a_folder_neither_lose_an_alarm_nor_tell_on
                 process.wait()
         assert all(expected.values())
         assert told.changes == expected
-
-
-LEAKS_MIN, CUT_AT, BACK_AT = 30.0, 280, 330
-"""The leak sets in at row 300, while the first monitor is cut off."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("absence", ["cut off", "frozen"])
-def test_who_comes_back_after_another_took_his_plants_over_tells_no_alarm_again_and_loses_none(
-    absence: str, bus_config: BusConfig, tmp_path: Path
-) -> None:
-    runs = {
-        plant: run_of(plant, seed, leak_min=LEAKS_MIN, span_min=40.0) for seed, plant in enumerate(PLANTS, start=40)
-    }
-    expected = {
-        plant: [change(item.message) for item in alone(plant, run) if isinstance(item.message, Alarm)]
-        for plant, run in runs.items()
-    }
-    rows, states, proxy = len(runs["alpha"]) // 3, tmp_path / "states", Proxy(bus_config.endpoint)
-    states.mkdir()
-    first_bus = msgspec.structs.replace(bus_config, endpoint=proxy.endpoint)
-    with (
-        contextlib.closing(proxy),
-        client(bus_config) as bus,
-        monitor(first_bus, tmp_path, "1/2", states) as first,
-        monitor(bus_config, tmp_path, "2/2", states),
-    ):
-        told, crew_are = Told(bus), crew_of(bus)
-
-        def publish(begin: int, end: int) -> None:
-            for row in range(begin, end):
-                for run in runs.values():
-                    for message in run[3 * row : 3 * row + 3]:
-                        bus.publish(message)
-            told.wait_for(end)
-
-        crew_are(2)
-        publish(0, CUT_AT)
-        with gone(first) if absence == "frozen" else proxy.cut("closed"):
-            crew_are(1)
-            publish(CUT_AT, BACK_AT)
-        crew_are(2)
-        publish(BACK_AT, rows)
-        told.wait_for(rows, sum(map(len, expected.values())))
-    assert all(
-        changes[0].time_ns < Sample.FromString(runs["alpha"][3 * BACK_AT].payload).time_ns
-        for changes in expected.values()
-    )
-    assert told.changes == expected
-
-
-@contextmanager
-def gone(process: subprocess.Popen[bytes]) -> Iterator[None]:
-    """A process stands still while the context lasts."""
-    process.send_signal(signal.SIGSTOP)
-    try:
-        yield
-    finally:
-        process.send_signal(signal.SIGCONT)
-
-
-def _raised(message: Encoded) -> str:
-    alarm = decode(message.payload, message.encoding)
-    return message.key if isinstance(alarm, Alarm) and alarm.event == "raised" else ""

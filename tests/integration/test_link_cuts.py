@@ -31,8 +31,8 @@ from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
+from recorder.files.recording import recordings_in
 from recorder.tools.inspect import inspect
-from recorder.tools.mcap_file import recordings_in
 
 RATE_PER_S = 1000
 """A machine that has much else to do cannot keep up with the five thousand of `make cuts`."""

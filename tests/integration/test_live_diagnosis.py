@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import structlog
 
-from diagnosis_node.node import Command, DiagnosisRunner
+from diagnosis_node.__main__ import Command, DiagnosisRunner
 from diagnosis_node.trigger import DiagnosisConfig, DiagnosisTrigger
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -23,12 +23,12 @@ ZERO_NS = 1_780_000_000 * 10**9
 
 
 def watched(record: Record, out: Path, run: Command) -> DiagnosisRunner:
-    """Plays a record onto a bus that a monitor and a diagnosis hear; the diagnosis is done at once."""
+    """Plays a record onto a bus that a monitor and a diagnosis hear; each diagnosis ends before the next sample."""
     exchange = Exchange()
     bus = MemoryBus(exchange)
     monitor = Monitor(MonitorConfig(training_min=60.0), 0)
     config = DiagnosisConfig(out=str(out), window_min=100.0, after_min=25.0, tolerance={"T": 0.2, "C": 0.001})
-    diagnoses = DiagnosisRunner(config, run, lambda work: work())
+    diagnoses = DiagnosisRunner(config, out, run)
     node = DiagnosisTrigger(config, diagnoses.start, lambda: diagnoses.busy)
     samples, alarms = (keys.all_keys("cstr", kind) for kind in (keys.SAMPLE, keys.ALARM))
 
@@ -44,6 +44,7 @@ def watched(record: Record, out: Path, run: Command) -> DiagnosisRunner:
     bus.subscribe(alarms, hear)
     for publication in samples_of(record, "cstr", ZERO_NS):
         bus.publish(encode(publication))
+        diagnoses.wait()
     return diagnoses
 
 

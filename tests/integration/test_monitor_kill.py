@@ -18,7 +18,7 @@ LOOKS = 3
 
 def looks(run: LiveRun) -> int:
     """Number of looks for causes whose suspects were heard."""
-    return len({alarm.time_ns for alarm in run.alarms if alarm.event == "suspected"})
+    return len({tuple(map(str, incident.suspects)) for incident in run.incidents if incident.suspects})
 
 
 @pytest.mark.slow

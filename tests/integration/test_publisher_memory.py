@@ -5,13 +5,13 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus_zenoh import connect_now
-from reactorwatch.runtime.bus_zenoh.bus import EVERY_ROW, MAX_CACHED_OF_OTHERS
+from reactorwatch.runtime.bus_zenoh.bus import EVERY_ROW, MAX_CACHED_OF_OTHERS, MAX_INCIDENTS
 from reactorwatch.runtime.config import BusConfig
 
 PUBLISHED = 1000
 KINDS = (
     keys.SAMPLE, keys.ESTIMATE, keys.CHART, keys.RECONSTRUCTION,
-    keys.MODEL, keys.ALARM, keys.ALARM_KPIS, keys.HEALTH, keys.FAULT, keys.AUDIT,
+    keys.MODEL, keys.ALARM, keys.INCIDENT, keys.ALARM_KPIS, keys.HEALTH, keys.FAULT, keys.AUDIT,
 )  # fmt: skip
 
 
@@ -39,3 +39,20 @@ def test_messages_that_do_not_come_with_every_row_are_kept_for_a_while_only(
 ) -> None:
     """Else figures of alarms and models would take more memory each minute of a day at the plant's own pace."""
     assert remembered[kind] == (PUBLISHED if kind in EVERY_ROW else MAX_CACHED_OF_OTHERS)
+
+
+def test_the_incidents_of_years_are_not_kept_but_the_newest_are() -> None:
+    from reactorwatch.runtime import bus_zenoh
+    from reactorwatch.runtime.loopback import free_endpoint
+
+    config, published = BusConfig(endpoint=free_endpoint()), 2 * MAX_INCIDENTS
+    buses = [bus_zenoh.router(config), connect_now(config), connect_now(config)]
+    try:
+        for number in range(1, published + 1):
+            for plant in ("cstr", "other"):
+                buses[1].publish(Encoded(keys.key(plant, keys.INCIDENT, str(number)), b"%d" % number, "text/plain"))
+        kept = [int(item.payload) for item in buses[2].query_history(keys.all_keys("cstr", keys.INCIDENT))]
+    finally:
+        for bus in reversed(buses):
+            bus.close()
+    assert sorted(kept) == list(range(published - MAX_INCIDENTS + 1, published + 1))

@@ -11,7 +11,7 @@ from reactorwatch.cli.verification import run
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Baseline
-from recorder.tools.mcap_file import read_messages
+from recorder.files.recording import read_messages
 
 from .live_run import LiveRun
 

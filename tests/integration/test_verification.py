@@ -14,11 +14,12 @@ from reactorwatch.contract.codec import decode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.message import RecordedMessage
-from recorder.storage.gaps import GAP, to_metadata
-from recorder.storage.recover import recover
-from recorder.tools.cut import cut, sample_window
-from recorder.tools.mcap_file import RecordingWriter, read_messages, read_metadata, recordings_in
+from reactorwatch.version import UNKNOWN, build_metadata, describe_build
+from recorder import RecordedMessage
+from recorder.files.copies import cut, recover, sample_window
+from recorder.files.metadata import GAP, gap_metadata
+from recorder.files.recording import read_messages, read_metadata, recordings_in
+from recorder.files.writer import RecordingWriter
 
 from .watched_hour import ROWS, START_NS, record_hour
 
@@ -67,7 +68,7 @@ def test_an_hour_with_faults_is_said_again_value_for_value(hour: Path, capsys: p
     assert (code, told["exact"], told["rows"], told["differing"], told["after_the_end"]) == (0, True, ROWS, 0, 0)
     assert told["kinds"] == [
         {"kind": kind, "recorded": recorded(hour, kind), "equal": recorded(hour, kind)}
-        for kind in (keys.ALARM, keys.ALARM_KPIS, keys.CHART, keys.ESTIMATE, keys.MODEL, keys.PROMISE)
+        for kind in (keys.ALARM, keys.ALARM_KPIS, keys.CHART, keys.ESTIMATE, keys.INCIDENT, keys.MODEL, keys.PROMISE)
     ]
 
 
@@ -126,6 +127,62 @@ def test_a_recording_that_ends_between_a_sample_and_what_was_said_of_it_is_exact
     assert told["after_the_end"] > 0
 
 
+OWN = build_metadata()
+OTHER_BUILDS: dict[str, dict[str, str]] = {
+    "another version": OWN | {"version": "0.2.0"},
+    "another commit": OWN | {"commit": "0123456789abcdef0123456789abcdef01234567"},
+    "before commits were stated": {"version": OWN["version"]},
+}
+
+
+def of_build(hour: Path, out: Path, build: dict[str, str], settings: str | None = None) -> Path:
+    """The hour as another build would have recorded it."""
+    metadata = {name: value for name, value in read_metadata(hour).items() if name not in OWN}
+    metadata |= {} if settings is None else {"settings": settings}
+    with RecordingWriter(out, metadata | build) as writer:
+        for entry in read_messages(hour):
+            writer.write(entry)
+    return out
+
+
+@pytest.mark.parametrize("build", OTHER_BUILDS)
+def test_another_build_s_recording_is_said_to_be_one_before_all_else_also_if_only_a_later_file_is(
+    build: str, hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run"
+    path.mkdir()
+    of_build(hour, path / "1.mcap", OWN, "[monitor]\nkey_of_that_build = 1\n")
+    of_build(hour, path / "2.mcap", OTHER_BUILDS[build])
+    expected = f"recorded by another build, {describe_build(**({'commit': UNKNOWN} | OTHER_BUILDS[build]))}, "
+    for as_json in (False, True):
+        with pytest.raises(InputError, match="key_of_that_build"):
+            run(path, None, None, as_json=as_json)
+        printed = capsys.readouterr()
+        assert expected in (printed.err if as_json else printed.out).splitlines()[0]
+
+
+def test_a_verification_of_another_build_s_recording_says_so_in_its_first_note(
+    hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, told = verified(of_build(hour, tmp_path / "other.mcap", OTHER_BUILDS["another commit"]), capsys)
+    assert (code, told["exact"]) == (0, True)
+    assert "another build" in told["notes"][0]
+    assert not [note for note in verified(hour, capsys)[1]["notes"] if "build" in note]
+
+
+def test_a_copy_of_a_part_states_the_build_that_recorded_it(hour: Path, tmp_path: Path) -> None:
+    for name, build in OTHER_BUILDS.items():
+        source = of_build(hour, tmp_path / f"{name}.mcap", build)
+        cut(
+            (source,),
+            tmp_path / f"{name} cut.mcap",
+            sample_window((source,), START_NS, START_NS + 300_000_000_000),
+            read_metadata(source),
+        )
+        copied = read_metadata(tmp_path / f"{name} cut.mcap")
+        assert {key: copied[key] for key in OWN if key in copied} == build
+
+
 def as_after_a_cut(hour: Path, out: Path, lost: Callable[[RecordedMessage], bool] = lambda _: False) -> Path:
     """The hour as a recorder has it whose link was down from 25 to 35 minutes, around the leak and its alarms.
 
@@ -144,7 +201,7 @@ def as_after_a_cut(hour: Path, out: Path, lost: Callable[[RecordedMessage], bool
             else:
                 writer.write(entry._replace(log_time_ns=end_ns))
         for stream, count in gaps.items():
-            writer.add_metadata(GAP, to_metadata(Gap(stream, 1, 0, 0, count, end_ns)))
+            writer.add_metadata(GAP, gap_metadata(Gap(stream, 1, 0, 0, count, end_ns)))
         for entry in (entry for entry in entries if entry.log_time_ns >= end_ns):
             writer.write(entry)
     return out

@@ -6,9 +6,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from reactorwatch.identification.recursion import RlsState
 from reactorwatch.identification.rls import RecursiveLeastSquares
-from reactorwatch.identification.rls_bank import RecursiveLeastSquaresBank
+from reactorwatch.stored_state import copy_of
 
 N = 4
 FORGETTING = st.sampled_from([0.5, 0.9, 0.99, 0.9999, 1.0])
@@ -59,26 +58,9 @@ def test_stored_at_any_row_it_goes_on_with_the_same_bits(
     straight, first = RecursiveLeastSquares(N, forgetting), RecursiveLeastSquares(N, forgetting)
     for row in rows[:stop]:
         first.update(row[:N], row[N])
-    resumed = RecursiveLeastSquares.from_state(RlsState.from_bytes(first.state.to_bytes()))
+    resumed = RecursiveLeastSquares.resume(copy_of(first.memory))
     for row in rows[stop:]:
         resumed.update(row[:N], row[N])
     for row in rows:
         straight.update(row[:N], row[N])
-    assert resumed.state == straight.state
-
-
-@settings(max_examples=200)
-@given(rows_of(ANY), FORGETTING, st.integers(1, 70), st.data())
-def test_in_a_bank_a_plant_has_the_bits_of_its_own(
-    rows: NDArray[np.float64], forgetting: float, plants: int, data: st.DataObject
-) -> None:
-    """Wherever in the bank the plant is, and whatever its neighbours get."""
-    place = data.draw(st.integers(0, plants - 1))
-    rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
-    alone, bank = RecursiveLeastSquares(N, forgetting), RecursiveLeastSquaresBank(plants, N, forgetting)
-    for row in rows:
-        everybody = rng.standard_normal((plants, N + 1))
-        everybody[place] = row
-        bank.update(everybody[:, :N], everybody[:, N])
-        alone.update(row[:N], row[N])
-    assert bank.plant(place).state == alone.state
+    assert resumed.memory.to_bytes() == straight.memory.to_bytes()

@@ -1,6 +1,7 @@
 """The public names: few, documented, lazy, with the results that the commands print."""
 
 import inspect
+import itertools
 import json
 import re
 import subprocess
@@ -76,6 +77,26 @@ def test_a_backtest_and_a_monitor_that_is_fed_row_by_row_raise_the_same_alarms(l
             monitor.from_bytes(state)
     raised = [(item.alarm, item.time_min) for item in changes if item.event == "raised"]
     assert raised == [(item.alarm, item.raised_min) for item in result.alarms]
+
+
+def test_a_monitor_that_is_restored_in_an_incident_gives_the_same_changes() -> None:
+    """Alarms of a small leak join its incident between the looks for its cause."""
+    scenario, fault = {"kind": "random-steps"}, f"coolant_flow:step:-0.01@{LEAK_MIN:g}min"
+    leaking = simulate_record(PlantConfig(duration_min=90.0, seed=1, faults=(fault,), scenario=scenario))
+    monitor, changes = rw.Monitor(training_min=20.0, diagnose_training=False), list[Any]()
+    restored: rw.Monitor | None = None
+    for row, minute in enumerate(leaking.time_min):
+        values = {name: float(column[row]) for name, column in leaking.columns.items()}
+        found = monitor.update(float(minute), values)
+        if restored is not None:
+            assert restored.update(float(minute), values) == found
+        changes += found
+        if any(item.event == "suspected" for item in found):
+            restored = rw.Monitor(training_min=20.0, diagnose_training=False)
+            restored.from_bytes(monitor.to_bytes())
+    suspected = [item.suspect for item in changes if item.event == "suspected"]
+    assert len(suspected) > 1
+    assert all(before != after for before, after in itertools.pairwise(suspected))
 
 
 def test_the_model_that_a_diagnosis_extended_judges_without_alarm(leaking: Record, found: DiagnosisResult) -> None:

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-import monitor_node.signal_checks
+import monitor_node.checks
 import reactorwatch.process.library.cstr.effects
 import reactorwatch.spc.charts
 import recorder.panels
+from monitor_node.checks.catalogue import CHECKS
 from monitor_node.config import CHART_SIGNALS, MonitorConfig
-from monitor_node.pipeline import row_frame, row_step
-from monitor_node.signal_checks.catalogue import CHECKS
+from monitor_node.watch import row_frame, row_step
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.spc.charts.catalogue import CHARTS
 from tests.unit.monitor_node.samples import leaking_run
@@ -30,7 +30,7 @@ FAMILIES = {
         {type(e).__module__ for e in reactorwatch.process.library.cstr.effects.EFFECTS},
     ),
     "charts": (reactorwatch.spc.charts, {chart.__module__ for chart in CHARTS}),
-    "checks": (monitor_node.signal_checks, {check.__module__ for check in CHECKS}),
+    "checks": (monitor_node.checks, {check.__module__ for check in CHECKS}),
     "panels": (recorder.panels, {panel.draw.__module__ for panel in recorder.panels.PANELS}),
 }
 
@@ -85,7 +85,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(ROOT / package, folder / package)  # with what Numba has compiled
     charts, checks, effects = (
         "reactorwatch/spc/charts",
-        "monitor_node/signal_checks",
+        "monitor_node/checks",
         "reactorwatch/process/library/cstr/effects",
     )
     add(

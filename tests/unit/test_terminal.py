@@ -22,12 +22,12 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import ALARM_STATE_UNACKNOWLEDGED, QUALITY_GOOD, Alarm, Sample
 from reactorwatch.runtime import logs
 from reactorwatch.terminal import printable, printable_lines
-from recorder.message import RecordedMessage
-from recorder.tools.mcap_file import RecordingWriter
+from recorder import RecordedMessage
+from recorder.files.writer import RecordingWriter
 
 ROOT = Path(__file__).parents[2]
 HOSTILE = "\x1b[2J\x1b]0;title\x07 a\r\nb\tc\x7f\x9b31m\u202eevil\u2066\u200b\u2028\u2029\ufeff\U000e0041"
-BORDER = {"printing.py", "crash.py", "display.py", "replay_keys.py"}
+BORDER = {"printing.py", "crash.py", "display.py", "replay.py"}
 
 
 def acted_on(text: str) -> list[str]:
@@ -92,7 +92,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         *("info hostile.mcap", "info hostile.mcap --json", "export hostile.mcap -o FILE.csv", "backtest FILE.csv"),
         *("recover hostile.mcap -o FILE.mcap", "recover hostile.mcap -o b.mcap --json", "backtest hostile.mcap"),
-        *("cut hostile.mcap -o FILE.mcap", "merge hostile.mcap -o FILE.mcap", "identify header.csv"),
+        *("cut hostile.mcap -o FILE.mcap", "identify header.csv"),
         *("backtest FILE.csv header.csv --jobs 1", "backtest header.csv --config bad.toml", "info FILE", "FILE"),
         *(
             "simulate header.csv -o a.csv --model model.json",

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.noise_estimation import initial_sensor_sd
+from reactorwatch.kalman.resolution import resolution
 
 FAR = 5.0
 """Required deviation in standard deviations of the sensor's noise ..."""
@@ -114,9 +115,3 @@ def _noise_sd(column: Array) -> float:
     if finite.size < 2 * SIDE_ROWS:
         return inf
     return max(initial_sensor_sd(finite), resolution(finite))
-
-
-def resolution(values: Array) -> float:
-    """Quantisation step: the smallest difference of two values; almost 0 if values are not quantised."""
-    steps = np.diff(np.unique(np.round(values[np.isfinite(values)], 9)))
-    return float(steps.min()) if steps.size else 0.0

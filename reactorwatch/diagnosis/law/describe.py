@@ -1,7 +1,9 @@
 """The law of an unknown as a result: intervals, correlations, rivals, curves and the gain on held-out rows."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from math import log
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,12 +17,13 @@ from reactorwatch.diagnosis.law.fit import ShapeFit
 from reactorwatch.diagnosis.law.path import variables_along
 from reactorwatch.diagnosis.law.shapes import coefficient_effect
 from reactorwatch.diagnosis.law.unknown import FittedLaw, Unknown
+from reactorwatch.diagnosis.parameter_priors import add_priors
 from reactorwatch.diagnosis.result import LISTED, Estimate, HeldOut, Law, LawCurve, RivalLaw
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
-from reactorwatch.process.law import find_form
-from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.places import CAPACITY, FACTOR, INPUT, SOURCE, Place, unit_of, unit_of_variable
+from reactorwatch.process.law import ExtendedLaw, find_form
+from reactorwatch.process.model import Place, ProcessModel
+from reactorwatch.process.places import CAPACITY, FACTOR, INPUT, SOURCE, unit_of, unit_of_variable
 
 BINS = 30
 """Number of points of a curve, each the mean of as many rows."""
@@ -28,32 +31,57 @@ BINS = 30
 LEAST_CORRELATION = 0.5
 
 
-def law_hypothesis(law: FittedLaw, run: Run) -> FittedHypothesis:
-    """The law as a hypothesis whose parameters shift those of the law."""
+def law_hypothesis(
+    law: FittedLaw, run: Run, model: ProcessModel, uncertain: Mapping[str, float]
+) -> tuple[ExtendedLaw, FittedHypothesis]:
+    """The law, and a hypothesis whose parameters shift those with which its fit began.
+
+    A law is found with the uncertain parameters as the nominal filter estimates them, and that filter takes part of the
+    law for their offsets. So here they are states again, from the stated values, and the law is fitted with them.
+
+    Args:
+        law: the law as it was found.
+        run: the record.
+        model: process model with the stated values.
+        uncertain: standard deviations of its uncertain parameters, by name.
+    """
     shape, fit = law.fit.shape, law.fit
-    effects = [coefficient_effect(name) for name in shape.parameters]
-    ekf = FaultFilter(shape.model, effects, fit.noise, run.period_min)
+    stated = {name: model.parameter(name).value for name in uncertain}
+    plant = add_priors(shape.model.with_values(stated), uncertain)
+    ekf = FaultFilter(plant, [coefficient_effect(name) for name in shape.parameters], fit.noise, run.period_min)
     hypothesis = Hypothesis(ekf, [Constant(run.time_min)] * fit.coefficients.size)
     parameters = tuple(np.array([value]) for value in fit.coefficients)
-    return FittedHypothesis(hypothesis, Fit(parameters, *fit.evaluation), law.bic)
+    if not uncertain:
+        return law.law, FittedHypothesis(hypothesis, Fit(parameters, *fit.evaluation), law.bic)
+    refitted = hypothesis.fit(run, parameters)
+    moved = zip(law.law.parameters.items(), parameters, refitted.parameters, strict=True)
+    values = {name: value + float((now - before)[0]) for (name, value), before, now in moved}
+    bic = 2.0 * refitted.loss + len(values) * log(run.values)
+    return msgspec.structs.replace(law.law, parameters=values), FittedHypothesis(hypothesis, refitted, bic)
 
 
-def describe_law(model: ProcessModel, run: Run, found: Unknown, held_out: dict[str, HeldOut]) -> Law:
+def describe_law(
+    model: ProcessModel,
+    run: Run,
+    found: Unknown,
+    law: ExtendedLaw,
+    covariances: Sequence[Array],
+    held_out: dict[str, HeldOut],
+) -> Law:
     """Describe the best law.
 
     Args:
         model: process model without the law.
         run: the record.
         found: evidence with at least one law.
+        law: the best law as it is reported, see `law_hypothesis`.
+        covariances: covariance of each of its parameters, marginal over the others.
         held_out: errors on held-out rows, by output.
     """
-    best = found.laws[0]
-    law, units = best.law, best.law.units(model)
-    information, _ = best.fit.fitter.normal_equations(best.fit)
-    sd = np.sqrt(np.maximum(np.diag(inverse(information)), 0.0))
+    best, units = found.laws[0], law.units(model)
     parameters = {
-        name: Estimate(value, float(sd[index]), units[name])
-        for index, (name, value) in enumerate(law.parameters.items())
+        name: Estimate(value, float(np.sqrt(max(part[0, 0], 0.0))), units[name])
+        for (name, value), part in zip(law.parameters.items(), covariances, strict=True)
     }
     rivals = tuple(
         RivalLaw(item.place.location, find_form(item.law.form).form, item.law.formula(), item.bic - best.bic)
@@ -74,7 +102,7 @@ def describe_law(model: ProcessModel, run: Run, found: Unknown, held_out: dict[s
         held_out=held_out,
         correlations=_correlations(model, run, best),
         extended=law,
-        curves=_curves(model, run, best, smooth),
+        curves=_curves(model, run, law, smooth),
     )
 
 
@@ -89,10 +117,10 @@ def describe_term(place: Place) -> str:
     return f"added to the {'input' if place.kind == INPUT else 'reading of'} {place.of}"
 
 
-def _curves(model: ProcessModel, run: Run, best: FittedLaw, smooth: ShapeFit) -> tuple[LawCurve, ...]:
+def _curves(model: ProcessModel, run: Run, law: ExtendedLaw, smooth: ShapeFit) -> tuple[LawCurve, ...]:
     """Smooth correction and formula over each variable of the law."""
-    x, law = smooth.evaluation.innovations.x, best.law
-    variables = variables_along(model, run, x, best.place, smooth.lag_min)
+    x = smooth.evaluation.innovations.x
+    variables = variables_along(model, run, x, smooth.place, smooth.lag_min)
     formula = find_form(law.form).expression(
         [variables[name] for name in law.variables], list(law.parameters.values()), law.references
     )

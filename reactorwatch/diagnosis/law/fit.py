@@ -19,7 +19,7 @@ from reactorwatch.diagnosis.law.shapes import LARGEST, Shape
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
-from reactorwatch.process.places import Place
+from reactorwatch.process.model import Place
 
 MOST_TERMS = 6
 """Largest number of functions of a correction."""

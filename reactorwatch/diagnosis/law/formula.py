@@ -33,8 +33,7 @@ from reactorwatch.process.law import (
     ExtendedLaw,
     Form,
 )
-from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.places import Place
+from reactorwatch.process.model import Place, ProcessModel
 
 MOST_STARTS = 2
 """Starts of a form that are fitted further, the best with fitted linear parameters."""

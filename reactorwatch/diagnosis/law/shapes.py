@@ -20,8 +20,8 @@ from reactorwatch.diagnosis.law.path import Scale, evaluate_along
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.process.effect import Effect, ParameterShift
 from reactorwatch.process.law import add_lag_states
-from reactorwatch.process.model import Parameter, ProcessModel
-from reactorwatch.process.places import CAPACITY, FACTOR, SENSOR, Place, correct, find_place, variable_expression
+from reactorwatch.process.model import Parameter, Place, ProcessModel
+from reactorwatch.process.places import CAPACITY, FACTOR, SENSOR, correct, find_place, variable_expression
 
 HINGES = (-0.7, 0.0, 0.7)
 """Positions of hinges, in spreads from the mean."""

@@ -6,6 +6,8 @@ the difference is further down. Elsewhere the whole new part is marked. So in K3
 marked, and in f - m (T - 298), put for f, the term after f.
 """
 
+from html import escape
+
 import casadi as ca
 
 ADDED = "added"
@@ -69,11 +71,11 @@ def name(symbol: str) -> str:
     >>> name("qc")
     '<msub><mi>q</mi><mi>c</mi></msub>'
     """
-    first, rest = symbol[0], symbol[1:].lstrip("_")
+    first, rest = escape(symbol[0]), escape(symbol[1:].lstrip("_"))
     if not rest:
         return f"<mi>{first}</mi>"
     if len(rest) > 2 and symbol[1] != "_":
-        return f'<mi mathvariant="normal">{symbol.replace("_", " ").replace(".", " ")}</mi>'
+        return f'<mi mathvariant="normal">{escape(symbol.replace("_", " ").replace(".", " "))}</mi>'
     return (
         f"<msub><mi>{first}</mi><{'mn' if rest.isdigit() else 'mi'}>{rest}</{'mn' if rest.isdigit() else 'mi'}></msub>"
     )

@@ -184,7 +184,7 @@ def _frame(across: _Time, up: Axis, unit: str) -> str:
     parts = [f'<path class="frame" d="M{LEFT} {TOP}V{floor}H{WIDTH - RIGHT}"/>']
     ticks = across.ticks()
     for number, (place, text) in enumerate(ticks, start=1):
-        label = text if number < len(ticks) else f"{text} {unit}".rstrip()
+        label = text if number < len(ticks) else escape(f"{text} {unit}".rstrip())
         parts.append(f'<path class="frame" d="M{place:.1f} {floor}v4"/>')
         at, anchor = (place, "middle") if place < WIDTH - LABEL_ROOM else (WIDTH - RIGHT, "end")
         spare = " spare" if (len(ticks) - number) % 2 else ""  # left out where the text is large

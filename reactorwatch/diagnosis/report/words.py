@@ -131,7 +131,7 @@ def _describe_size(cause: Cause, effects: Sequence[Effect]) -> str:
     effect = next((item for item in effects if item.name == cause.cause), None)
     if effect is None or not effect.larger:
         return format_interval(size)
-    share = "{} %" in effect.larger
+    share = effect.is_share
     amount = replace(size, value=100.0 * size.value, sd=100.0 * size.sd, unit="%") if share else size
     if cause.profile == "sine":  # its sign has no meaning
         return format_interval(amount)

@@ -27,6 +27,7 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.cause_prior import prior_cost
 from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
 from reactorwatch.diagnosis.search.screen import Candidate, Part, Screen, first_of_each
+from reactorwatch.kalman.resolution import resolution_sd
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
@@ -423,7 +424,10 @@ def _in_order(by_label: dict[Label, FittedHypothesis]) -> list[FittedHypothesis]
     return sorted(by_label.values(), key=lambda item: item.bic)
 
 
-def smallest_noise(model: ProcessModel) -> list[float]:
-    """Lower bound of each sensor's noise."""
+def smallest_noise(model: ProcessModel, measured: Array) -> list[float]:
+    """Lower bound of each sensor's noise: at least that of the resolution of its values, shape (rows, n_y)."""
     scales = {state.name: state.scale for state in model.states}
-    return [SMALLEST_NOISE * scales.get(output.name, 1.0) for output in model.outputs]
+    return [
+        max(SMALLEST_NOISE * scales.get(output.name, 1.0), resolution_sd(column))
+        for output, column in zip(model.outputs, measured.T, strict=True)
+    ]

@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from math import inf, isfinite, nan
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,7 +32,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.identification.black_box.model import BlackBoxModel
 from reactorwatch.identification.black_box.state_map import predict_outputs
-from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
+from reactorwatch.stored_state import Memory
 
 UNSEEN = 1.3
 """Ratio of the standard deviation of an innovation to that of the training beyond which a row is an extrapolation."""
@@ -209,12 +210,20 @@ def filter_row(
 _FILTER_ROW = Entry(filter_row)
 
 
-class BlackBoxState(StoredState, frozen=True):
-    """State of a filter: its belief as doubles, the first rows after a restart, and whether it is started."""
+class BlackBoxFilterMemory(Memory):
+    """Memory of a filter.
 
-    belief: bytes
-    first_rows: list[list[float]]
-    started: bool
+    Attributes:
+        belief: state and parameters with their covariance, what was seen of the inputs, and those of the rows before.
+        limit_sd: scaled standard deviation of each output beyond which a row is not judged.
+        first_rows: the first rows after a restart, until the state is known.
+        started: True if it is.
+    """
+
+    belief: Array
+    limit_sd: Array
+    first_rows: list[list[float]] = msgspec.field(default_factory=list)
+    started: bool = False
 
 
 class Prediction(NamedTuple):
@@ -236,23 +245,34 @@ class BlackBoxFilter:
 
     Args:
         model: the fitted state map.
+        memory: memory to go on from, which it updates; None: a new one.
+
+    Raises:
+        ValueError: the memory is of another model.
+
+    Attributes:
+        memory: what runs, and what is stored.
     """
 
-    def __init__(self, model: BlackBoxModel) -> None:
+    def __init__(self, model: BlackBoxModel, memory: BlackBoxFilterMemory | None = None) -> None:
         self.model, shape = model, model.shape
         self._shape, self._p, self._m = shape, shape.outputs, shape.inputs
         self._past, self._size = shape.past * shape.inputs, shape.states + shape.parameters
         self.constants = constants_of(model)
         self._first = FLAGS + self._m * BINS
-        self.belief: Array = np.zeros(self._first + self._past + self._size + self._size**2)
-        self.belief[0] = 1.0
+        size = self._first + self._past + self._size + self._size**2
+        self.memory = memory or BlackBoxFilterMemory(np.zeros(size), np.full(self._p, inf))
+        if self.memory.belief.shape != (size,):
+            raise ValueError(f"the memory must have {size} numbers, got {self.memory.belief.size}")
+        self.belief: Array = self.memory.belief
+        self.limit_sd = self.memory.limit_sd
         self._theta, self._P = self._views()
         self._after = np.empty_like(self.belief)
         self._given = np.zeros(2 * self._m + 3 + 2 * self._p)
         self._results = np.empty(5 * self._p + 1)
-        self._first_rows: list[list[float]] = []
-        self.started = False
-        self.reset_parameters()
+        if memory is None:
+            self.belief[0] = 1.0
+            self.reset_parameters()
 
     def _views(self) -> tuple[Array, Array]:
         first = self._first + self._past + self._shape.states
@@ -267,19 +287,6 @@ class BlackBoxFilter:
     @learning.setter
     def learning(self, learning: bool) -> None:
         self.belief[0] = float(learning)
-
-    @property
-    def state(self) -> BlackBoxState:
-        """A copy of the state."""
-        return BlackBoxState(pack_numbers(self.belief), [list(row) for row in self._first_rows], self.started)
-
-    @state.setter
-    def state(self, state: BlackBoxState) -> None:
-        belief = unpack_numbers(state.belief, 1)[:, 0]
-        if belief.size != self.belief.size:
-            raise ValueError(f"the state must have {self.belief.size} numbers, got {belief.size}")
-        self.belief[:] = belief
-        self._first_rows, self.started = [list(row) for row in state.first_rows], state.started
 
     @property
     def parameters(self) -> tuple[Array, Array]:
@@ -300,8 +307,8 @@ class BlackBoxFilter:
 
     def restart(self) -> None:
         """Start with the next rows: rows are missing, or the plant's clock was set. The parameters stay."""
-        self.started = False
-        self._first_rows.clear()
+        self.memory.started = False
+        self.memory.first_rows.clear()
 
     def update(self, inputs: Sequence[float], measured: Sequence[float], limits: Sequence[float]) -> Prediction | None:
         """Predict a row, then learn from it; None where there is no prediction.
@@ -312,7 +319,7 @@ class BlackBoxFilter:
             limits: for each output the number of standard deviations beyond which its value corrects nothing.
         """
         prediction = None
-        if self.started:
+        if self.memory.started:
             m, p = self._m, self._p
             self._given[m : 2 * m] = inputs
             self._given[2 * m + 3 : 2 * m + 3 + p], self._given[2 * m + 3 + p :] = measured, limits
@@ -324,7 +331,7 @@ class BlackBoxFilter:
                 self.belief[:] = self._after
                 results = self._results.tolist()
                 prediction = Prediction(results[:p], results[2 * p : 3 * p], verdict == JUDGED)
-        if not self.started:
+        if not self.memory.started:
             self._start(inputs, measured)
         elif not isfinite(sum(inputs)):
             self.restart()
@@ -333,14 +340,14 @@ class BlackBoxFilter:
     def _start(self, inputs: Sequence[float], measured: Sequence[float]) -> None:
         """Collect rows until the state is known."""
         if not isfinite(sum(inputs) + sum(measured)):
-            self._first_rows.clear()
+            self.memory.first_rows.clear()
             return
         shape, p = self._shape, self._p
-        self._first_rows.append([*measured, *inputs])
-        if len(self._first_rows) < shape.past:
+        self.memory.first_rows.append([*measured, *inputs])
+        if len(self.memory.first_rows) < shape.past:
             return
         centres, spreads = np.array(self.model.centres), np.array(self.model.spreads)
-        rows = (np.array(self._first_rows[::-1]) - centres) / spreads
+        rows = (np.array(self.memory.first_rows[::-1]) - centres) / spreads
         n_x = shape.states
         first = self._first + self._past
         self.belief[self._first : first] = rows[:, p:].ravel()
@@ -348,8 +355,8 @@ class BlackBoxFilter:
         self.belief[1:FLAGS] = 0.0
         self._P[:n_x], self._P[:, :n_x] = 0.0, 0.0
         self._P[range(n_x), range(n_x)] = np.tile(self.model.r, shape.lags)
-        self._first_rows.clear()
-        self.started = True
+        self.memory.first_rows.clear()
+        self.memory.started = True
 
     def run(self, inputs: Array, outputs: Array, follows: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Predict the rows of the training with its own parameters, then stand at its end, ready to learn.
@@ -390,16 +397,12 @@ class BlackBoxFilter:
     @property
     def limit_sd(self) -> Array:
         """Scaled standard deviation of each output beyond which a row is not judged."""
-        return self.constants[self._limits]
+        return self.memory.limit_sd
 
     @limit_sd.setter
     def limit_sd(self, limits: Array) -> None:
-        self.constants[self._limits] = limits
-
-    @property
-    def _limits(self) -> slice:
         first = HEAD + 2 * (self._p + self._m) + 2 * self._p
-        return slice(first, first + self._p)
+        self.memory.limit_sd = self.constants[first : first + self._p] = limits
 
 
 def constants_of(model: BlackBoxModel) -> Array:

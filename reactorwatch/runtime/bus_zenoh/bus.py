@@ -42,9 +42,13 @@ HEARTBEAT_S = 0.5
 EVERY_ROW = frozenset({keys.SAMPLE, keys.ESTIMATE, keys.RECONSTRUCTION, keys.CHART})
 """Kinds published with every row, apart from `RARE_CHARTS`. Others would keep `cache_messages` filled for days."""
 RARE_CHARTS = frozenset({"parameters"})
+PRIORITY = zenoh.Priority.DATA_HIGH
+"""Above Zenoh's default, so that publishers that are no nodes do not fill the queues of a link."""
 MAX_CACHED_OF_OTHERS = 600
 """Messages cached on each key of another kind: those of `history_s` at one a plant minute and `--speed 600`."""
 LAST_RECOVERY_S = 1.0  # a bus stays open after its last message, so that it can be recovered
+MAX_INCIDENTS = 100
+"""Incidents of a plant whose last message is cached: each is a key of its own, and a plant goes on for years."""
 MAX_NEW_KEYS, NEW_KEYS_PER_S = 1000, 100
 """Keys of uncached kinds that are declared at once, and in each second after that."""
 BATCH_PERIOD_S = 0.005
@@ -120,13 +124,22 @@ class ZenohBus:
             return
         with self._publishing:
             if message.key not in self._publishers:
-                self._publishers[message.key] = self._declare_publisher(message.key), stream_of(message.key)
+                stream = stream_of(message.key)
+                self._forget_incidents(stream)
+                self._publishers[message.key] = self._declare_publisher(message.key), stream
             publisher, stream = self._publishers[message.key]
             number = self._numbers[stream]
             self._numbers[stream] = number + 1
             attachment = SEQUENCE_ATTACHMENT.pack(self._name, number)
             publisher.put(message.payload, encoding=message.encoding, attachment=attachment)
             self._published_at = time.monotonic()
+
+    def _forget_incidents(self, stream: str) -> None:
+        """Undeclare the oldest publishers of a plant's incidents before another is declared, see `MAX_INCIDENTS`."""
+        if stream.endswith(f"/{keys.INCIDENT}"):
+            declared = [key for key, (_, of) in self._publishers.items() if of == stream]
+            for key in declared[: max(0, 1 + len(declared) - MAX_INCIDENTS)]:
+                self._publishers.pop(key)[0].undeclare()
 
     def _publish_uncached(self, message: Encoded) -> None:
         """Publish without cache and number; on a new key only if there were not too many new ones lately.
@@ -209,7 +222,11 @@ class ZenohBus:
         """
 
         def on_sample(sample: zenoh.Sample) -> None:
-            handler(SampleReader(sample.encoding).read(sample, time.time_ns())[1])
+            message = SampleReader(sample.encoding).read(sample, time.time_ns())[1]
+            if has_wildcard(message.key):
+                self._refuse_wildcard(message.key)
+            else:
+                handler(message)
 
         self._declared.append(self._session.declare_subscriber(zenoh_expression(key_expression), on_sample))
 
@@ -350,13 +367,14 @@ class ZenohBus:
             log.warning("refused: a message must be on one key", key=key[:MAX_ENCODING], so_far=self._wildcards)
 
     def _declare_publisher(self, key: str) -> zenoh.ext.AdvancedPublisher:
-        # Of the same priority as all else: at a lower one, the end of the reply would overtake the replies.
-        replies = zenoh.ext.RepliesConfig(congestion_control=zenoh.CongestionControl.BLOCK)
+        # Not below the priority of the end of a reply, which would overtake the replies.
+        replies = zenoh.ext.RepliesConfig(congestion_control=zenoh.CongestionControl.BLOCK, priority=PRIORITY)
         drop = self._config.congestion == "drop"
         return zenoh.ext.declare_advanced_publisher(
             self._voice,
             key,
             congestion_control=zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK,
+            priority=PRIORITY,
             cache=zenoh.ext.CacheConfig(cache_size(key, self._config.cache_messages), replies_config=replies),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
             publisher_detection=True,
@@ -390,6 +408,11 @@ class ZenohBus:
     def undeclare_token(self, key: str) -> None:
         """See `Bus`."""
         self._tokens.pop(key).undeclare()
+
+    def query_tokens(self, key_expression: str) -> list[str]:
+        """See `Bus`."""
+        replies = self._voice.liveliness().get(zenoh_expression(key_expression), timeout=HISTORY_WITHIN_S)
+        return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
     def subscribe_liveliness(self, key_expression: str, handler: Callable[[str, bool], None]) -> None:
         """See `Bus`."""

@@ -79,7 +79,7 @@ def matches_whole_streams(key_expression: str) -> bool:
     return last == "**" and len(parts) <= STREAM_PARTS
 
 
-def first_line(error: Exception) -> str:
+def first_line(error: Exception | str) -> str:
     """First line of Zenoh's error, without the lines of its source."""
     line = str(error).splitlines()[0] if str(error) else type(error).__name__
     return re.sub(r" at /\S+\.rs:\d+\.?", "", line).rstrip(". ")

@@ -21,17 +21,25 @@ LOG_EVERY_NS = 1_000_000_000
 DECISIONS = "error,zenoh::net::routing::interceptor::access_control=trace"
 _COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
 _DECISION = re.compile(b"routing::interceptor::access_control")
-_REFUSAL = re.compile(rb"CertCommonName\(([^)]*)\).* is unauthorized to (?!Delete)(\w+) \(ingress\) on (\S+)")
-"""Refused message in the log of the router. A Delete is excluded: a client that disconnects undeclares its keys, which
-looks like one, and no node publishes any."""
+_CACHING = re.compile(rb"(\S+ ThreadId\(\d+\)) .*ACL \(ingress\): caching permissions for `(.*)`")
+"""A router decides on every kind of message when a client declares a key, and keeps the decisions for later."""
+_VERDICT = re.compile(
+    rb"(?P<thread>\S+ ThreadId\(\d+\)) .*access_control: (?P<cached>Using cached result: )?(?P<session>[0-9a-f]+)"
+    rb"(?: on .*CertCommonName\((?P<name>[^)]*)\).*)? is (?P<is_refused>un)?authorized to "
+    rb"(?P<what>Put|Query|Reply) \(ingress\) on (?P<key>\S+)"
+)
+"""Decision on a message, or on one that may come, of a session; a decision that was kept lacks the holder's name.
+Declarations and deletions are left out: a client that disconnects undeclares its keys, which looks like a Delete."""
 _LONGEST = 200
+MAX_SESSIONS = 10_000
+"""Sessions whose names are kept; those of the oldest are dropped first."""
 
 
 class RefusalLog:
     """Turns lines of Zenoh's log into lines of this software's.
 
     >>> refusals = RefusalLog()
-    >>> line = (b"access_control: 2f on Interface(lo)+CertCommonName(cstr.plant)+Transport(Tls)+2f "
+    >>> line = (b"rx-0 ThreadId(7) access_control: 2f on Interface(lo)+CertCommonName(cstr.plant)+Transport(Tls)+2f "
     ...         b"is unauthorized to Put (ingress) on reactor/cstr/alarm/x")
     >>> [refusals.add(line) for _ in range(3)]
     [True, True, True]
@@ -42,16 +50,35 @@ class RefusalLog:
     def __init__(self) -> None:
         self._text: str | None = None
         self._since = self._total = 0
+        self._names: dict[bytes, bytes] = {}  # of the holders, by session
+        self._declared: dict[bytes, tuple[bytes, set[bytes]]] = {}  # key and kinds decided on in advance, by thread
         self._reported_ns: int | None = None
 
     def add(self, line: bytes) -> bool:
         """Count a line if it is a refusal; returns True for any decision of the rules."""
-        refusal = _REFUSAL.search(line)
-        if refusal is not None:
-            who, what, key = (ascii(part.decode(errors="replace"))[1:-1][:_LONGEST] for part in refusal.groups())
+        caching = _CACHING.search(line)
+        if caching is not None:
+            self._declared[caching[1]] = caching[2], set()
+        verdict = _VERDICT.search(line)
+        if verdict is not None and self._is_of_message(verdict) and verdict["is_refused"]:
+            name = self._names.get(verdict["session"], verdict["session"])
+            parts = (verdict["what"], name, verdict["key"])
+            what, who, key = (ascii(part.decode(errors="replace"))[1:-1][:_LONGEST] for part in parts)
             self._text = f"refused: {what} by {who} on {key}"
             self._since, self._total = self._since + 1, self._total + 1
-        return _DECISION.search(line) is not None or refusal is not None
+        return _DECISION.search(line) is not None or verdict is not None
+
+    def _is_of_message(self, verdict: re.Match[bytes]) -> bool:
+        """True for a decision on a message that came; False for one in advance."""
+        if verdict["name"] is not None:
+            self._names[verdict["session"]] = verdict["name"]
+            if len(self._names) > MAX_SESSIONS:
+                del self._names[next(iter(self._names))]
+        key, kinds = self._declared.get(verdict["thread"], (b"", set()))
+        if not verdict["cached"] and verdict["key"] == key and verdict["what"] not in kinds:
+            kinds.add(verdict["what"])
+            return False
+        return True
 
     def report(self, now_ns: int) -> str | None:
         """Line to log now; None if nothing was refused since the last one, or that was less than a second ago."""

@@ -1,9 +1,9 @@
 """Connections to the bus, and its router."""
 
 import json
-import threading
-import time
+import re
 from collections.abc import Collection
+from errno import EACCES, EAGAIN, EPERM
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,13 @@ from reactorwatch.runtime.bus_zenoh.messages import first_line
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.heap import release_large_blocks
+from reactorwatch.runtime.retry import retry
 
 log = structlog.get_logger()
 
-FIRST_RETRY_S = 0.1
-MAX_RETRY_S = 2.0
-LOG_INTERVAL_S = 30.0
 STUCK_S = 1.0
+LEASE_S = 10.0
+"""Time without any sign of a client after which a router drops it, with its liveliness tokens."""
 
 _TLS = "transport/link/tls"
 _ROUTER_FILES = ("root_ca_certificate", "listen_certificate", "listen_private_key")
@@ -31,6 +31,7 @@ _ROUTER_FILES = ("root_ca_certificate", "listen_certificate", "listen_private_ke
 _SHARED_MEMORY = "transport/shared_memory/enabled"
 _TRANSPORT = {
     "transport/link/tx/queue/congestion_control/block/wait_before_close": round(STUCK_S * 1e6),
+    "transport/link/tx/lease": round(LEASE_S * 1e3),
     _SHARED_MEMORY: False,
 }
 """Zenoh passes messages of more than 3 kB in shared memory. A session keeps the 18 MB of a process that has ended, and
@@ -60,24 +61,19 @@ def connect(
     """
     client = _client(config)
     release_large_blocks()
-    woken = threading.Event()
-    stop.call_on_set(woken.set)
-    retry_s = FIRST_RETRY_S
-    logged_at = -LOG_INTERVAL_S
-    while not stop.is_set:
-        try:
-            session = zenoh.open(client)
-            voice = zenoh.open(client) if many_keys else None
-        except zenoh.ZError as error:
-            if time.monotonic() - logged_at >= LOG_INTERVAL_S:
-                logged_at = time.monotonic()
-                log.info("waiting for a router", node=node, endpoint=config.endpoint, why=first_line(error))
-            woken.wait(retry_s)
-            retry_s = min(2 * retry_s, MAX_RETRY_S)
-            continue
+
+    def on_failure(reason: str, is_new: bool) -> None:
+        if is_new:
+            log.info("waiting for a router", node=node, endpoint=config.endpoint, why=first_line(reason))
+
+    def attempt() -> ZenohBus:
+        session = zenoh.open(client)
+        return ZenohBus(session, config, uncached, zenoh.open(client) if many_keys else None)
+
+    bus = retry(attempt, stop.wait, on_failure, lambda error: isinstance(error, zenoh.ZError))
+    if bus is not None:
         log.info("connected", node=node, endpoint=config.endpoint)
-        return ZenohBus(session, config, uncached, voice)
-    return None
+    return bus
 
 
 def connect_now(config: BusConfig) -> ZenohBus:
@@ -145,8 +141,16 @@ def router(config: BusConfig) -> ZenohBus:
         raise InputError(
             f"no router can listen at {config.endpoint!r}: {first_line(error)}; "
             f"is another router running there? Choose another with --endpoint"
-        ) from error
+        ) from _system_error(error)
     return ZenohBus(session, config)
+
+
+def _system_error(error: zenoh.ZError) -> Exception:
+    """The system's error about an address, as Zenoh's text names it; else Zenoh's, as for a port without the right."""
+    number = EAGAIN if "Temporary failure in name resolution" in str(error) else 0
+    if (match := re.search(r"\(os error (\d+)\)", str(error))) is not None:
+        number = int(match[1])
+    return error if number in (0, EACCES, EPERM) else OSError(number, first_line(error))
 
 
 def router_from_file(path: Path) -> ZenohBus:
@@ -168,7 +172,7 @@ def router_from_file(path: Path) -> ZenohBus:
                 config.insert_json5(f"{_TLS}/{name}", json.dumps(str(path.parent / file)))
         return ZenohBus(zenoh.open(config), BusConfig())
     except zenoh.ZError as error:
-        raise InputError(f"router settings {path}: {first_line(error)}") from error
+        raise InputError(f"router settings {path}: {first_line(error)}") from _system_error(error)
 
 
 def _validate(settings: dict[str, Any], endpoint: str) -> zenoh.Config:

@@ -10,9 +10,10 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any
 
-from reactorwatch import __version__
 from reactorwatch.errors import InputError
+from reactorwatch.limits import limits
 from reactorwatch.runtime.parallel.jobs import Failed, Job, Result, internal_error, one_line, run_job, worker_death
+from reactorwatch.version import version as own_version
 
 CONNECT_WITHIN_S = 10.0
 WORKERS_WITHIN_S = 60.0  # a worker on a busy machine takes half a minute to start
@@ -57,7 +58,7 @@ class DaskExecutor:
             raise InputError(f"--scheduler {self._address}: cannot be reached: {text}") from unreachable
         with connection as client:
             _check_workers(client, self._address)
-            indices = {client.submit(run_job, work, job, pure=False): index for index, job in enumerate(jobs)}
+            indices = {client.submit(run_job, work, job, limits(), pure=False): index for index, job in enumerate(jobs)}
             suspects: list[int] = []
             for future in self._in_completion_order(client, list(indices)):
                 index = indices.pop(future)
@@ -66,7 +67,9 @@ class DaskExecutor:
                 else:
                     yield index, _outcome(future)
             for index in suspects:
-                (alone,) = self._in_completion_order(client, [client.submit(run_job, work, jobs[index], pure=False)])
+                (alone,) = self._in_completion_order(
+                    client, [client.submit(run_job, work, jobs[index], limits(), pure=False)]
+                )
                 error = alone.exception()
                 killed = isinstance(error, KilledWorker)
                 yield index, worker_death(error.allowed_failures + 1) if killed else _outcome(alone)
@@ -107,10 +110,12 @@ def _check_workers(client: Any, address: str) -> None:
         if isinstance(version, Exception):
             raise version
         if version is None:
-            raise InputError(f"--scheduler {address}: worker {worker} has no reactorwatch; install {__version__} there")
-        if version != __version__:
             raise InputError(
-                f"--scheduler {address}: worker {worker} has reactorwatch {version}, this is {__version__}; "
+                f"--scheduler {address}: worker {worker} has no reactorwatch; install {own_version()} there"
+            )
+        if version != own_version():
+            raise InputError(
+                f"--scheduler {address}: worker {worker} has reactorwatch {version}, this is {own_version()}; "
                 "install the same"
             )
 
@@ -127,11 +132,12 @@ def _wait_for_workers(client: Any, address: str) -> None:
 def _version_query() -> Callable[[], str | None]:
     """Function that is pickled by value: a worker that cannot find a function by its name never answers."""
 
-    def version() -> str | None:
-        try:
-            import reactorwatch
-        except ImportError:
-            return None
-        return reactorwatch.__version__
+    def installed_version() -> str | None:
+        from importlib.metadata import PackageNotFoundError, version
 
-    return version
+        try:
+            return version("reactorwatch")
+        except PackageNotFoundError:
+            return None
+
+    return installed_version

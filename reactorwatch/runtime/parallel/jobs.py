@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, describe_exception
+from reactorwatch.limits import Limits, limits, set_limits
 
 RETRIES = 2
 """Retries of a job whose worker died: a job that kills three workers would kill a fourth."""
@@ -31,10 +32,12 @@ class Failed:
     Attributes:
         reason: one line of text.
         is_internal: True for an error of this software, False for unusable input.
+        exit_code: see `InputError`.
     """
 
     reason: str
     is_internal: bool = False
+    exit_code: int = InputError.exit_code
 
 
 class Executor(Protocol):
@@ -59,15 +62,16 @@ class SerialExecutor:
     ) -> Generator[tuple[int, Result | Failed]]:
         """See `Executor`."""
         for number, job in enumerate(jobs):
-            yield number, run_job(work, job)
+            yield number, run_job(work, job, limits())
 
 
-def run_job(work: Callable[[Job], Result], job: Job) -> Result | Failed:
-    """Run a job; an error is its result, and does not end the worker."""
+def run_job(work: Callable[[Job], Result], job: Job, given: Limits) -> Result | Failed:
+    """Run a job within the limits of files; an error is its result, and does not end the worker."""
+    set_limits(given)
     try:
         return work(job)
     except InputError as error:
-        return Failed(one_line(error))
+        return Failed(one_line(error), exit_code=error.exit_code)
     except Exception as error:  # noqa: BLE001 # no error of a job may stop the others
         frame = traceback.extract_tb(error.__traceback__)[-1]
         return internal_error(error, f" ({Path(frame.filename).name}, line {frame.lineno})")
@@ -75,7 +79,7 @@ def run_job(work: Callable[[Job], Result], job: Job) -> Result | Failed:
 
 def internal_error(error: BaseException, where: str = "") -> Failed:
     """Result of a job that ended with an unexpected error."""
-    return Failed(f"internal error: {type(error).__name__}: {one_line(error)}{where}", is_internal=True)
+    return Failed(f"internal error: {one_line(describe_exception(error))}{where}", is_internal=True)
 
 
 def worker_death(times: int) -> Failed:
@@ -83,7 +87,7 @@ def worker_death(times: int) -> Failed:
     return Failed(f"given up: {times} workers died at it; is there too little memory?")
 
 
-def one_line(error: BaseException) -> str:
+def one_line(error: object) -> str:
     """Text of an error on one line."""
     return " ".join(str(error).split())
 
@@ -97,29 +101,3 @@ def in_job_order(outcomes: Iterator[tuple[int, Result | Failed]]) -> Iterator[Re
         while position in early:
             yield early.pop(position)
             position += 1
-
-
-def choose_executor(processes: int | None = None, scheduler: str | None = None) -> Executor:
-    """Choose an executor.
-
-    Args:
-        processes: number of processes on this machine; None: one for each core that this process may use. One: this
-            process.
-        scheduler: address of a Dask cluster's scheduler, such as `tcp://127.0.0.1:8786`; None: this machine.
-
-    Raises:
-        InputError: both are given, there are no processes, or there is no such cluster.
-    """
-    if scheduler is not None:
-        if processes is not None:
-            raise InputError("--jobs is for this machine, and --scheduler for a cluster; give one of them")
-        from reactorwatch.runtime.parallel.dask_workers import DaskExecutor
-
-        return DaskExecutor(scheduler)
-    from reactorwatch.runtime.parallel.process_pool import ProcessExecutor, available_cores
-
-    if processes is None:
-        processes = available_cores()
-    if processes < 1:
-        raise InputError(f"--jobs must be at least 1, got {processes}")
-    return SerialExecutor() if processes == 1 else ProcessExecutor(processes)

@@ -20,6 +20,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, cast
 
+from reactorwatch.limits import Limits, limits
 from reactorwatch.runtime.parallel.jobs import RETRIES, Failed, Job, Result, internal_error, run_job, worker_death
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -122,7 +123,7 @@ def _start(work: Callable[[Any], Any]) -> _Worker:
     for name in THREADS:
         os.environ.setdefault(name, "1")
     ours, theirs = _SPAWN.Pipe()
-    process = _SPAWN.Process(target=_do_jobs, args=(work, theirs), daemon=True)
+    process = _SPAWN.Process(target=_do_jobs, args=(work, limits(), theirs), daemon=True)
     with _without_interrupts():
         process.start()
     theirs.close()  # so that the pipe ends with the process
@@ -160,12 +161,12 @@ def _without_interrupts() -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
 
-def _do_jobs(work: Callable[[Job], Result], pipe: "Connection[Any, Any]") -> None:
+def _do_jobs(work: Callable[[Job], Result], given: Limits, pipe: "Connection[Any, Any]") -> None:
     """Run jobs until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         while True:
-            outcome = run_job(work, pipe.recv())
+            outcome = run_job(work, pipe.recv(), given)
             try:
                 pipe.send(outcome)
             except OSError:

@@ -23,8 +23,8 @@ CACHE_SUFFIX = "@adv/**"
 NO_QUERYABLE = f"{keys.ROOT}watch/nobody"
 """Key without a queryable: a query of it ends when all messages before it have arrived. Every role may query it."""
 
-PLANT_COMMANDS = ("set_input", "inject_fault", "clear_fault", "pause", "resume", "step", "set_rate")
-"""Commands of the plant, or a replay in its place."""
+PLANT_COMMANDS = ("set_input", "inject_fault", "clear_fault")
+"""Commands of the plant."""
 PLANT_ALARM_COMMANDS = ("acknowledge", "shelve", "unshelve", "comment")
 ALARM_COMMANDS = (*PLANT_ALARM_COMMANDS, keys.ACKNOWLEDGE_RECORDER)
 """Commands of an operator for alarms of the plant and of the recorder."""
@@ -71,7 +71,8 @@ ROLES = (
         "monitor",
         ("monitor", "diagnosis"),
         (
-            *(f"{kind}/**" for kind in (keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.RECONSTRUCTION)),
+            *(f"{kind}/**" for kind in (keys.ESTIMATE, keys.MODEL, keys.CHART, keys.RECONSTRUCTION)),
+            *(f"{kind}/**" for kind in (keys.ALARM, keys.INCIDENT)),
             f"{keys.ALARM_KPIS}/monitor",
             f"{keys.BASELINE}/monitor",
             f"{keys.PROMISE}/monitor",
@@ -149,8 +150,9 @@ def access_control(
     subjects, policies = [], []
     for plant in plants:
         root = f"{keys.ROOT}/{plant}"
-        monitors = keys.monitor_token(plant, "*")
-        everything = [f"{root}/**", f"{root}/**/{CACHE_SUFFIX}", f"{root}/*/{PROOF}", monitors, keys.FLEET_TOKENS]
+        instances = {node: keys.instance_token(plant, node, "*") for role in ROLES for node in role.nodes}
+        others = [f"{root}/*/{PROOF}", *instances.values(), keys.FLEET_TOKENS]
+        everything = [f"{root}/**", f"{root}/**/{CACHE_SUFFIX}", *others]
         reading = [
             _rule(plant, "subscribe", ("ingress",), READ_INGRESS, everything),
             _rule(plant, "receive", ("egress",), READ_EGRESS, everything),
@@ -167,7 +169,7 @@ def access_control(
                 proofs = [f"{root}/{kind}/{PROOF}" for kind in kinds_of(role)]
                 answers = [f"{root}/{keys.COMMAND}/{command}" for command in role.answers]
                 alive = [f"{root}/{keys.ALIVE}/{node}" for node in role.nodes]
-                alive += [monitors] if role.name == "monitor" else []
+                alive += [instances[node] for node in role.nodes]
                 own += [
                     _rule(name, "publish", ("ingress",), ("put", "reply"), [*published, *caches, *proofs]),
                     _rule(name, "cache", ("ingress",), ("declare_queryable", "liveliness_token"), caches),

@@ -194,7 +194,7 @@ def _load_authority(folder: Path, now: datetime.datetime, *, is_old: bool) -> tu
     if (folder / CA).exists() or is_old:
         return Identity(read_certificate(folder / CA), read_key(folder / KEY)), []
     ca = make_authority(f"reactorwatch {now:%Y-%m-%d}", now, AUTHORITY_DAYS)
-    _install(folder, lambda new: ca.write(new / CA, new / KEY), mode=0o700)
+    _install(folder, lambda new: ca.write(new / CA, new / KEY))
     return ca, [folder]
 
 
@@ -235,13 +235,21 @@ class _Issuer:
         return is_pair and read_common_name(certificate) == name and certificate.not_valid_after_utc > self._until
 
 
-def _install(folder: Path, write: Callable[[Path], None], mode: int = 0o777) -> None:
+def _make_private(folder: Path) -> None:
+    """Make a folder, and those above it that are missing, for its owner alone, whatever the umask is."""
+    if not folder.is_dir():
+        _make_private(folder.parent)
+        folder.mkdir(mode=0o700)
+        folder.chmod(0o700)
+
+
+def _install(folder: Path, write: Callable[[Path], None]) -> None:
     """Write files to a temporary folder and move them into `folder`; a new folder appears complete."""
     new = folder.with_name(f".{folder.name}.new")
     if new.is_symlink() or new.is_file():
         new.unlink()
     shutil.rmtree(new, ignore_errors=True)
-    new.mkdir(parents=True, mode=mode)
+    _make_private(new)
     write(new)
     if not folder.exists():
         new.rename(folder)

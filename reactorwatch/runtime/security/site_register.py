@@ -6,7 +6,9 @@ from pathlib import Path
 import msgspec
 
 from reactorwatch.errors import InputError
+from reactorwatch.limits import parse_json
 from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.input_file import read_regular
 from reactorwatch.runtime.security.acl import SERIAL_BYTES, common_name
 
 
@@ -53,6 +55,6 @@ def read_register(path: Path) -> Register | None:
     if not path.exists():
         return None
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Register)
-    except (OSError, msgspec.DecodeError) as error:
+        return msgspec.convert(parse_json(read_regular(path)), Register)
+    except (OSError, InputError, msgspec.ValidationError) as error:
         raise InputError(f"{path}: cannot be read as what `certify` has written there: {error}") from error

@@ -1,24 +1,20 @@
 """Control charts: one statistic each, evaluated sample by sample against limits.
 
 All charts have one interface: `update(x)` takes the next value, a number or a vector, and returns a `Judgement`.
-`state` holds the parameters and the memory of a chart, and `from_state` resumes from it, bit for bit. A chart does not
-restart by itself after a point that is out: its owner calls `restart` when the cause is gone.
+`memory` holds the parameters of a chart and what it remembers, and `resume` makes a chart that goes on from it, bit for
+bit. A chart does not restart by itself after a point that is out: its owner calls `restart` when the cause is gone.
 """
 
 from abc import ABC, abstractmethod
-from math import isfinite
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
-from reactorwatch.errors import InputError
 from reactorwatch.spc.baseline import Baseline
-from reactorwatch.stored_state import StoredState
-
-if TYPE_CHECKING:
-    from reactorwatch.spc.training_errors import TrainingErrors
+from reactorwatch.spc.training_errors import TrainingErrors, relative_rate
+from reactorwatch.stored_state import Memory
 
 Array = NDArray[np.float64]
 
@@ -47,10 +43,6 @@ class Judgement(NamedTuple):
     def side(self) -> str:
         """Side of the centre on which the statistic is."""
         return "above" if self.statistic > self.centre else "below"
-
-
-class ChartState(StoredState, frozen=True):
-    """Base class of the stored states of a chart or a bank of charts."""
 
 
 class Setting(NamedTuple):
@@ -115,14 +107,15 @@ class Chart(ABC):
 
     Attributes:
         name: in `[monitor] charts`, in the key of its points and in the name of its alarm.
-        State: the type of its state.
+        memory: its parameters and what it remembers: what runs, and what is stored; it is changed, never replaced.
+        memory_type: the type of its memory.
         has_memory: whether a point depends on samples before it. One point out then raises the alarm; otherwise it
             takes `raise_count` of the last `window`, so that a single outlier raises none.
         settings: keys of `[monitor]` that belong to the chart.
     """
 
     name: ClassVar[str]
-    State: ClassVar[type[ChartState]]
+    memory_type: ClassVar[type[Memory]]
     has_memory: ClassVar[bool] = True
     settings: ClassVar[tuple[Setting | SignalSetting, ...]] = ()
 
@@ -137,26 +130,29 @@ class Chart(ABC):
         """
         return None
 
+    memory: Any
+
     @classmethod
-    @abstractmethod
-    def from_state(cls, state: Any) -> Self:
-        """Resume a chart, bit for bit, from its state.
+    def resume(cls, memory: Any) -> Self:
+        """Chart that goes on from a memory of `memory_type`, which it updates.
 
         Raises:
-            ValueError: the state is damaged.
+            ValueError: the memory is damaged.
         """
+        chart = cls.__new__(cls)
+        chart._use(memory)
+        return chart
 
-    @property
-    @abstractmethod
-    def state(self) -> ChartState:
-        """A copy of the full state."""
+    def _use(self, memory: Any) -> None:
+        """Check a memory, and update it from now on."""
+        self.memory = memory
 
     @abstractmethod
     def update(self, x: Any) -> Judgement:
         """Judge the next sample.
 
         Raises:
-            ValueError: it is not finite; the chart's state is as before.
+            ValueError: it is not finite; the chart's memory is as before.
         """
 
     @abstractmethod
@@ -173,7 +169,7 @@ class SignalChart(Chart):
         """The chart for a training of one signal, whose residual has the mean 0 and the standard deviation 1."""
 
     @classmethod
-    def relative_rates(cls, baseline: Baseline, errors: "TrainingErrors") -> Array:
+    def relative_rates(cls, baseline: Baseline, errors: TrainingErrors) -> Array:
         """Rate of false alarms by the errors of the training, relative to the intended one, shape (draws,).
 
         Of a chart without memory it is that of its single points. A chart that does not define it counts as one of
@@ -183,10 +179,6 @@ class SignalChart(Chart):
             baseline: training of one signal, as for `design`.
             errors: errors of this signal.
         """
-        from reactorwatch.spc.training_errors import (
-            relative_rate,
-        )  # which needs the run lengths, which need this module
-
         (learned,) = baseline.learned
         share = 1.0 / baseline.arl0 if cls.has_memory else baseline.point_probability
         return relative_rate(float(-ndtri(0.5 * share)), 1.0, learned, errors)
@@ -240,14 +232,3 @@ def vector(x: ArrayLike, dimension: int) -> Array:
     for value in values.tolist():
         finite(value)
     return values
-
-
-def positive(name: str, value: float) -> float:
-    """The value itself.
-
-    Raises:
-        InputError: it is not a positive number.
-    """
-    if not (value > 0 and isfinite(value)):
-        raise InputError(f"{name} must be a positive number, got {value}")
-    return float(value)

@@ -16,9 +16,10 @@ from typing import Self
 import numpy as np
 
 from reactorwatch.codegen.numba_kernel import jit
+from reactorwatch.errors import positive
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.base import Array, Judgement, Setting, Shown, finite, positive
+from reactorwatch.spc.charts.base import Array, Judgement, Setting, Shown, finite
 from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, CompiledChart, X, write_point
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.run_length.design import ewma_limit

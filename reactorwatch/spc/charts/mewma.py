@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.codegen.numba_kernel import Entry, jit
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, positive
 from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Setting, positive, vector
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, Judgement, Setting, vector
 from reactorwatch.spc.charts.t2 import Whitening
 from reactorwatch.spc.joint_chart import JointChart, correlation, joint_limit, joint_rates
 from reactorwatch.spc.training_errors import TrainingErrors
+from reactorwatch.stored_state import Memory
 
 
 @jit
@@ -49,14 +50,16 @@ def move(numbers: Array, x: Array, weight: float) -> float:
 _MOVE = Entry(move)
 
 
-class MewmaState(ChartState, frozen=True):
-    """State of a MEWMA chart: the arguments of `Mewma`, and the average in white coordinates."""
+class MewmaMemory(Memory):
+    """Memory of a MEWMA chart.
 
-    mean: list[float]
-    covariance: list[list[float]]
+    Attributes:
+        weight: lambda.
+        numbers: limit, mean, average in white coordinates, whitening matrix, as `move` takes them, and covariance.
+    """
+
     weight: float
-    limit: float
-    average: list[float]
+    numbers: Array
 
 
 class Mewma(JointChart):
@@ -77,21 +80,40 @@ class Mewma(JointChart):
     """
 
     name = "mewma"
-    State = MewmaState
+    memory_type = MewmaMemory
     settings = (Setting("mewma_weight", 0.02, 0.01, 1.0),)
 
     def __init__(self, mean: ArrayLike, covariance: ArrayLike, weight: float, limit: float) -> None:
         if not 0.0 < weight <= 1.0:
             raise InputError(f"weight (lambda) must be in (0, 1], got {weight}")
-        whitening = self.whitening = Whitening(mean, covariance)
-        self.weight = float(weight)
-        self.limit = positive("limit", limit)
-        p = whitening.mean.size
-        self.numbers: Array = np.concatenate(
-            [[self.limit], whitening.mean, np.zeros(p), whitening.matrix.ravel(), whitening.covariance.ravel()]
+        given, p = Whitening(mean, covariance), np.size(mean)
+        numbers = [
+            np.array([positive("limit", limit)]),
+            given.mean,
+            np.zeros(p),
+            given.matrix.ravel(),
+            given.covariance.ravel(),
+        ]
+        self._use(MewmaMemory(float(weight), np.concatenate(numbers)))
+
+    def _use(self, memory: MewmaMemory) -> None:
+        """See `Chart`."""
+        self.memory, self.weight, numbers = memory, memory.weight, memory.numbers
+        if not np.all(np.isfinite(numbers)):
+            raise ValueError(f"numbers of the chart must be finite, got {numbers.tolist()}")
+        p = signals_of(numbers)
+        self.limit, mean, self._average = (
+            positive("limit", float(numbers[0])),
+            numbers[1 : 1 + p],
+            numbers[1 + p : 1 + 2 * p],
         )
-        """Limit, mean, average and whitening matrix, as `move` takes them, and the covariance."""
-        self._average = self.numbers[1 + p : 1 + 2 * p]
+        self.whitening = Whitening(mean, numbers[1 + 2 * p + p * p :].reshape(p, p))
+
+    @property
+    def numbers(self) -> Array:
+        """Numbers of the chart, see `MewmaMemory`."""
+        numbers: Array = self.memory.numbers
+        return numbers
 
     @classmethod
     def design(cls, baseline: Baseline) -> Self:
@@ -111,37 +133,12 @@ class Mewma(JointChart):
         chart = cls.design(baseline)
         return chart.weight, sqrt(chart.limit), chart.whitening.matrix
 
-    @classmethod
-    def from_state(cls, state: MewmaState) -> "Mewma":
-        """Resume a chart, bit for bit, from its state.
-
-        Raises:
-            ValueError: the state is damaged.
-        """
-        chart = cls(state.mean, state.covariance, state.weight, state.limit)
-        average = np.array(state.average, dtype=np.float64)
-        if average.shape != chart._average.shape or not np.all(np.isfinite(average)):
-            raise ValueError(f"average must be {chart._average.size} finite numbers, got {state.average}")
-        chart._average[:] = average
-        return chart
-
-    @staticmethod
-    def state_of_numbers(numbers: Array, weight: float) -> MewmaState:
-        """State of a chart with given numbers."""
-        p = signals_of(numbers)
-        mean, average = numbers[1 : 1 + p].tolist(), numbers[1 + p : 1 + 2 * p].tolist()
-        covariance = numbers[1 + 2 * p + p * p :].reshape(p, p).tolist()
-        return MewmaState(mean, covariance, weight, float(numbers[0]), average)
-
-    @property
-    def state(self) -> MewmaState:
-        """A copy of the full state."""
-        return self.state_of_numbers(self.numbers, self.weight)
-
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (p,)."""
         values = np.ascontiguousarray(x, dtype=np.float64)
-        statistic = _MOVE.call(self.numbers, values, self.weight) if values.shape == self._average.shape else -1.0
+        statistic = (
+            _MOVE.call(self.memory.numbers, values, self.weight) if values.shape == self._average.shape else -1.0
+        )
         if statistic < 0.0:
             vector(x, self._average.size)  # says what is wrong
         return Judgement(statistic, float(self._average.size), 0.0, self.limit, statistic > self.limit)
@@ -166,5 +163,12 @@ def count_numbers(signals: int) -> int:
 
 
 def signals_of(numbers: Array) -> int:
-    """Number of signals of a chart with given numbers."""
-    return next(p for p in range(numbers.size) if count_numbers(p) == numbers.size)
+    """Number of signals of a chart with given numbers.
+
+    Raises:
+        ValueError: no chart has so many.
+    """
+    found = next((p for p in range(1, numbers.size) if count_numbers(p) == numbers.size), None)
+    if found is None:
+        raise ValueError(f"there must be as many numbers as a chart has, got {numbers.size}")
+    return found

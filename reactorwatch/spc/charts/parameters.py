@@ -25,23 +25,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, Chart, ChartState, Judgement, positive, vector
+from reactorwatch.errors import InputError, positive
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, Chart, Judgement, vector
+from reactorwatch.stored_state import Memory
 
 
-class ParameterState(ChartState, frozen=True):
-    """State of the chart: the arguments of `ParameterT2`, and its memory.
+class ParameterMemory(Memory):
+    """Memory of the chart: the arguments of `ParameterT2`, and the excitation.
 
     Attributes:
-        excitation: mean square of the inputs in memory in units of the training's, by rows.
+        excitation: mean square of the inputs in memory in units of the training's, shape (q, q).
     """
 
-    names: list[str]
-    root: list[list[float]]
+    names: tuple[str, ...]
+    root: Array
     limit: float
-    inputs: list[list[float]]
+    inputs: Array
     forgetting: float
-    excitation: list[list[float]]
+    excitation: Array
 
 
 class ParameterT2(Chart):
@@ -68,7 +69,7 @@ class ParameterT2(Chart):
     """
 
     name = "parameters"
-    State = ParameterState
+    memory_type = ParameterMemory
 
     def __init__(
         self,
@@ -78,47 +79,26 @@ class ParameterT2(Chart):
         inputs: ArrayLike | None = None,
         forgetting: float = 0.999,
     ) -> None:
-        self.names = tuple(names)
-        self.limit = positive("limit", limit)
-        if not 0.0 < forgetting < 1.0:
-            raise InputError(f"forgetting must be in (0, 1), got {forgetting}")
-        self.forgetting = float(forgetting)
-        self._root = _matrix("root", root, len(self.names))
-        if not len(self._root):
+        names, made = tuple(names), _matrix("root", root, len(names))
+        white = _matrix("inputs", [] if inputs is None else inputs, len(names))
+        self._use(ParameterMemory(names, made, limit, white, float(forgetting), np.eye(len(white))))
+
+    def _use(self, memory: ParameterMemory) -> None:
+        """See `Chart`."""
+        self.memory, self.names = memory, memory.names
+        self.limit = positive("limit", memory.limit)
+        if not 0.0 < memory.forgetting < 1.0:
+            raise InputError(f"forgetting must be in (0, 1), got {memory.forgetting}")
+        if not len(memory.root):
             raise InputError("root must have a row for each direction that is charted, got none")
-        self._inputs = _matrix("inputs", [] if inputs is None else inputs, len(self.names))
-        self._excitation: Array = np.eye(len(self._inputs))
-
-    @classmethod
-    def from_state(cls, state: ParameterState) -> "ParameterT2":
-        """Resume a chart, bit for bit, from its state.
-
-        Raises:
-            ValueError: the state is damaged.
-        """
-        chart = cls(state.names, state.root, state.limit, state.inputs, state.forgetting)
-        excitation = np.array(state.excitation, dtype=np.float64).reshape(-1, len(chart._inputs) or 1)
-        if excitation.shape[0] != len(chart._inputs) or not np.all(np.isfinite(excitation)):
-            raise ValueError(f"excitation must be {len(chart._inputs)} rows of finite numbers, got {state.excitation}")
-        chart._excitation = excitation
-        return chart
-
-    @property
-    def state(self) -> ParameterState:
-        """A copy of the full state."""
-        return ParameterState(
-            list(self.names),
-            self._root.tolist(),
-            self.limit,
-            self._inputs.tolist(),
-            self.forgetting,
-            self._excitation.tolist(),
-        )
+        q, excitation = len(memory.inputs), memory.excitation
+        if excitation.shape != (q, q) or not np.all(np.isfinite(excitation)):
+            raise ValueError(f"excitation must be {q} rows of finite numbers, got {excitation.tolist()}")
 
     @property
     def excitation(self) -> float:
         """g, in [0, 1]."""
-        return float(_share(self._excitation))
+        return float(_share(self.memory.excitation))
 
     def update(self, difference: ArrayLike, regressor: ArrayLike | None = None) -> Judgement:
         """Judge the parameters after a row; see `Chart`.
@@ -133,26 +113,26 @@ class ParameterT2(Chart):
         """
         d = np.ascontiguousarray(difference, dtype=np.float64)
         row = _NO_ROW if regressor is None else np.ascontiguousarray(regressor, dtype=np.float64)
-        p = len(self.names)
+        p, memory = len(self.names), self.memory
         statistic = np.nan
         if d.shape == (p,) and (regressor is None or row.shape == (p,)):
-            statistic = _judge(d, row, self._root, self._inputs, self._excitation, self.forgetting)
+            statistic = _judge(d, row, memory.root, memory.inputs, memory.excitation, memory.forgetting)
         if statistic != statistic:
             vector(d, p)
             vector(row, p)
-        return Judgement(statistic, float(len(self._root)), 0.0, self.limit, statistic > self.limit)
+        return Judgement(statistic, float(len(memory.root)), 0.0, self.limit, statistic > self.limit)
 
     def contributions(self, difference: ArrayLike) -> Array:
         """Each parameter's part of T2, shape (p,), in the order of `names`: g^2 d_j (C^-1 d)_j with C the covariance.
 
         Their sum is T2; one may be negative. See `T2.contributions`.
         """
-        d = vector(difference, len(self.names))
-        return np.asarray(self.excitation**2 * d * (self._root.T @ (self._root @ d)))
+        d, root = vector(difference, len(self.names)), self.memory.root
+        return np.asarray(self.excitation**2 * d * (root.T @ (root @ d)))
 
     def restart(self) -> None:
         """Forget the excitation; the models keep the parameters."""
-        self._excitation = np.eye(len(self._inputs))
+        self.memory.excitation = np.eye(len(self.memory.inputs))
 
 
 def _matrix(name: str, values: ArrayLike, columns: int) -> Array:

@@ -26,12 +26,13 @@ from numpy.typing import ArrayLike
 
 from reactorwatch.errors import InputError
 from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.base import Array, ChartState, Judgement, vector
+from reactorwatch.spc.charts.base import Array, Judgement, vector
 from reactorwatch.spc.joint_chart import JointChart
+from reactorwatch.stored_state import Memory
 
 
-class PcaModel(ChartState, frozen=True):
-    """PCA model of related signals: the full state of the two charts.
+class PcaModel(Memory):
+    """PCA model of related signals: the full memory of the two charts.
 
     Attributes:
         mean: mean of each signal, length p.
@@ -92,16 +93,20 @@ class PcaModel(ChartState, frozen=True):
 class _PcaChart(JointChart):
     """Base class of the two charts: a model, and no memory."""
 
-    State = PcaModel
+    memory_type = PcaModel
     has_memory = False
 
     def __init__(self, model: PcaModel) -> None:
-        self._model = model
+        self._use(model)
+
+    def _use(self, memory: PcaModel) -> None:
+        """See `Chart`."""
+        self.memory = self._model = model = memory
         self._mean, self._scale = np.array(model.mean), np.array(model.scale)
         self._loadings = np.array(model.loadings)
         p, a = len(model.mean), len(model.variances)
         if self._loadings.shape[:1] != (p,) or self._scale.shape != (p,) or a != p or not np.all(self._scale > 0):
-            raise ValueError(f"state must hold loadings, scales and variances of its {p} signals")
+            raise ValueError(f"the memory must hold loadings, scales and variances of its {p} signals")
 
     @classmethod
     def design(cls, baseline: Baseline) -> Self:
@@ -114,20 +119,6 @@ class _PcaChart(JointChart):
         spans = np.ptp(e, axis=0) if len(e) else np.zeros(len(names))
         still = "" if np.all(spans > 0.0) else names[int(np.argmin(spans))]
         return super().obstacle(e, names) or (still and f"the residual of {still} does not vary in the training")
-
-    @classmethod
-    def from_state(cls, state: PcaModel) -> Self:
-        """The chart of that model.
-
-        Raises:
-            ValueError: the state is damaged.
-        """
-        return cls(state)
-
-    @property
-    def state(self) -> PcaModel:
-        """The model; the chart has no memory."""
-        return self._model
 
     def restart(self) -> None:
         """Do nothing: there is no memory."""
@@ -148,10 +139,11 @@ class PcaT2(_PcaChart):
 
     name = "pca_t2"
 
-    def __init__(self, model: PcaModel) -> None:
-        super().__init__(model)
+    def _use(self, memory: PcaModel) -> None:
+        """See `Chart`."""
+        super()._use(memory)
         a = self._loadings.shape[1]
-        self._white: Array = self._loadings / np.sqrt(np.array(model.variances[:a]))
+        self._white: Array = self._loadings / np.sqrt(np.array(memory.variances[:a]))
 
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (p,)."""

@@ -36,12 +36,12 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from reactorwatch.codegen.numba_kernel import Entry, jit
-from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Setting, positive, vector
+from reactorwatch.errors import InputError, positive
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, Judgement, Setting, vector
 from reactorwatch.spc.run_length.design import ewma_limit
 from reactorwatch.spc.training_errors import TrainingErrors, student_tail
 from reactorwatch.spc.value_chart import ValueBaseline, ValueChart, student_limit
-from reactorwatch.stored_state import pack_numbers, unpack_numbers
+from reactorwatch.stored_state import Memory
 
 BLOCKS = 5
 """Blocks of the cross-validation."""
@@ -64,7 +64,7 @@ def move(numbers: Array, x: Array, weight: float) -> float:
     """Take a row into the averages; returns the largest one in size, -1 if the row cannot be taken.
 
     Args:
-        numbers: see `ResidualSpace.numbers`.
+        numbers: see `ResidualSpaceMemory`.
         x: shape (p,).
         weight: lambda.
     """
@@ -85,15 +85,18 @@ def move(numbers: Array, x: Array, weight: float) -> float:
 _MOVE = Entry(move)
 
 
-class ResidualSpaceState(ChartState, frozen=True):
-    """State of the chart: its names, weight and limit, and centre, matrix and averages as doubles."""
+class ResidualSpaceMemory(Memory):
+    """Memory of the chart.
 
-    names: list[str]
+    Attributes:
+        names: names of the signals.
+        weight: lambda.
+        numbers: limit, centre, averages and matrix, as `move` takes them.
+    """
+
+    names: tuple[str, ...]
     weight: float
-    limit: float
-    centre: bytes
-    matrix: bytes
-    averages: bytes
+    numbers: Array
 
 
 class ResidualSpace(ValueChart):
@@ -117,20 +120,27 @@ class ResidualSpace(ValueChart):
 
     name = "residual_space"
     locates = True
-    State = ResidualSpaceState
+    memory_type = ResidualSpaceMemory
     settings = (Setting("residual_space_weight", 0.1, 0.01, 1.0),)
 
     def __init__(self, names: Sequence[str], centre: ArrayLike, matrix: ArrayLike, weight: float, limit: float) -> None:
         if not 0.0 < weight <= 1.0:
             raise InputError(f"weight (lambda) must be in (0, 1], got {weight}")
-        self.names, self.weight, self.limit = tuple(names), float(weight), positive("limit", limit)
-        p, middle, given = len(self.names), np.asarray(centre, np.float64), np.asarray(matrix, np.float64)
+        p, middle, given = len(names), np.asarray(centre, np.float64), np.asarray(matrix, np.float64)
         if middle.shape != (p,) or given.shape != (p, p) or not np.all(np.isfinite(given)):
             raise InputError(f"centre and matrix must have {p} finite rows, got {middle.shape} and {given.shape}")
-        self.numbers: Array = np.concatenate([[self.limit], middle, np.zeros(p), given.ravel()])
-        """Limit, centre, averages and matrix, as `move` takes them."""
-        self._centre, self._averages = self.numbers[1 : 1 + p], self.numbers[1 + p : 1 + 2 * p]
-        self._matrix = self.numbers[1 + 2 * p :].reshape(p, p)
+        numbers = np.concatenate([[positive("limit", limit)], middle, np.zeros(p), given.ravel()])
+        self._use(ResidualSpaceMemory(tuple(names), float(weight), numbers))
+
+    def _use(self, memory: ResidualSpaceMemory) -> None:
+        """See `Chart`."""
+        self.memory, self.names, self.weight, numbers = memory, memory.names, memory.weight, memory.numbers
+        p = len(self.names)
+        if numbers.size != 1 + 2 * p + p * p or not np.all(np.isfinite(numbers)):
+            raise ValueError(f"numbers of {p} signals must be {1 + 2 * p + p * p} finite ones, got {numbers.tolist()}")
+        self.limit = positive("limit", float(numbers[0]))
+        self._centre, self._averages = numbers[1 : 1 + p], numbers[1 + p : 1 + 2 * p]
+        self._matrix = numbers[1 + 2 * p :].reshape(p, p)
 
     @classmethod
     def design(cls, baseline: ValueBaseline) -> Self:
@@ -152,31 +162,12 @@ class ResidualSpace(ValueChart):
         errors = TrainingErrors.draw(len(baseline.names)).scale
         return np.asarray(np.sum(student_tail(limit, freedom, errors), axis=1) / special.ndtr(-known))
 
-    @classmethod
-    def from_state(cls, state: ResidualSpaceState) -> Self:
-        """Resume a chart, bit for bit, from its state.
-
-        Raises:
-            ValueError: the state is damaged.
-        """
-        p = len(state.names)
-        centre, averages = (unpack_numbers(item, 1)[:, 0] for item in (state.centre, state.averages))
-        chart = cls(state.names, centre, unpack_numbers(state.matrix, max(p, 1)), state.weight, state.limit)
-        if averages.shape != (p,) or not np.all(np.isfinite(averages)):
-            raise ValueError(f"averages must be {p} finite numbers, got {averages.tolist()}")
-        chart._averages[:] = averages
-        return chart
-
-    @property
-    def state(self) -> ResidualSpaceState:
-        """A copy of the full state."""
-        parts = (pack_numbers(item) for item in (self._centre, self._matrix, self._averages))
-        return ResidualSpaceState(list(self.names), self.weight, self.limit, *parts)
-
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (p,)."""
         values = np.ascontiguousarray(x, dtype=np.float64)
-        statistic = _MOVE.call(self.numbers, values, self.weight) if values.shape == self._averages.shape else -1.0
+        statistic = (
+            _MOVE.call(self.memory.numbers, values, self.weight) if values.shape == self._averages.shape else -1.0
+        )
         if statistic < 0.0:
             vector(x, self._averages.size)  # says what is wrong
         return Judgement(statistic, 0.0, 0.0, self.limit, statistic > self.limit)

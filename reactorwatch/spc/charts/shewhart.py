@@ -27,9 +27,10 @@ import numpy as np
 from scipy import special
 
 from reactorwatch.codegen.numba_kernel import jit
+from reactorwatch.errors import positive
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.base import Array, Judgement, Shown, finite, positive
+from reactorwatch.spc.charts.base import Array, Judgement, Shown, finite
 from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, CompiledChart, X, write_point
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.run_length.shewhart import RULES, checked_rules

@@ -14,17 +14,18 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, positive
 from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.base import Array, ChartState, Judgement, positive, vector
+from reactorwatch.spc.charts.base import Array, Judgement, vector
 from reactorwatch.spc.joint_chart import JointChart, correlation, joint_limit
+from reactorwatch.stored_state import Memory
 
 
-class T2State(ChartState, frozen=True):
-    """State of a T2 chart: the arguments of `T2`."""
+class T2Memory(Memory):
+    """Memory of a T2 chart: the arguments of `T2`."""
 
-    mean: list[float]
-    covariance: list[list[float]]
+    mean: Array
+    covariance: Array
     limit: float
 
 
@@ -45,12 +46,16 @@ class T2(JointChart):
     """
 
     name = "t2"
-    State = T2State
+    memory_type = T2Memory
     has_memory = False
 
     def __init__(self, mean: ArrayLike, covariance: ArrayLike, limit: float) -> None:
-        self.whitening = Whitening(mean, covariance)
-        self.limit = positive("limit", limit)
+        self._use(T2Memory(np.array(mean, dtype=np.float64), np.array(covariance, dtype=np.float64), limit))
+
+    def _use(self, memory: T2Memory) -> None:
+        """See `Chart`."""
+        self.memory, self.whitening = memory, Whitening(memory.mean, memory.covariance)
+        self.limit = positive("limit", memory.limit)
 
     @classmethod
     def design(cls, baseline: Baseline) -> Self:
@@ -63,16 +68,6 @@ class T2(JointChart):
         """See `Chart`."""
         chart = cls.design(baseline)
         return 1.0, sqrt(chart.limit), chart.whitening.matrix
-
-    @classmethod
-    def from_state(cls, state: T2State) -> "T2":
-        """The chart of that state."""
-        return cls(state.mean, state.covariance, state.limit)
-
-    @property
-    def state(self) -> T2State:
-        """The arguments; the chart has no memory."""
-        return T2State(self.whitening.mean.tolist(), self.whitening.covariance.tolist(), self.limit)
 
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (p,)."""

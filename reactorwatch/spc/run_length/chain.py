@@ -17,8 +17,8 @@ from math import ceil
 import numpy as np
 from scipy import linalg, special
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Array
 from reactorwatch.spc.run_length.limits import LONGEST
 
 

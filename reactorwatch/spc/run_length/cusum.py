@@ -26,8 +26,8 @@ from math import ceil, isinf
 import numpy as np
 from scipy import special
 
-from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Array, positive
+from reactorwatch.arrays import Array
+from reactorwatch.errors import InputError, positive
 from reactorwatch.spc.run_length.chain import nodes, run_lengths, stationary_distribution
 from reactorwatch.spc.run_length.limits import check_length, check_range, shift_size
 

@@ -22,7 +22,8 @@ from math import ceil, sqrt
 import numpy as np
 from scipy import special
 
-from reactorwatch.spc.charts.base import Array, positive
+from reactorwatch.arrays import Array
+from reactorwatch.errors import positive
 from reactorwatch.spc.run_length.chain import run_lengths, stationary_distribution
 from reactorwatch.spc.run_length.ewma import ewma
 from reactorwatch.spc.run_length.limits import check_length, check_range, shift_size

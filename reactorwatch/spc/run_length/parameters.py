@@ -32,8 +32,8 @@ from math import inf, isfinite, log
 import numpy as np
 from scipy import special
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Array
 from reactorwatch.spc.run_length.design import LONGEST_DESIGN, SHORTEST
 from reactorwatch.spc.run_length.limits import check_range
 from reactorwatch.spc.run_length.mewma import LARGEST_LIMIT, mewma

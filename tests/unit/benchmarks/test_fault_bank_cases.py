@@ -7,13 +7,13 @@ import pytest
 
 from benchmarks.faults.bank import AFTER_MIN, BANK, GRADES, ONSET_MIN, TWINS, Case, Fault, cases
 from benchmarks.faults.runs import NOISE_SD, fault_free, record_of, truth_of
-from monitor_node.isolation.causes import causes_of
-from plant_node.initial_state import start_state
+from monitor_node.causes.isolation import causes_of
 from reactorwatch.arrays import Array
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
+from reactorwatch.process.steady_state import start_state
 from reactorwatch.records.record import Record
 
 CAUSES = causes_of(cstr())

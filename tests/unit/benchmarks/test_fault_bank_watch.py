@@ -5,12 +5,12 @@ from math import inf
 import pytest
 
 from benchmarks.faults.score import Interval
-from benchmarks.faults.watch import Suspicion, incidents_of, intervals_of, suspicion
-from reactorwatch.contract.messages_pb2 import Alarm, Suspect
+from benchmarks.faults.watch import Suspicion, Watched, incidents_of, intervals_of, suspicion
+from reactorwatch.contract.messages_pb2 import Alarm, Incident, Suspect
 from reactorwatch.records.record import to_time_ns
 
 
-def alarm(event: str, minute: float, name: str = "ewma/T", incident: int = 1, **suspects: float) -> Alarm:
+def alarm(event: str, minute: float, name: str = "ewma/T", incident: int = 1) -> Alarm:
     return Alarm(
         time_ns=to_time_ns(minute),
         alarm=name,
@@ -18,15 +18,23 @@ def alarm(event: str, minute: float, name: str = "ewma/T", incident: int = 1, **
         cleared_ns=to_time_ns(minute) if event == "cleared" else 0,
         event=event,
         incident=incident,
-        suspects=[Suspect(cause=cause, probability=probability) for cause, probability in suspects.items()],
     )
+
+
+def suspected(minute: float, incident: int = 1, **suspects: float) -> Incident:
+    named = [Suspect(cause=cause, probability=probability) for cause, probability in suspects.items()]
+    return Incident(time_ns=to_time_ns(minute), number=incident, suspects=named)
+
+
+def watched(alarms: list[Alarm], *incidents: Incident) -> Watched:
+    return Watched(alarms, list(incidents), 0.0, 450.0)
 
 
 def test_an_alarm_stands_from_raised_to_cleared_whatever_is_said_between() -> None:
     messages = [
         alarm("raised", 301.0),
         alarm("raised", 302.0, "ewma/C"),
-        alarm("suspected", 303.0, coolant_flow=0.9),
+        alarm("acknowledge", 303.0),
         alarm("cleared", 304.0),
         alarm("raised", 305.0),
         alarm("raised", 306.0, "mewma/all"),
@@ -50,21 +58,20 @@ def test_alarms_of_one_incident_are_counted_once() -> None:
     ],
 )
 def test_what_counts_is_the_newest_word_on_the_incident(until_min: float, expected: Suspicion) -> None:
-    messages = [
-        alarm("raised", 301.0, incident=2),
-        alarm("suspected", 303.0, incident=2, heat_loss=0.85, coolant_flow=0.15),
-        alarm("suspected", 350.0, incident=2, heat_loss=0.05, coolant_flow=0.95),
-        alarm("cleared", 360.0, incident=2),
-        alarm("suspected", 370.0, incident=3, temperature_bias=1.0),
-    ]
+    messages = watched(
+        [alarm("raised", 301.0, incident=2), alarm("cleared", 360.0, incident=2)],
+        suspected(303.0, 2, heat_loss=0.85, coolant_flow=0.15),
+        suspected(350.0, 2, heat_loss=0.05, coolant_flow=0.95),
+        suspected(370.0, 3, temperature_bias=1.0),
+    )
     assert suspicion(messages, "coolant_flow", detected_min=301.0, until_min=until_min) == expected
 
 
 def test_a_suspect_of_little_probability_is_not_among_the_likely() -> None:
-    messages = [alarm("raised", 301.0), alarm("suspected", 303.0, temperature_bias=0.92, coolant_flow=0.08)]
+    messages = watched([alarm("raised", 301.0)], suspected(303.0, temperature_bias=0.92, coolant_flow=0.08))
     assert suspicion(messages, "coolant_flow", 301.0, 400.0) == Suspicion()
 
 
 def test_without_a_detection_nobody_is_suspected() -> None:
-    messages = [alarm("raised", 200.0, coolant_flow=1.0)]
+    messages = watched([alarm("raised", 200.0)], suspected(200.0, coolant_flow=1.0))
     assert suspicion(messages, "coolant_flow", detected_min=inf, until_min=450.0) == Suspicion()

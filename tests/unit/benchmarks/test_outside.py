@@ -1,5 +1,6 @@
 """Peers and scores of the outside benchmarks equal independent computations on small examples."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -150,7 +151,7 @@ def test_data_that_are_not_there_are_named(tmp_path: Path, capsys: pytest.Captur
     from benchmarks.outside import __main__ as main
     from benchmarks.outside import tennessee
 
-    said = main.measure_benchmark(main.Benchmark("TEP", "tep", tennessee.measure), tmp_path)
+    said = main.measure_benchmark(main.Benchmark("TEP", "tep", tennessee.measure, "One record."), tmp_path)
     assert said.startswith("## TEP\n\nNot measured: ")
     assert capsys.readouterr().out == ""
 
@@ -162,3 +163,39 @@ def test_a_table_replaces_the_one_with_its_title_and_the_others_stay() -> None:
     assert replace_tables(page, ["## A\n\nnew", "## C\n\nadded"]) == (
         f"Text.\n\n{BEGIN}\n\n## A\n\nnew\n\n## B\n\nkept\n\n## C\n\nadded\n\n{END}\n"
     )
+
+
+PAGE = (Path(__file__).parents[3] / "docs" / "outside.md").read_text(encoding="utf-8")
+PROSE, TABLES = PAGE.split("<!-- tables: begin -->")
+
+
+def test_each_table_of_the_page_states_how_many_records_it_is_from_as_its_benchmark_does() -> None:
+    from benchmarks.outside.__main__ import BENCHMARKS
+
+    parts = {part.partition("\n")[0]: part for part in re.split(r"(?m)^## ", TABLES)[1:]}
+    assert set(parts) == {item.title for item in BENCHMARKS}
+    for item in BENCHMARKS:
+        stamp, _, table = parts[item.title].partition("\n\n")[2].partition("\n\n")
+        assert stamp.endswith(f" {item.records}"), item.title
+        assert "ecord" in item.records
+        assert all("one record" in name for name in re.findall(r"\| (fault [^|]*)\|", table.partition("\n")[0]))
+
+
+def test_a_measured_table_states_its_records_above_it(tmp_path: Path) -> None:
+    from benchmarks.outside import __main__ as main
+
+    (tmp_path / "data").mkdir()
+    benchmark = main.Benchmark("A", "data", lambda *_: [Row("a", "x", {"one": "1"})], "One record.")
+    head, stamp, _ = main.measure_benchmark(benchmark, tmp_path).split("\n\n")
+    assert head == "## A"
+    assert stamp.endswith(". One record.")
+
+
+def test_no_number_in_the_text_of_the_page_is_without_its_records() -> None:
+    """A sentence with a decimal number or a percentage names the records that it is from."""
+    text = PROSE.partition("## What the tables do not show")[2]
+    sentences = [" ".join(item.split()) for item in re.split(r"(?<=[.:])\s+(?=[A-Z])", text)]
+    measured = [item for item in sentences if re.search(r"\d\.\d|\d %|third of its rows", item)]
+    assert len(measured) >= 5
+    assert [item for item in measured if not re.search(r"records?\b|over seven fresh seeds|over them", item)] == []
+    assert "over seven fresh seeds of the original simulator the share is 0.04" in " ".join(text.split())

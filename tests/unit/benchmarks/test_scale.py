@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import scale
-from benchmarks.fleet.traffic import LEARNED_ROWS
+from benchmarks.fleet.traffic import LEARNED_ROWS, plant_name
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import Encoded, encode
@@ -18,7 +18,9 @@ ROWS = 200
 @pytest.fixture(scope="module")
 def short_record() -> list[Encoded]:
     """Messages of a plant, as many as are needed here."""
-    return [encode(item) for item in samples_of(simulate_record(PlantConfig(seed=1), LEARNED_ROWS + ROWS), "p0")]
+    return [
+        encode(item) for item in samples_of(simulate_record(PlantConfig(seed=1), LEARNED_ROWS + ROWS), plant_name(0))
+    ]
 
 
 def test_the_part_without_a_bus_takes_a_clock_that_goes_on_while_others_have_the_machine(

@@ -1,4 +1,4 @@
-"""`reproduce` draws every figure of the report, says what it found with numbers that are known, and repeats itself."""
+"""The study draws every figure of the report, says what it found with numbers that are known, and repeats itself."""
 
 import re
 import sys
@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 from benchmarks.study_figures import canvas
+from benchmarks.study_figures.__main__ import main
 from benchmarks.study_figures.best_model import ThirdOrder
 from benchmarks.study_figures.catalogue import FIGURES
 from benchmarks.study_figures.figure import Figure, Finding, Verdict
@@ -19,7 +20,6 @@ from benchmarks.study_figures.measured_records import FAULTS, TITLE, measured_fi
 from benchmarks.study_figures.reproduce import reproduce
 from benchmarks.study_figures.sampling_rate import report_choice
 from benchmarks.study_figures.study import Study, row_times
-from reactorwatch.cli import models
 from reactorwatch.errors import InputError
 from reactorwatch.identification.selection import Candidate, Selection
 from reactorwatch.records.record import Record
@@ -275,31 +275,44 @@ def test_an_output_folder_that_is_a_file_is_refused(tmp_path: Path, name: str) -
 def test_without_matplotlib_the_cure_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Through the command's own entry: one line on standard error and exit code 2, nothing written."""
-    from reactorwatch.cli.main import main
-
+    """Through the program's own entry: one line on standard error and exit code 2, nothing written."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    monkeypatch.setattr(sys, "argv", ["reactorwatch", "reproduce", "-o", str(tmp_path / "out")])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
+    assert main(["--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr()
-    assert said.err == "reactorwatch: pictures need matplotlib: pip install 'reactorwatch[pictures]'\n"
+    assert said.err == "reproduce: pictures need matplotlib: pip install 'reactorwatch[pictures]'\n"
     assert said.out == ""
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("options", [["--only", "99"], ["--seed", "-1"], ["--record", "missing.csv"]])
+@pytest.mark.parametrize(
+    "options", [["--only", "99"], ["--seed", "-1"], ["--record", "missing.csv"], ["--data", "missing"]]
+)
 def test_bad_options_end_with_code_2_and_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: list[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
 ) -> None:
-    from reactorwatch.cli.main import main
-
-    monkeypatch.setattr(sys, "argv", ["reactorwatch", "reproduce", "-o", str(tmp_path / "out"), *options])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
+    assert main(["--out", str(tmp_path / "out"), *options]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["study.md", "study/figure-07.png"])
+def test_the_record_that_is_read_is_never_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    record = tmp_path / name
+    record.parent.mkdir(exist_ok=True)
+    record.write_text("time_min,qc,C,T\n0,103,0.1,440\n1,103,0.1,440\n")
+    before = record.read_bytes()
+    assert main(["--out", str(tmp_path), "--only", "7", "--record", str(record), "--force"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [record]
+    assert record.read_bytes() == before
+
+
+def test_the_program_writes_the_figure_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--out", str(tmp_path), "--only", "9", "--jobs", "1"]) == 0
+    assert f"wrote {tmp_path / 'study.md'} and 1 pictures" in capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "study").iterdir()] == ["figure-09.png"]
 
 
 def test_a_figure_that_fails_leaves_no_page_and_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -312,14 +325,3 @@ def test_a_figure_that_fails_leaves_no_page_and_no_picture(tmp_path: Path, monke
     with pytest.raises(InputError, match="cannot be used"):
         reproduce(tmp_path, 1)
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
-
-
-def test_an_installed_package_without_the_source_tree_names_the_cure(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "benchmarks", None)  # what Python takes for "not there"
-    with pytest.raises(InputError, match=r"in the source tree.*make setup"):
-        models.reproduce(tmp_path / "out")
-    assert not (tmp_path / "out").exists()

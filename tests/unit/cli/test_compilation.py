@@ -32,7 +32,7 @@ def register(*function, **options):
 
 numba.njit = register
 from monitor_node.config import MonitorConfig
-from monitor_node.isolation.stage import preparation
+from monitor_node.causes.stage import preparation
 from reactorwatch.cli import compilation
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.codegen.cache import CodeCache

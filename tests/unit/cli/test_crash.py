@@ -23,9 +23,9 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.write_table import write_table
 from reactorwatch.runtime import crash
 from reactorwatch.runtime.config import read_settings
+from recorder import RecordedMessage
 from recorder.config import RecorderConfig
-from recorder.message import RecordedMessage
-from recorder.tools.mcap_file import RecordingWriter
+from recorder.files.writer import RecordingWriter
 from tests.unit.diagnosis.cases import CASES
 
 Shown = pytest.CaptureFixture[str]
@@ -153,7 +153,7 @@ TOML = {
     "a deep list": "[monitor]\ncharts = " + "[" * 5000 + "]" * 5000 + "\n",
     "a deep table": "[monitor]\ncharts = " + "{a = " * 5000 + "1" + "}" * 5000 + "\n",
     "a deep name": "[" + ".".join(["monitor"] * 3000) + "]\n",
-    "two megabytes": "[monitor]\n" + "#" * 2_000_000 + "\n",
+    "twenty megabytes": "[monitor]\n" + "#" * 20_000_000 + "\n",
     "no tables": "monitor = 3\n",
     "a number for a list": "[monitor]\ncharts = 1e308\n",
 }

@@ -56,7 +56,7 @@ ENDLESS = (
     "plant_node.__main__.run",
     "monitor_node.__main__.run",
     "recorder.tools.replay.run_replay",
-    "recorder.dashboard.live.show",
+    "recorder.view.viewer.show",
     "reactorwatch.cli.status.run",
     "reactorwatch.cli.processes.Processes.start",
 )

@@ -6,8 +6,8 @@ import pytest
 
 from reactorwatch.cli.batch import as_table, expand_files
 from reactorwatch.errors import InputError
-from recorder.storage.mcap_writer import FILE_INDEX
-from recorder.tools.mcap_file import RecordingWriter
+from recorder.files.metadata import FILE_INDEX
+from recorder.files.writer import RecordingWriter
 
 
 def recording(path: Path, **metadata: str) -> Path:

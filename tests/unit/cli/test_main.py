@@ -38,6 +38,20 @@ def test_a_node_starts_without_the_slow_parts_of_scipy_and_without_a_viewer(node
     assert not ended.stderr.strip()
 
 
+def test_what_does_not_draw_never_imports_rerun() -> None:
+    question = (
+        "import sys, recorder.node, recorder.tools.replay\n"
+        "from reactorwatch.cli.main import main\n"
+        "sys.argv = ['reactorwatch', 'record', '--help']\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
+        "found = sorted(name for name in sys.modules if name.partition('.')[0].startswith('rerun'))\n"
+        "assert not found, found"
+    )
+    ended = subprocess.run([sys.executable, "-c", question], capture_output=True, text=True, check=False)
+    assert "record" in ended.stdout
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
 def test_a_record_is_read_without_pandas_which_takes_long_to_import(tmp_path: Path) -> None:
     (tmp_path / "record.csv").write_text(
         "time_min,qc,C,T\n0,100,0.1,440\n0.1,,0.1,440\n0.2,100,0.1,440\n", encoding="utf-8"

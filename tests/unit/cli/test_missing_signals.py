@@ -67,14 +67,14 @@ def test_backtest_names_the_signal_that_has_no_value_and_watches_the_others(
     assert found["signals"]["inputs"] == [name for name in ("qc",) if name != signal]
     assert found["signals"]["outputs"] == [name for name in ("C", "T") if name != signal]
     assert found["trained_until_min"] == 40.0
-    assert main(["backtest", str(file), "--training", "1000"]) == 0
+    assert main(["backtest", str(file), "--training", "1000"]) == 3
     assert f"  {signal} is not watched: no value of it has come" in capsys.readouterr().out
 
 
 def test_backtest_without_any_output_is_refused_with_the_file(
     records: Path, main: Command, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["backtest", str(records / "only_qc.csv")]) == 2
+    assert main(["backtest", str(records / "only_qc.csv")]) == 3
     told = capsys.readouterr().err
     assert "only_qc.csv: there is no output to watch (C: no value of it has come; T: no value of it has come)" in told
     assert "Traceback" not in told
@@ -91,7 +91,7 @@ def test_identify_names_the_signal_that_has_no_value_and_the_file(
     main: Command,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert main(["identify", str(records / f"{record}.csv"), "--output", output, *options]) == 2
+    assert main(["identify", str(records / f"{record}.csv"), "--output", output, *options]) == 3
     told = " ".join(capsys.readouterr().err.split())
     assert f"{record}.csv: {signal} has no measured value, so no model of {output} can be fitted" in told
 
@@ -109,7 +109,7 @@ def test_backtest_says_why_no_training_was_fit_and_blames_no_length(
     (tmp_path / "irregular.csv").write_text("\n".join(["time_min,qc,C,T", *rows]) + "\n")
     (tmp_path / "arx.toml").write_text('[monitor]\nreference = "arx"\n')
     command = ["backtest", str(tmp_path / "irregular.csv"), "--config", str(tmp_path / "arx.toml"), "--training", "30"]
-    assert main(command) == 0
+    assert main(command) == 3
     told = capsys.readouterr().out
     assert "nothing was watched: no training was fit to learn from" in told
     assert "do rows come one by one period?" in told

@@ -69,9 +69,9 @@ def test_row_by_row_gives_what_all_rows_at_once_give(measured: Record) -> None:
 
 
 def test_compare_says_which_and_why(measured: Record) -> None:
-    text = identification.compare(measured, ("qc",), ("C",), TWO, neural=False, as_json=False)
+    text = identification.compare(measured, ("qc",), ("C",), TWO, as_json=False)
     assert text.splitlines()[-1].endswith(".")
-    said = json.loads(identification.compare(measured, ("qc",), ("C",), TWO, neural=False, as_json=True))
+    said = json.loads(identification.compare(measured, ("qc",), ("C",), TWO, as_json=True))
     assert {(item["family"], item["order"]) for item in said["candidates"]} == {
         ("arx", 1), ("arx", 2), ("oe", 1), ("oe", 2),
     }  # fmt: skip

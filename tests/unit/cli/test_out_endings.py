@@ -24,11 +24,10 @@ FILES = {
     "simulate run.csv": TABLES,
     "recover run.mcap": (".mcap",),
     "cut run.mcap": (".mcap",),
-    "merge run.mcap": (".mcap",),
 }
 """Commands that write a file, and its endings."""
 
-FOLDERS = ["diagnose run.csv", "backtest run.csv run.mcap", "reproduce", "demo", "up", f"record {NO_ROUTER}"]
+FOLDERS = ["diagnose run.csv", "backtest run.csv run.mcap", "demo", "up", f"record {NO_ROUTER}"]
 """Commands that write a folder; `record` a file, too."""
 
 ENDINGS = [".parquet", ".csv", ".mcap", ".rrd", ".json", ".html", ".xlsx", ".part", ".7z", ""]

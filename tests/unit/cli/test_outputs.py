@@ -11,15 +11,12 @@ from typing import NamedTuple, get_args, get_type_hints
 import pytest
 import typer
 
-from benchmarks.study_figures.page import FOLDER
-from benchmarks.study_figures.reproduce import PAGE
 from reactorwatch.cli.batch import SUMMARY
 from reactorwatch.cli.diagnosis import REPORT
 from reactorwatch.cli.main import app, main
 from reactorwatch.records import output
-from recorder.dashboard.picture import picture_names
-from recorder.message import RecordedMessage
-from recorder.tools.mcap_file import RecordingWriter
+from recorder import RecordedMessage
+from recorder.files.writer import RecordingWriter
 from tests.unit.recorder import golden
 
 NO_ROUTER = "--endpoint tcp/127.0.0.1:1"
@@ -58,13 +55,6 @@ CASES = {
             {"file": "run.mcap", "diagnosis": "report/report.rrd", "process": "model.json"},
             "new.rrd",
         ),
-        Case(
-            "dashboard run.mcap -o new.rrd --process model.json",
-            {"file": "run.mcap", "diagnosis": "", "process": "model.json"},
-            "pictures",
-            tuple(picture_names()),
-            option="--png",
-        ),
     ],
     "example": [Case("example leak", {}, "new.csv")],
     "recover": [Case("recover run.mcap", {"file": "run.mcap"}, "new.mcap")],
@@ -72,7 +62,6 @@ CASES = {
         Case("cut run.mcap", {"file": "run.mcap"}, "new.mcap"),
         Case("cut recordings", {"file": "recordings/a.mcap"}, "new.mcap"),
     ],
-    "merge": [Case("merge other.mcap run.mcap", {"files": "run.mcap"}, "new.mcap")],
     "backtest": [
         Case(
             "backtest run.csv run.mcap --train other.csv --process model.json --config settings.toml",
@@ -96,14 +85,6 @@ CASES = {
             (*SUMMARY, *(f"other/{name}" for name in REPORT)),
         ),
     ],
-    "reproduce": [
-        Case(
-            "reproduce --only 7 --record run.csv",
-            {"file": "run.csv", "data": ""},
-            "folder",
-            (PAGE, f"{FOLDER}/figure-07.png"),
-        )
-    ],
     "record": [
         Case(f"record {NO_ROUTER} --config settings.toml", {"config": ""}, "new.mcap", never_overwrites=True),
     ],
@@ -111,7 +92,7 @@ CASES = {
     "demo": [Case("demo", {"site": "", "process": ""}, "folder", never_overwrites=True)],
 }
 ALL = [case for cases in CASES.values() for case in cases]
-FOLDERS = ("folder", "pictures")
+FOLDERS = ("folder",)
 OF_FILES = [case for case in ALL if case.out not in FOLDERS and not case.never_overwrites]
 
 
@@ -132,7 +113,7 @@ def commands(of: typer.Typer = app, before: str = "") -> Iterator[tuple[str, Cal
 
 
 def test_every_command_with_an_output_is_tested_here_with_every_file_that_it_reads() -> None:
-    outputs = {"out", "png", "rows"}
+    outputs = {"out", "rows"}
     found = {name: paths(command) for name, command in commands() if outputs & paths(command)}
     assert {"export", "diagnose", "record"} <= found.keys()
     assert found.keys() == CASES.keys()
@@ -153,7 +134,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @pytest.fixture
 def folder(tmp_path: Path, recording: bytes, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for name in ("recordings", "report", "folder", "pictures", f"folder/{FOLDER}", "folder/other"):
+    for name in ("recordings", "report", "folder", "pictures", "folder/other"):
         (tmp_path / name).mkdir()
     record = b"time_min,qc,C,T\n0,103,0.1,440\n1,103,0.1,440\n"
     files = {

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from monitor_node.config import MonitorConfig
 from reactorwatch.cli.main import app
-from reactorwatch.cli.verification import _described_process
+from reactorwatch.cli.verification import _recorded_process
 from reactorwatch.errors import InputError
 from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.library.three_tanks.model import three_tanks
@@ -129,7 +129,7 @@ ONE_ROW = "sample,P101 flow,P102 flow,L1,L2,L3\n0,1,1,1,1,1\n1,1,1,1,1,2\n"
 
 
 @pytest.mark.parametrize(("text", "is_held"), [(CODE, False), (CODE.replace("(Clog(),)", "()"), True)])
-def test_a_recording_judged_by_code_that_is_gone_is_not_verified_without_it(
+def test_a_recording_judged_by_code_is_not_verified_by_code_that_only_it_names(
     tmp_path: Path, text: str, is_held: bool
 ) -> None:
     """Equations without effects of the user's own are in the recording; with such effects its code is needed."""
@@ -139,12 +139,11 @@ def test_a_recording_judged_by_code_that_is_gone_is_not_verified_without_it(
     arguments = ["import", str(tmp_path / "rig.csv"), "--process", str(code), "-o", str(recording), "--plant", "rig"]
     run = CliRunner().invoke(app, arguments)
     assert run.exit_code == 0, run.output
-    code.unlink()
     config = MonitorConfig(plant="rig", process=str(code))
     if is_held:
-        held = _described_process(recording, config)
+        held = _recorded_process(recording, config)
         assert held is not None
         assert fingerprint(held.require_model()) == fingerprint(replace(three_tanks(), name="code"))
     else:
-        with pytest.raises(InputError, match=r"which a recording does not hold.*put it back"):
-            _described_process(recording, config)
+        with pytest.raises(InputError, match=r"in no catalogue here.*name its file by --process"):
+            _recorded_process(recording, config)

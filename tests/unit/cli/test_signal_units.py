@@ -22,11 +22,11 @@ from reactorwatch.process import MODELS
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
 from reactorwatch.spc.charts.base import format_quantity
-from recorder.columns.process_annotations import find_model, signal_title
+from recorder.columns.run import find_model, signal_title
 from recorder.columns.run_reader import read_run
-from recorder.panels.overview import draw
-from recorder.tools.convert import import_csv
-from recorder.tools.mcap_file import read_messages, read_record
+from recorder.files.recording import read_messages
+from recorder.panels.signals import OVERVIEW
+from recorder.tools.convert import import_csv, read_record
 from recorder.tools.player import samples_of
 from tests.tables import UNITS, read_csv
 
@@ -92,7 +92,7 @@ def test_units_go_into_recordings_and_drawings_and_back(rig: Path, tmp_path: Pat
     assert read_record(tmp_path / "rig.mcap").units == {"C": "degC"}
     drawn = read_run(read_messages(tmp_path / "rig.mcap"))
     assert drawn.units == {"C": "degC"}
-    assert {(view.title, view.unit) for view in draw(drawn)[:3]} == {("C", "degC"), ("T", ""), ("qc", "")}  # type: ignore[union-attr]
+    assert {(view.title, view.unit) for view in OVERVIEW.draw(drawn)[:3]} == {("C", "degC"), ("T", ""), ("qc", "")}  # type: ignore[union-attr]
     assert find_model(drawn.units) is None
     assert find_model(UNITS) is not None
     assert signal_title("T", "K") != "T" == signal_title("T", "degC")

@@ -11,8 +11,7 @@ import reactorwatch as rw
 from reactorwatch.api.files import open_messages
 from reactorwatch.cli.main import app
 from reactorwatch.records.file_format import FileFormat
-from recorder.tools.convert import export_csv, import_csv
-from recorder.tools.mcap_file import read_record
+from recorder.tools.convert import export_csv, import_csv, read_record
 from tests.unit.records.variants import SUMMER_ENDS, VARIANTS
 
 LOCAL = VARIANTS["local time when summer time ends"]
@@ -42,6 +41,13 @@ def local(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_each_command_that_reads_a_record_takes_the_options_about_its_form(local: Path, command: list[str]) -> None:
     refused = CliRunner().invoke(app, [*command, str(local), "--time", "clock"], standalone_mode=False)
     assert "expected a column 'clock' (--time)" in f"{refused.exception} {refused.output} {refused.stderr}"
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command[0])
+def test_each_command_that_reads_a_record_takes_the_order_of_day_and_month(local: Path, command: list[str]) -> None:
+    arguments = [*command, str(local), "--dates", "us"]
+    refused = CliRunner().invoke(app, arguments, standalone_mode=False)
+    assert "unknown --dates 'us' (valid: day-first, month-first)" in str(refused.exception)
 
 
 def test_a_wrong_option_is_refused_before_the_file_is_read(local: Path) -> None:

@@ -25,9 +25,8 @@ from reactorwatch.records.record import Record
 from reactorwatch.records.write_table import write_table
 from reactorwatch.runtime.model_file import write_extended_model
 from recorder.columns.run_reader import read_run
-from recorder.tools.convert import import_csv
+from recorder.tools.convert import import_csv, read_record
 from recorder.tools.inspect import inspect
-from recorder.tools.mcap_file import read_record
 
 ROWS, ONSET_MIN = 600, 40.0
 ORIGINS = [-ONSET_MIN, -59.9, -1.0, -5000.0, 250.0]

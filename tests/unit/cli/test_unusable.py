@@ -1,5 +1,6 @@
 """Files without a usable sample, and names that mislead."""
 
+import json
 import shlex
 from pathlib import Path
 
@@ -9,8 +10,9 @@ from reactorwatch.cli.batch import expand_files
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_BAD, QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
-from recorder.message import RecordedMessage
-from recorder.tools.mcap_file import RecordingWriter, recordings_in
+from recorder import RecordedMessage
+from recorder.files.recording import recordings_in
+from recorder.files.writer import RecordingWriter
 from tests.unit.cli.test_crash import run
 
 NO_ROUTER = "--endpoint tcp/127.0.0.1:1"
@@ -37,12 +39,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("file", ["empty.csv", "bad.mcap", "nan.mcap", "huge.mcap"])
 @pytest.mark.parametrize("command", ["backtest {}", "backtest {} --json", "dashboard {} -o x.rrd"])
-def test_without_a_usable_sample_there_is_one_line_and_exit_code_2(
+def test_without_a_usable_sample_there_is_one_line_and_an_exit_code(
     folder: Path, command: str, file: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(shlex.split(command.format(file)), monkeypatch) == 2
+    is_watched, as_json = command.startswith("backtest"), command.endswith("--json")
+    assert run(shlex.split(command.format(file)), monkeypatch) == (3 if is_watched else 2)
     shown = capsys.readouterr()
-    assert (shown.out, shown.err.count("\n")) == ("", 1)
+    assert (shown.out.count("\n"), shown.err.count("\n")) == (int(as_json), 1)
+    if as_json:
+        found = json.loads(shown.out)
+        assert (found["file"], found["watched"]) == (file, False)
+        assert found["why"].startswith("holds no sample that can be used")
     assert f"{file}: holds no sample that can be used" in shown.err
     assert not (folder / "x.rrd").exists()
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.cli.main import main
-from recorder.message import RecordedMessage
-from recorder.tools.mcap_file import RecordingWriter
+from recorder import RecordedMessage
+from recorder.files.writer import RecordingWriter
 from tests.unit.recorder import golden
 
 NO_ROUTER = "--endpoint tcp/127.0.0.1:1"
@@ -95,15 +95,6 @@ def state(folder: Path) -> dict[Path, bytes]:
         ("cut nothing.mcap -o x.mcap", "holds no sample"),
         ("cut stranger.mcap -o x.mcap", "holds no sample"),
         ("cut folder -o x.mcap", "holds no recording"),
-        ("merge good.mcap", "Missing option '--out'"),
-        ("merge -o x.mcap", "Missing argument"),
-        ("merge good.mcap none.mcap -o x.mcap", "there is no such file"),
-        ("merge good.mcap cut_off.mcap -o x.mcap", "`reactorwatch recover cut_off.mcap`"),
-        ("merge good.mcap broken.mcap -o x.mcap", "`reactorwatch recover broken.mcap`"),
-        ("merge good.mcap text.mcap -o x.mcap", "got another kind of file"),
-        ("merge good.mcap stranger.mcap -o good.mcap", "is one of the files that are read"),
-        ("merge good.mcap ./good.mcap -o x.mcap", "good.mcap: is named twice"),
-        ("merge good.mcap stranger.mcap -o x.bag", "must end in .mcap"),
         ("recover none.mcap", "there is no such file"),
         ("recover no_bytes.mcap", "got an empty file"),
         ("recover text.mcap", "got another kind of file"),

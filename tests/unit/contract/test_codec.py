@@ -12,7 +12,16 @@ from hypothesis import strategies as st
 import reactorwatch.contract
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import MESSAGES, DecodeError, Publication, decode, encode, encoding_of, message_type
+from reactorwatch.contract.codec import (
+    MESSAGES,
+    DecodeError,
+    Publication,
+    decode,
+    encode,
+    encoding_of,
+    message_type,
+    read_sequence,
+)
 
 FOLDER = Path(reactorwatch.contract.__file__).parent
 
@@ -91,7 +100,6 @@ def test_what_is_published_has_its_time_as_field_one() -> None:
         "ShelveAlarm",
         "ListAlarms",
         "BaselineCommand",
-        "ReplayCommand",
     }
     for kind in MESSAGES:
         if kind.DESCRIPTOR.name not in commands:
@@ -109,7 +117,8 @@ def test_an_encoding_names_its_message_and_no_other() -> None:
     [
         (b"", "application/json", "encoding"),
         (b"", "", "encoding"),
-        (b"", "application/protobuf;reactorwatch.v2.Sample", "encoding"),
+        (b"", "application/protobuf;reactorwatch.v2.Sample", "version"),
+        (b"", "application/protobuf;reactorwatch.v1.Other", "encoding"),
         (b"\xff\xff\xff", "application/protobuf;reactorwatch.v1.Sample", "payload"),
     ],
 )
@@ -147,3 +156,21 @@ def test_a_payload_of_ten_megabytes_is_not_read() -> None:
     with pytest.raises(DecodeError, match="a payload must have at most 1048576 bytes, got 100000") as refused:
         decode(sample.SerializeToString(), encoding_of(messages.Sample))
     assert refused.value.reason == "too_large"
+
+
+@given(
+    time_ns=st.integers(-(2**63), 2**63 - 1),
+    sequence=st.integers(0, 2**64 - 1),
+    value=st.floats(),
+    quality=st.sampled_from(list(messages.Quality.values())),
+)
+def test_the_number_of_one_sample_is_read_from_its_bytes(
+    time_ns: int, sequence: int, value: float, quality: messages.Quality
+) -> None:
+    sample = messages.Sample(time_ns=time_ns, sequence=sequence, value=value, quality=quality, unit="K")
+    assert read_sequence(sample.SerializeToString()) == sequence
+
+
+@given(st.binary(max_size=40))
+def test_any_other_bytes_have_a_number_or_none(data: bytes) -> None:
+    assert read_sequence(data) >= 0

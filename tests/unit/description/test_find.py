@@ -109,7 +109,7 @@ def test_a_python_file_is_run_because_it_was_named(tmp_path: Path) -> None:
     ("code", "text"),
     [
         ("def process(): return 3", r"process\(\): must return a reactorwatch Process, got int"),
-        ("x = 1", r"it must have a function process\(\) that returns a Process"),
+        ("x = 1", r"^process file .*: it must have a function process\(\) that returns a Process"),
         ("def process(): return 1 / 0", "ZeroDivisionError: division by zero"),
         ("def process(:", "SyntaxError"),
         ("import no_such_package", "ModuleNotFoundError: No module named 'no_such_package'"),

@@ -36,7 +36,7 @@ def test_a_lasting_cause_is_fitted_together_with_the_uncertain_constants() -> No
 def searched(rig: Rig, effect: Effect, profile: type[FittedProfile]) -> tuple[Search, SearchResult]:
     """A search whose best hypothesis is one effect that drifts or steps."""
     run = make_run(record_of(rig, seed=4, rows=700), tanks())
-    search = Search(tanks(), (OVERFLOW, BIAS, PUMP), run, smallest_noise(tanks()))
+    search = Search(tanks(), (OVERFLOW, BIAS, PUMP), run, smallest_noise(tanks(), run.measured))
     made = PiecewiseLinear(run.time_min, 12) if profile is PiecewiseLinear else Step(run.time_min)
     start = np.zeros(12) if profile is PiecewiseLinear else np.array([0.05, rig.onset_min])
     hypothesis = Hypothesis(search.filter((effect,)), (made,))

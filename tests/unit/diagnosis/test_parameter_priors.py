@@ -106,6 +106,14 @@ def test_tolerances_are_shares_or_numbers_with_the_unit_of_the_parameter() -> No
     assert parse_priors("K3=2%, Tf = 0.5K,V=1.5e0 l", cstr()) == pytest.approx({"K3": 14.0, "Tf": 0.5, "V": 1.5})
 
 
+def test_a_share_of_a_temperature_in_celsius_is_refused() -> None:
+    room = replace(cstr().parameter("Tf"), unit="degC", value=21.0, lower=0.0, upper=50.0)
+    model = replace(cstr(), parameters=tuple(room if item.name == "Tf" else item for item in cstr().parameters))
+    assert parse_priors("Tf=0.5 degC", model) == {"Tf": 0.5}
+    with pytest.raises(InputError, match="must be in degC, of which a share is no size, got '2%'"):
+        parse_priors("Tf=2%", model)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -12,7 +12,6 @@ from reactorwatch.identification.black_box.filter import (
     BINS,
     FLAGS,
     BlackBoxFilter,
-    BlackBoxState,
     constants_of,
     filter_row,
 )
@@ -20,6 +19,7 @@ from reactorwatch.identification.black_box.fit import MOST_PARAMETERS, fit_black
 from reactorwatch.identification.black_box.model import BlackBoxModel
 from reactorwatch.identification.black_box.prediction_error import NEXT, START, prediction_errors
 from reactorwatch.identification.black_box.state_map import Shape, lagged_inputs
+from reactorwatch.stored_state import copy_of
 
 NOISE_SD = np.array([0.1, 0.2])
 TRAINING = 500
@@ -203,12 +203,10 @@ def test_a_filter_resumes_bit_for_bit_also_between_its_first_rows() -> None:
     first.run(inputs, outputs, following(TRAINING))
     first.restart()
     for k in range(60):
-        second = BlackBoxFilter(model)
-        second.limit_sd = first.limit_sd
-        second.state = BlackBoxState.from_bytes(first.state.to_bytes())
+        second = BlackBoxFilter(model, copy_of(first.memory))
         row = inputs[k].tolist(), outputs[k].tolist(), [6.0, 6.0]
         assert second.update(*row) == first.update(*row)
-        assert second.state == first.state
+        assert second.memory.to_bytes() == first.memory.to_bytes()
 
 
 def test_a_missing_value_corrects_nothing_and_a_missing_input_starts_again() -> None:

@@ -9,8 +9,6 @@ import pytest
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import Identification
 from reactorwatch.identification.linear_model import fit_percent
-from reactorwatch.identification.report_scheme import fit_least_squares
-from reactorwatch.identification.structure import Structure
 from tests.unit.identification.truth import Daisy, NoisyPlant, identify
 
 
@@ -48,15 +46,14 @@ def told_parameters(told: Identification) -> list[float]:
     return [*told.a, *told.b, told.offset]
 
 
-@pytest.mark.parametrize("model", ["arx", "oe"])
-def test_row_by_row_it_finds_what_it_finds_at_once(noisy_plant: NoisyPlant, model: str) -> None:
-    """ARX to 1e-9; output error within one standard deviation of the batch minimum."""
+def test_row_by_row_it_finds_what_it_finds_at_once(noisy_plant: NoisyPlant) -> None:
+    """To 1e-9 of a standard deviation."""
     time = np.arange(4000.0)
-    batch = identify(time, noisy_plant.inputs, noisy_plant.measured, model=model, order=2)
-    recursive = identify(time, noisy_plant.inputs, noisy_plant.measured, model=model, order=2, recursive=True)
+    batch = identify(time, noisy_plant.inputs, noisy_plant.measured, order=2)
+    recursive = identify(time, noisy_plant.inputs, noisy_plant.measured, order=2, recursive=True)
     deviations = np.array([*batch.sd.a, *batch.sd.b, batch.sd.offset])
     difference = np.abs(np.subtract(told_parameters(recursive), told_parameters(batch)))
-    assert np.all(difference < deviations * (1.0 if model == "oe" else 1e-9))
+    assert np.all(difference < deviations * 1e-9)
     assert recursive.recursive
     assert not batch.recursive
 
@@ -77,19 +74,8 @@ def test_gaps_and_missing_rows_are_left_out_where_that_is_asked_for(noisy_plant:
     for recursive in (False, True):
         told = identify(time, u, y, order=2, missing="leave out", recursive=recursive)
         np.testing.assert_allclose(told_parameters(told), noisy_plant.parameters, atol=1e-8)
-    running = identify(time, u, y, model="oe", order=2, missing="leave out", recursive=True)
-    np.testing.assert_allclose(told_parameters(running), noisy_plant.parameters, atol=1e-3)
-
-
-def test_the_report_s_scheme_is_chosen_by_name(daisy: Daisy) -> None:
-    told = identify(daisy.time, daisy.qc, daisy.T, order=2, scheme="report")
-    model = fit_least_squares(Structure.of_order(2), daisy.qc[:3750], daisy.T[:3750])
-    np.testing.assert_allclose(told_parameters(told), model.parameters, rtol=1e-12)
-    for form in ({"model": "armax"}, {"recursive": True}):
-        with pytest.raises(InputError, match="scheme report fits arx and oe, and no recursive model, got"):
-            identify(daisy.time, daisy.qc, daisy.T, scheme="report", **form)
-    with pytest.raises(InputError, match=r"unknown scheme 'best' \(valid: least-squares, report\)"):
-        identify(daisy.time, daisy.qc, daisy.T, scheme="best")
+    batch = identify(time, u, y, model="oe", order=2, missing="leave out")
+    np.testing.assert_allclose(told_parameters(batch), noisy_plant.parameters, atol=1e-3)
 
 
 def test_a_record_that_determines_nothing_is_refused_with_the_cause(noisy_plant: NoisyPlant) -> None:

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from reactorwatch.identification.recursion import RlsState
-from reactorwatch.identification.rls import RecursiveLeastSquares
-from reactorwatch.identification.rls_bank import RecursiveLeastSquaresBank
+from reactorwatch.identification.rls import RecursiveLeastSquares, RlsMemory
 from tests.unit.identification.truth import Array, exact_least_squares
 
 EPSILON = np.finfo(np.float64).eps
@@ -171,15 +169,18 @@ def test_standard_deviations_are_the_scatter_of_many_plants(forgetting: float) -
     rng = np.random.default_rng(11)
     plants, n, rows = 4000, 4, 300
     truth = np.array([1.0, -0.5, 2.0, 0.3])
-    bank = RecursiveLeastSquaresBank(plants, n, forgetting)
+    found = [RecursiveLeastSquares(n, forgetting) for _ in range(plants)]
     for _ in range(rows):
         regressors = rng.standard_normal((plants, n)) * [1.0, 0.3, 2.0, 1.0]
-        said = bank.update(regressors, regressors @ truth + 0.2 * rng.standard_normal(plants))
-    observed = np.std(bank.parameters, axis=0)
-    reported = np.sqrt(np.mean([bank.plant(i).standard_deviations ** 2 for i in range(0, plants, 20)], axis=0))
+        outputs = regressors @ truth + 0.2 * rng.standard_normal(plants)
+        last = [rls.update(*row) for rls, *row in zip(found, regressors, outputs.tolist(), strict=True)]
+    parameters = np.array([rls.parameters for rls in found])
+    observed = np.std(parameters, axis=0)
+    reported = np.sqrt(np.mean([rls.standard_deviations**2 for rls in found[::20]], axis=0))
     np.testing.assert_allclose(reported, observed, rtol=0.05)
-    np.testing.assert_allclose(np.mean(bank.parameters, axis=0), truth, atol=4 * observed.max() / np.sqrt(plants))
-    assert np.std(said.residual) == pytest.approx(np.sqrt(np.mean(said.residual_sd**2)), rel=0.05)
+    np.testing.assert_allclose(np.mean(parameters, axis=0), truth, atol=4 * observed.max() / np.sqrt(plants))
+    residuals, deviations = np.transpose([(update.residual, update.residual_sd) for update in last])
+    assert np.std(residuals) == pytest.approx(np.sqrt(np.mean(deviations**2)), rel=0.05)
 
 
 def test_the_prediction_is_made_before_the_row_is_used() -> None:
@@ -197,14 +198,14 @@ def test_the_prediction_is_made_before_the_row_is_used() -> None:
 def test_a_value_that_is_no_measurement_is_refused_and_harms_nothing(bad: float) -> None:
     rng = np.random.default_rng(13)
     rls = learn(rng.standard_normal((20, 3)), rng.standard_normal(20), forgetting=0.9)
-    before = rls.state
+    before = rls.memory.to_bytes()
     with pytest.raises(ValueError, match=r"regressor\[1\] must be a finite number"):
         rls.update([1.0, bad, 1.0], 1.0)
     with pytest.raises(ValueError, match="output must be a finite number"):
         rls.update([1.0, 1.0, 1.0], bad)
     with pytest.raises(ValueError, match="regressor must have shape"):
         rls.update([1.0, 1.0], 1.0)
-    assert rls.state == before
+    assert rls.memory.to_bytes() == before
 
 
 @pytest.mark.parametrize("forgetting", [0.95, 1.0])
@@ -220,76 +221,17 @@ def test_moving_the_parameters_keeps_their_covariance(forgetting: float) -> None
         rls.raise_forgetting(0.5)
 
 
-@pytest.mark.parametrize("forgetting", [1.0, 0.97])
-@pytest.mark.parametrize("plants", [1, 63, 64, 65, 130])
-def test_many_plants_in_one_call_have_the_bits_of_each_alone(plants: int, forgetting: float) -> None:
-    """Also when some plants have no row: those stay as they are."""
-    rng = np.random.default_rng(15)
-    n, rows = 7, 40
-    regressors = rng.standard_normal((rows, plants, n)) * rng.choice([0.0, 1e-9, 1.0, 1e6], (rows, plants, 1))
-    outputs = rng.standard_normal((rows, plants))
-    present = rng.random((rows, plants)) < 0.8
-    regressors[~present] = np.nan
-    bank = RecursiveLeastSquaresBank(plants, n, forgetting)
-    alone = [RecursiveLeastSquares(n, forgetting) for _ in range(plants)]
-    for k in range(rows):
-        together = bank.update(regressors[k], outputs[k], present[k])
-        for i, rls in enumerate(alone):
-            if present[k, i]:
-                said = rls.update(regressors[k, i], outputs[k, i])
-                assert (said.prediction, said.residual, said.residual_sd, said.leverage) == tuple(
-                    values[i] for values in together
-                )
-            else:
-                assert all(np.isnan(values[i]) for values in together)
-    for i, rls in enumerate(alone):
-        assert bank.plant(i).state == rls.state
-    with pytest.raises(IndexError, match="plant must be in"):
-        bank.plant(plants)
-
-
-def test_a_bad_row_of_one_plant_is_named_and_harms_no_plant() -> None:
-    bank = RecursiveLeastSquaresBank(70, 2)
-    regressors, outputs = np.ones((70, 2)), np.ones(70)
-    bank.update(regressors, outputs)
-    before = bank.state
-    regressors[66, 1] = np.nan
-    with pytest.raises(ValueError, match=r"plant 66: regressor\[1\]"):
-        bank.update(regressors, outputs)
-    with pytest.raises(ValueError, match="must have the shapes"):
-        bank.update(regressors[:69], outputs)
-    with pytest.raises(ValueError, match="present must be"):
-        bank.update(regressors, outputs, np.ones(3, dtype=np.bool_))
-    assert bank.state == before
-
-
-def test_a_stored_bank_goes_on_with_the_same_bits() -> None:
-    rng = np.random.default_rng(16)
-    bank = RecursiveLeastSquaresBank(100, 3, 0.95)
-    for _ in range(10):
-        bank.update(rng.standard_normal((100, 3)), rng.standard_normal(100))
-    resumed = RecursiveLeastSquaresBank.from_state(RlsState.from_bytes(bank.state.to_bytes()))
-    regressors, outputs = rng.standard_normal((100, 3)), rng.standard_normal(100)
-    for a, b in zip(bank.update(regressors, outputs), resumed.update(regressors, outputs), strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert resumed.state == bank.state
-
-
 def test_settings_out_of_range_are_named() -> None:
     with pytest.raises(ValueError, match=r"forgetting must be in \(0, 1\], got 1.2"):
         RecursiveLeastSquares(3, forgetting=1.2)
     with pytest.raises(ValueError, match="parameters must be at least 1, got 0"):
         RecursiveLeastSquares(0)
-    with pytest.raises(ValueError, match="plants must be at least 1, got 0"):
-        RecursiveLeastSquaresBank(0, 3)
     with pytest.raises(ValueError, match="covariance_limit must be below"):
         RecursiveLeastSquares(3, 0.99, covariance_limit=np.inf)
     with pytest.raises(ValueError, match="covariance_limit must be above"):
         RecursiveLeastSquares(3, covariance_limit=0.0)
     with pytest.raises(ValueError, match="parameters must be 3 finite numbers"):
         RecursiveLeastSquares(3).set_parameters([1.0, np.nan, 0.0])
-    damaged = RlsState(1, 3, 1.0, np.inf, b"\0" * 8)
-    with pytest.raises(ValueError, match="state memory of 1 plants with 3 parameters must have"):
-        RecursiveLeastSquares.from_state(damaged)
-    with pytest.raises(ValueError, match="use RecursiveLeastSquaresBank"):
-        RecursiveLeastSquares.from_state(RecursiveLeastSquaresBank(2, 3).state)
+    damaged = RlsMemory(3, 1.0, np.inf, np.zeros(1))
+    with pytest.raises(ValueError, match="3 parameters must have"):
+        RecursiveLeastSquares.resume(damaged)

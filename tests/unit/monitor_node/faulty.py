@@ -3,7 +3,7 @@
 from math import inf
 from typing import Any
 
-from monitor_node.isolation.window import Row
+from monitor_node.causes.window import Row
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.kalman.ekf import NoiseLevels

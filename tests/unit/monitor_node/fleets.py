@@ -1,15 +1,14 @@
 """Fleets that a test makes: plants, monitors, and what each plant's own monitor would have said."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.callbacks import Callbacks
-from monitor_node.fleet.monitor import FleetMonitor
-from monitor_node.fleet.sharding import WHOLE, Shard, ShardGroup
+from monitor_node.fleet.config import WHOLE, Shard
+from monitor_node.fleet.monitor import ANY, FleetMonitor, PlantKind
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Health
@@ -38,15 +37,15 @@ def row_by_row(runs: Iterable[list[Encoded]]) -> list[Encoded]:
     return [message for each in rows for row in each for message in row]
 
 
-def fleet(config: MonitorConfig = QUICK, shard: Shard = WHOLE, name: str = "a", **callbacks: Any) -> FleetMonitor:
+def fleet(config: MonitorConfig = QUICK, shard: Shard = WHOLE, **callbacks: Any) -> FleetMonitor:
     """A monitor of all plants, or of a shard."""
-    return FleetMonitor(config, 0, ShardGroup(PLANTS, shard, name), Callbacks(**callbacks))
+    return FleetMonitor([PlantKind(ANY, config, None)], 0, shard, **callbacks)
 
 
 def stage_by_stage(config: MonitorConfig, plant: str = "x", *, points: bool = False) -> Monitor:
     """Monitor whose rows all pass the stages one by one, as events do."""
     monitor = Monitor(msgspec.structs.replace(config, plant=plant), 0, points=points)
-    monitor.pipeline.evaluation.find_normal = lambda *_: False  # type: ignore[method-assign]
+    monitor.pipeline.evaluation.find_ordinary = lambda *_: False  # type: ignore[method-assign]
     return monitor
 
 
@@ -65,18 +64,3 @@ def of(plant: str, said: Iterable[Publication]) -> list[Publication]:
 def alarms(said: list[Publication]) -> list[tuple[str, str, int]]:
     """Key, event and time of each alarm."""
     return [(i.key, i.message.event, i.message.time_ns) for i in said if isinstance(i.message, Alarm)]
-
-
-def noting(asked: list[tuple[str, bool]]) -> Callable[[str, bool], bool]:
-    """Notes whose past is asked for, and promises that it will be told."""
-
-    def request_history(plant: str, taken_over: bool) -> bool:
-        asked.append((plant, taken_over))
-        return True
-
-    return request_history
-
-
-def shard_token(number: int) -> str:
-    """Of one of two monitors that share a fleet."""
-    return ShardGroup(PLANTS, Shard(number, 2), str(number)).token

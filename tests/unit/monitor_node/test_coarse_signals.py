@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from monitor_node.baseline.outlier_blocks import screen_baseline
-from monitor_node.baseline.resolution import resolution
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from monitor_node.learn.training_rows import screen_baseline
+from reactorwatch.kalman.resolution import resolution
 
 from .samples import Rows
 from .test_many_outputs import config_of, plant, raised, watch
@@ -78,7 +78,10 @@ def test_an_output_that_never_moves_is_left_out_with_the_reason_and_the_others_a
     values[2, 500:] += 3.0
     values[1, 550:] += 3.0
     names = raised(watch(monitor, values))
-    assert monitor.excluded_signals == {"y0": "it reads 4.25 in the whole training; smallest_sd or resolution may help"}
+    why = (
+        "it reads 4.25 in the whole training; train on rows in which it changes, or state its smallest_sd or resolution"
+    )
+    assert monitor.excluded_signals == {"y0": why}
     assert "shewhart/y1" in names
     assert not any(name.endswith("/y0") for name in names)
 

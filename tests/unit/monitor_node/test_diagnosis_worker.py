@@ -2,26 +2,26 @@
 
 import errno
 import time
+from array import array
 from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
 import pytest
 
 from monitor_node.__main__ import MonitorNode
-from monitor_node.baseline.process_reference import ProcessReference
-from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, read_equations
-from monitor_node.baseline.training_rows import TrainingState
 from monitor_node.diagnosis_worker import DiagnosisWorker, PlantFinding
+from monitor_node.learn.process_reference import ProcessReference
+from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, read_equations
+from monitor_node.learn.training_rows import TrainingRows
 from reactorwatch.contract.codec import Publication
 from reactorwatch.diagnosis.result import NAMED
 from reactorwatch.runtime.parallel.jobs import SerialExecutor
-from reactorwatch.stored_state import pack_numbers, pack_times
 
 from ...running import WITHIN_S
 from .warm_plant import CONFIG, LATE, TRAINED, Run, changes
 
 SHORT = DiagnosisJob(
-    TrainingState(pack_times([7, 8]), pack_numbers([[1.0] * 3] * 2), [2, 2]),
+    TrainingRows([2, 2], array("q", [7, 8]), array("d", [1.0] * 6)),
     ("qc", "C", "T"),
     '{"format": "reactorwatch.model.v1", "model": "cstr"}',
 )

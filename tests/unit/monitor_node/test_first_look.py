@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 
 from monitor_node import __main__ as monitor_main
+from monitor_node.causes import stage
+from monitor_node.causes.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
+from monitor_node.causes.window import MOST_PIECES, Row, newest_rows
+from monitor_node.charts import drift
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet import node as fleet_node
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.isolation import stage
-from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
-from monitor_node.isolation.window import MOST_PIECES, Row, newest_rows
-from monitor_node.stages import drift
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.codegen.array_function import ArrayFunction
@@ -125,9 +125,9 @@ def test_an_error_in_what_is_prepared_is_left_to_the_first_look(monkeypatch: pyt
     def fail(_: object) -> None:
         raise RuntimeError("made on purpose")
 
-    monkeypatch.setattr("monitor_node.isolation.fit.Fitter._prepare", fail)
+    monkeypatch.setattr("monitor_node.causes.fit.Fitter._prepare", fail)
     assert len(list(stage.preparation(CONFIG, cstr()))) == 2
-    monkeypatch.setattr("monitor_node.isolation.isolation.GlrScan", fail)
+    monkeypatch.setattr("monitor_node.causes.isolation.GlrScan", fail)
     assert list(stage.preparation(CONFIG, cstr())) == []
     monitor = Monitor(CONFIG, 0, points=False)
     for message in samples(*leaking_run(-0.2, 18.0, 20.0, seed=3)):

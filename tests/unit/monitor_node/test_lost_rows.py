@@ -8,12 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor_node.baseline.process_reference import ProcessReference, input_reach
+from monitor_node.causes.isolation import UNKNOWN, Isolation
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.ingest.sampling import missing_rows
-from monitor_node.isolation.isolation import Isolation
-from monitor_node.isolation.suspect import UNKNOWN
+from monitor_node.learn.process_reference import ProcessMemory, ProcessReference, input_reach
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.kalman.ekf import Filter
@@ -183,7 +182,7 @@ def test_where_nothing_is_lost_no_prediction_is_any_less_certain(
 
 def reference_with_rows(held: float = 100.0) -> ProcessReference:
     """A reference that has settled, with an input that is held."""
-    reference = ProcessReference(cstr(), ("C", "T"), SENSORS)
+    reference = ProcessReference(cstr(), ("C", "T"), ProcessMemory(SENSORS))
     for row in range(50):
         reference.update(row * 6 * 10**9, [held], [0.097, 439.0], (True, True))
     return reference

@@ -13,7 +13,7 @@ from monitor_node.replay import backtest
 from monitor_node.replay.verification import verify
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Quality, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Incident, Quality, Sample
 from reactorwatch.process import EFFECTS_OF
 from reactorwatch.process.library.three_tanks.model import three_tanks
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
@@ -206,7 +206,7 @@ def test_equations_with_two_inputs_judge_a_plant_in_closed_loop(missing: float) 
     plant.values[np.random.default_rng(1).random(plant.values.shape) < missing] = np.nan
     config, messages, model = plant.config(diagnose_training=False), plant.messages(), three_tanks()
     monitor, staged = (Monitor(config, START_NS, model=model) for _ in range(2))
-    staged.pipeline.evaluation.find_normal = lambda *_: False  # type: ignore[method-assign]
+    staged.pipeline.evaluation.find_ordinary = lambda *_: False  # type: ignore[method-assign]
     published = [live(monitor, [message]) for message in messages]
     assert monitor.pipeline.reference == "equations"
     assert [live(staged, [message]) for message in messages] == published
@@ -258,7 +258,8 @@ def test_the_cause_of_an_alarm_is_sought_among_the_effects_of_a_process_with_two
     resumed.on_history_end()
     told = live(monitor, messages[last:])
     assert live(resumed, messages[last:]) == told
-    suspects = [item.message.suspects[0] for item in told if isinstance(item.message, Alarm) and item.message.suspects]
+    incidents = [item.message for item in told if isinstance(item.message, Incident)]
+    suspects = [incident.suspects[0] for incident in incidents if incident.suspects]
     assert suspects[-1].cause == cause
     assert suspects[-1].kind == kind
     assert suspects[-1].size == pytest.approx(size, rel=0.3)

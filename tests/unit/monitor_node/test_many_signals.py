@@ -9,7 +9,7 @@ import pytest
 from monitor_node.config import CHARTS_OF_DOZENS, CHARTS_OF_MANY, DOZENS, USUAL_CHARTS, DefaultCharts, MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.contract.messages_pb2 import Alarm, Incident
 
 from .samples import Rows
 from .test_many_outputs import watch
@@ -82,7 +82,7 @@ def test_the_alarm_names_the_signal_at_which_the_disturbance_enters(faulty: int)
     assert alarm.text.startswith(f"the disturbance enters at y{faulty}: ")
     assert alarm.contributions[0].signal == f"y{faulty}"
     assert sum(item.share for item in alarm.contributions) == pytest.approx(1.0)
-    suspected = [item.message for item in said if isinstance(item.message, Alarm) and item.message.event == "suspected"]
+    suspected = [item.message for item in said if isinstance(item.message, Incident)]
     assert suspected[-1].suspects[0].cause == f"y{faulty}"
     assert len(suspected[-1].suspects) == 3
 

@@ -92,8 +92,7 @@ def test_a_fleet_s_monitor_holds_as_many_objects_after_each_round(rows: list[lis
         node.on_messages([*known, *strange, *made_up], row * 10**9)
         node.on_tick(row * 10**9)
         if row >= TRAINING_ROWS and (row - TRAINING_ROWS) % ROUND == ROUND - 1:
-            node.rejoin("b", row * 10**9)
-            list(node.watched.reports(row * 10**9))
+            list(node.reports(row * 10**9))
             counts.append(objects())
     assert growth(counts[1], counts[-1]) == {}
 

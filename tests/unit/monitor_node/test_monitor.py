@@ -253,7 +253,7 @@ def garbage() -> list[tuple[str, Encoded]]:
         ("out_of_range", sample("T", 5000, 1.5e8, 440.0)),
         ("too_large", good._replace(payload=b"\x22" * 10_000_000)),
         ("encoding", good._replace(encoding="application/json")),
-        ("encoding", good._replace(encoding="application/protobuf;reactorwatch.v2.Sample")),
+        ("version", good._replace(encoding="application/protobuf;reactorwatch.v2.Sample")),
         ("encoding", encode(Publication(key, Health(time_ns=1)))),
         ("unknown_signal", good._replace(key=keys.key(PLANT, keys.SAMPLE, "pH"))),
         ("unknown_signal", good._replace(key="reactor/cstr/sample")),

@@ -85,6 +85,6 @@ def test_rows_are_lined_up_alike_wherever_time_begins(zero_ns: int) -> None:
             for signal, number, time_ns in samples()
             for row in aligner.update(signal, origin_ns + time_ns, number, 1.0)
         ]
-        return found, aligner.state.counts
+        return found, aligner.memory.counts
 
     assert rows(zero_ns) == rows(0)

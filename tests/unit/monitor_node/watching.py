@@ -7,7 +7,7 @@ import numpy as np
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Alarm, ChartPoint
+from reactorwatch.contract.messages_pb2 import Alarm, ChartPoint, Incident, Suspect
 from reactorwatch.records.record import to_time_ns
 
 from .samples import Rows, leaking_run, samples
@@ -24,6 +24,19 @@ class Watched:
     def alarms(self) -> list[Alarm]:
         """Every change of an alarm."""
         return [item.message for item in self.said if isinstance(item.message, Alarm)]
+
+    @property
+    def suspected(self) -> list[Incident]:
+        """Every incident as it was published with other suspects than before."""
+        newest: dict[int, list[Suspect]] = {}
+        found = []
+        for item in self.said:
+            incident = item.message
+            if isinstance(incident, Incident) and incident.suspects:
+                if list(incident.suspects) != newest.get(incident.number):
+                    found.append(incident)
+                newest[incident.number] = list(incident.suspects)
+        return found
 
     @property
     def raised(self) -> list[tuple[str, float]]:
@@ -51,7 +64,7 @@ def watched(
     """
     run = Watched(Monitor(config or MonitorConfig(isolation=False), 0))
     if not compiled:
-        run.monitor.pipeline.evaluation.find_normal = lambda *_: False  # type: ignore[method-assign]
+        run.monitor.pipeline.evaluation.find_ordinary = lambda *_: False  # type: ignore[method-assign]
     for message in samples(time_min, columns):
         run.said += run.monitor.on_message(message, 0)
     run.said += run.monitor.finish()

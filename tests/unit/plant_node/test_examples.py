@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reactorwatch as rw
-from plant_node.examples import EXAMPLES, make_example
+from plant_node.record import EXAMPLES, make_example
 from reactorwatch.errors import InputError
 from reactorwatch.process import OPERATIONS
 from reactorwatch.process.library.cstr.examples import BOILING_FROM_K

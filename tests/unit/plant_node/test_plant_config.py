@@ -8,8 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from plant_node.config import PlantConfig
-from plant_node.process_settings import ProcessSettings, fit_settings
+from plant_node.config import PlantConfig, ProcessSettings, fit_settings
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.controllers import LevelControl, TemperatureControl

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from plant_node.actuators import Actuator
-from plant_node.noise import BLOCK
-from plant_node.sensors import Sensor
+from plant_node.instruments import BLOCK, Actuator, Sensor
 
 ROWS = 20_000
 

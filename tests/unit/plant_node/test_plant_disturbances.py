@@ -10,7 +10,7 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 from scipy.stats import chi2, kstest
 
 from plant_node.config import PlantConfig
-from plant_node.disturbances import ProcessNoise
+from plant_node.instruments import ProcessNoise
 from plant_node.record import plant_from, simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError

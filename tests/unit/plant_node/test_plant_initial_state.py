@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from plant_node.config import PlantConfig
-from plant_node.initial_state import complete_state, start_state
 from plant_node.record import plant_from
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import Effect
@@ -16,6 +15,7 @@ from reactorwatch.process.fault import FaultSpecification
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel, variable
 from reactorwatch.process.profiles import CONSTANT
+from reactorwatch.process.steady_state import complete_state, start_state
 
 
 class Thermowell(Effect):

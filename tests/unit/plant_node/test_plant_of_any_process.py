@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plant_node.config import PlantConfig
+from plant_node.config import PlantConfig, fit_settings
 from plant_node.core import Plant
 from plant_node.node import PlantNode
-from plant_node.process_settings import fit_settings
 from plant_node.record import plant_from, simulate_record
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode_message

@@ -7,8 +7,7 @@ import pytest
 from msgspec.structs import asdict
 from typer.main import get_command
 
-from plant_node.config import PlantConfig
-from plant_node.process_settings import fit_settings
+from plant_node.config import PlantConfig, fit_settings
 from plant_node.record import simulate_record
 from reactorwatch.cli.main import app
 from reactorwatch.description.find import find_process

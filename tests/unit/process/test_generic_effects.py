@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from reactorwatch.process import EFFECTS_OF, MODELS, effects_of, named_effects
 from reactorwatch.process.effect import Effect
@@ -13,7 +15,8 @@ from reactorwatch.process.effect_twins import EffectChanges, add_generic, are_tw
 from reactorwatch.process.generic_effects import generic_effects, reference_point
 from reactorwatch.process.library.cstr.effects.temperature_bias import TemperatureBias
 from reactorwatch.process.library.three_tanks.model import three_tanks
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
+from reactorwatch.units import conversion
 from tests.unit.diagnosis.linear_tank import tank
 
 of_every_model = pytest.mark.parametrize("make", [*MODELS, tank], ids=lambda make: str(make.__name__))
@@ -131,3 +134,60 @@ def test_what_an_exchange_takes_from_one_tank_the_other_gets() -> None:
     x, u = reference_point(model)
     before, after = (np.array(item.function()(x, u, item.values(), 0.0, 0.0)[0]).ravel() for item in (model, extended))
     np.testing.assert_allclose(after - before, [0.7, 0.0, -0.7], atol=1e-9)
+
+
+def heated(unit: str, value: float, bounds: tuple[float, float]) -> ProcessModel:
+    """A body in a room whose temperature is a parameter in this unit; the heat loss is in K."""
+    scale, offset = conversion(unit, "K", "Ta")
+    T, P = variable("T", "K", (200.0, 500.0), 10.0, "body"), variable("P", "W", (0.0, 100.0), 20.0, "heater")
+    Ta = parameter("Ta", value, unit, bounds, "room")
+    rate = 0.1 * P.symbol - 0.2 * (T.symbol - (scale * Ta.symbol + offset))
+    return ProcessModel("body", (T,), (P,), (Ta,), (rate,), (Output("T", "K", T.symbol),), new_clock())
+
+
+@pytest.mark.parametrize(("unit", "per_K"), [("degC", 1.0), ("°C", 1.0), ("C", 1.0), ("degF", 1.8), ("°F", 1.8)])
+@given(room_K=st.floats(250.0, 330.0), share=st.floats(0.01, 0.99))
+def test_a_parameter_whose_unit_has_a_zero_of_its_own_deviates_by_a_difference(
+    unit: str, per_K: float, room_K: float, share: float
+) -> None:
+    scale, offset = conversion(unit, "K", "Ta")
+    lower, value, upper = ((of - offset) / scale for of in (room_K - 40.0, room_K, room_K + 60.0))
+    model, in_K = heated(unit, value, (lower, upper)), heated("K", room_K, (room_K - 40.0, room_K + 60.0))
+    (effect,) = (item for item in generic_effects(model) if item.name == "Ta.deviation")
+    (of_K,) = (item for item in generic_effects(in_K) if item.name == "Ta.deviation")
+    assert effect.unit == unit
+    assert (effect.lower, effect.upper) == pytest.approx((-40.0 * per_K, 60.0 * per_K))
+    assert effect.typical == pytest.approx(per_K * of_K.typical * room_K)
+    assert effect.describe(2.0) == f"Ta higher by 2 {unit}"
+    size = effect.lower + share * (effect.upper - effect.lower)
+    x, u = reference_point(model)
+    rates = []
+    for item, made, of in ((effect, model, size), (of_K, in_K, size / per_K / room_K)):
+        extended = item.extend(made)
+        p = extended.values({"Ta.deviation.size": of})
+        rates.append(float(extended.function()(x, u, p, 0.0, 0.0)[0]))
+    assert rates[0] == pytest.approx(rates[1], rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("unit", ["K", "degC/min", "1/degC", "W", "1", "deg", "coulomb"])
+def test_a_parameter_of_another_unit_deviates_by_a_share(unit: str) -> None:
+    kelvin = heated("K", 300.0, (250.0, 400.0))
+    room = replace(kelvin.parameters[0], unit=unit)
+    (effect,) = (item for item in generic_effects(replace(kelvin, parameters=(room,))) if item.name == "Ta.deviation")
+    assert effect.unit == "1"
+    assert effect.describe(0.01) == "Ta higher by 1 %"
+
+
+def test_a_size_in_per_cent_of_a_signal_is_described_as_it_is_and_a_share_in_per_cent() -> None:
+    valve = variable("v", "%", (0.0, 100.0), 30.0, "valve")
+    level = variable("h", "%", (0.0, 100.0), 10.0, "level")
+    bias, leak = (parameter(name, value, "%", (-50.0, 50.0), name) for name, value in (("zero", 0.0), ("leak", 2.0)))
+    rate = 0.1 * (valve.symbol + bias.symbol) - 0.2 * (level.symbol + leak.symbol)
+    model = ProcessModel(
+        "tank", (level,), (valve,), (bias, leak), (rate,), (Output("h", "%", level.symbol),), new_clock()
+    )
+    described = {item.name: item.describe(1.5) for item in generic_effects(model)}
+    for name in ("v.offset", "v.stiction", "h.bias", "h.noise", "zero.deviation", "h.source"):
+        assert " 1.5 %" in f" {described[name]}", described[name]
+    for name in ("v.gain", "h.gain", "h.stuck", "leak.deviation"):
+        assert " 150 %" in f" {described[name]}", described[name]

@@ -13,8 +13,8 @@ from reactorwatch.process import MODELS
 from reactorwatch.process.extended_model import extended_model_of, parse_extended_model
 from reactorwatch.process.law import APART, FORMS, LAG, ExtendedLaw, Form
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.places import Place, correct, places_of, unit_of, variable_expression
+from reactorwatch.process.model import Place, ProcessModel
+from reactorwatch.process.places import correct, places_of, unit_of, variable_expression
 from reactorwatch.process.simulate import Simulator
 
 LOSS = ExtendedLaw("energy balance", "power", ("T",), (440.0,), {"a": -0.9, "n": 4.0}, {"T": (425.0, 452.0)})

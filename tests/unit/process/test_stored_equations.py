@@ -105,7 +105,7 @@ def damaged(**changes: Any) -> str:
         ({"steps": [["add", 0]]}, "step 0 must have indices of what it acts on, got ['add', 0]"),
         ({"steps": [["neg", -1]]}, "step 0 must have indices"),
         ({"results": [0]}, "results must be"),
-        ({"states": []}, "results must be"),
+        ({"states": []}, "equations must have at least one state, got none"),
         ({"colour": 1}, "unknown field `colour`"),
     ],
 )

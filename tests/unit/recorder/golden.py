@@ -14,7 +14,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication, encode
 from reactorwatch.records.record import to_time_ns
-from recorder.message import RecordedMessage
+from recorder import RecordedMessage
 from tests.tables import UNITS
 
 PLANT = "cstr"

@@ -8,11 +8,11 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Health
 from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
-from recorder.files import RecordingFiles
+from recorder.files.ages import BootClock
+from recorder.files.part_file import PartFile
+from recorder.files.writer import part_of
 from recorder.node import RecorderNode
-from recorder.storage.ages import BootClock
-from recorder.storage.mcap_writer import part_of
-from recorder.storage.part_file import PartFile
+from recorder.recording_files import RecordingFiles
 
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND

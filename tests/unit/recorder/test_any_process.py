@@ -21,10 +21,10 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write_table import write_table
 from recorder.config import ReplayConfig
-from recorder.tools.convert import export_csv, import_csv
-from recorder.tools.cut import cut, merge, receipt_window
+from recorder.files.copies import cut, receipt_window
+from recorder.files.recording import read_messages, recorded_process
+from recorder.tools.convert import export_csv, import_csv, read_record
 from recorder.tools.inspect import inspect
-from recorder.tools.mcap_file import read_messages, read_record, recorded_process
 from recorder.tools.replay import open_tape
 from tests.unit.records.test_csv_file import assert_same
 
@@ -134,10 +134,10 @@ def test_info_names_the_process_and_its_signals_by_role_with_their_units(tanks: 
     assert told["signals"]["Q2"] == {"role": "input", "unit": "cm3/s"}
 
 
-def test_cut_and_merged_recordings_describe_their_processes(tanks: Path, tmp_path: Path) -> None:
+def test_cut_recordings_describe_their_processes(tanks: Path, tmp_path: Path) -> None:
     expected = signals_of(inspect(tanks).processes)
     cut([tanks], tmp_path / "cut.mcap", receipt_window(*ALL_NS), {})
-    merge([tanks, tmp_path / "cut.mcap"], tmp_path / "both.mcap", {})
+    cut([tanks, tmp_path / "cut.mcap"], tmp_path / "both.mcap", receipt_window(*ALL_NS), {})
     for name in ("cut", "both"):
         assert signals_of(inspect(tmp_path / f"{name}.mcap").processes) == expected
     assert signals_of(inspect(tmp_path).processes) == expected
@@ -196,8 +196,8 @@ def test_a_recording_that_nothing_describes_gives_all_its_signals_in_the_order_o
 def write_undescribed(path: Path, record: Record) -> None:
     """Record samples as a recorder does, which knows of no process."""
     from reactorwatch.contract.codec import encode
-    from recorder.message import RecordedMessage
-    from recorder.tools.mcap_file import RecordingWriter
+    from recorder import RecordedMessage
+    from recorder.files.writer import RecordingWriter
     from recorder.tools.player import samples_of
 
     path.unlink(missing_ok=True)

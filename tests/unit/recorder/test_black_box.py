@@ -3,7 +3,7 @@
 import itertools
 
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.policy.black_box import MAX_MARGINS, AlarmInterval, BlackBox
+from recorder.keep import MAX_MARGINS, AlarmInterval, BlackBox
 
 N = 600
 

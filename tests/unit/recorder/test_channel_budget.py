@@ -8,12 +8,11 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from recorder.message import RecordedMessage
-from recorder.policy import channel_budget
-from recorder.policy.channel_budget import MAX_OTHER_CHANNELS, Channel, ChannelBudget
-from recorder.policy.own_alarms import KEYS_ALARM
-from recorder.storage.mcap_writer import RecordingWriter, WriteError
-from recorder.tools.mcap_file import read_messages, recordings_in
+from recorder import RecordedMessage, keep
+from recorder.core import KEYS_ALARM
+from recorder.files.recording import read_messages, recordings_in
+from recorder.files.writer import RecordingWriter, WriteError
+from recorder.keep import MAX_OTHER_CHANNELS, Channel, ChannelBudget
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import SECOND, Fed, recorder
 
@@ -94,7 +93,7 @@ def test_keys_that_fell_silent_give_their_room_to_others_in_the_next_file(tmp_pa
 
 
 def test_a_fleet_of_12_000_plants_has_room_for_five_keys_each() -> None:
-    room = ChannelBudget(channel_budget.MAX_KEYS)
+    room = ChannelBudget(keep.MAX_KEYS)
     assert all(
         room.admit(Channel(f"reactor/p{plant}/sample/{key}", SAMPLE.encoding, is_product=True), 0)
         for plant in range(12_000)
@@ -103,7 +102,7 @@ def test_a_fleet_of_12_000_plants_has_room_for_five_keys_each() -> None:
 
 
 def test_room_is_bounded_by_what_the_format_can_number() -> None:
-    assert channel_budget.MAX_KEYS + MAX_OTHER_CHANNELS < channel_budget.MAX_CHANNELS
+    assert keep.MAX_KEYS + MAX_OTHER_CHANNELS < keep.MAX_CHANNELS
 
 
 def test_reserved_keys_have_room_in_a_full_file() -> None:
@@ -123,7 +122,7 @@ def test_messages_repeated_at_the_start_of_a_file_count_too() -> None:
 def test_a_channel_beyond_those_that_the_format_can_number_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("recorder.storage.mcap_writer.MAX_CHANNELS", 3)
+    monkeypatch.setattr("recorder.files.writer.MAX_CHANNELS", 3)
     first = RecordedMessage("", b"", "?", 0, 0)
     with RecordingWriter(tmp_path / "run.mcap", {}) as writer:
         for number in range(3):

@@ -13,12 +13,10 @@ from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Mc
 from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
-from recorder.storage.chunk_data import LARGEST_MB
-from recorder.storage.mcap_scan import LATEST_NS
-from recorder.storage.recover import recover
-from recorder.tools.cut import cut, merge, receipt_window
+from recorder.files.copies import cut, receipt_window, recover
+from recorder.files.index import LARGEST_MB, LATEST_NS
+from recorder.files.recording import read_messages
 from recorder.tools.inspect import inspect
-from recorder.tools.mcap_file import read_messages
 
 BOMB_BYTES = 40_000_000
 KEY = "reactor/cstr/sample/T"
@@ -98,7 +96,6 @@ BOMBS: dict[str, Callable[[str], tuple[Chunk, int | None]]] = {
 READERS: dict[str, Callable[[Path, Path], object]] = {
     "read": lambda path, _: list(read_messages(path)),
     "cut": lambda path, out: cut([path], out, receipt_window(0, LATEST_NS), {}),
-    "merge": lambda path, out: merge([path], out, {}),
 }
 
 

@@ -12,9 +12,9 @@ from reactorwatch.cli.recording_reports import info_object
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write_table import write_table
-from recorder.tools.convert import export_csv, import_csv
+from recorder.files.recording import read_messages, read_metadata
+from recorder.tools.convert import export_csv, import_csv, read_record
 from recorder.tools.inspect import inspect
-from recorder.tools.mcap_file import read_messages, read_metadata, read_record
 from tests.tables import read_csv
 from tests.unit.records.test_csv_file import A_VALUE, assert_same
 

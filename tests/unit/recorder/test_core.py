@@ -5,8 +5,8 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Encoded, Publication, encode, encode_message, encoding_of
+from recorder import RecordedMessage
 from recorder.core import Recorder
-from recorder.message import RecordedMessage
 
 KEY = "reactor/cstr/sample/T"
 GOOD = messages.QUALITY_GOOD

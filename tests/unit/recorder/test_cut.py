@@ -10,13 +10,16 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
-from recorder.message import RecordedMessage
-from recorder.tools.cut import cut, merge, receipt_window, sample_window
-from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
+from recorder import RecordedMessage
+from recorder.files.copies import cut, receipt_window, sample_window
+from recorder.files.recording import plants_in, read_messages, read_metadata
+from recorder.files.writer import RecordingWriter
+from recorder.tools.convert import read_record
 from tests.unit.recorder import golden
 
 MINUTE = 60_000_000_000
 ENTRIES = list(golden.entries())
+ALWAYS = receipt_window(0, 2**63 - 1)
 
 
 def recorded(
@@ -107,8 +110,6 @@ def test_no_source_is_written_over(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES[:50])
     with pytest.raises(InputError, match="is one of the files that are read"):
         cut([source], source, receipt_window(0, 2**63), {})
-    with pytest.raises(InputError, match="is one of the files that are read"):
-        merge([source], source, {})
 
 
 def test_a_damaged_source_is_told_and_nothing_is_written(tmp_path: Path) -> None:
@@ -116,19 +117,19 @@ def test_a_damaged_source_is_told_and_nothing_is_written(tmp_path: Path) -> None
     content = source.read_bytes()
     place = content.index(b"\x28\xb5\x2f\xfd", len(content) // 2)
     source.write_bytes(content[:place] + bytes(30) + content[place + 30 :])
-    with pytest.raises(InputError, match=r"a chunk of \d+ bytes .*`reactorwatch recover"):
-        merge([source], tmp_path / "out.mcap", {})
+    with pytest.raises(InputError, match=r"the chunk at byte \d+ .*`reactorwatch recover"):
+        cut([source], tmp_path / "out.mcap", ALWAYS, {})
     source.write_bytes(content[:-1])
     with pytest.raises(InputError, match=r"is cut off.*`reactorwatch recover"):
-        merge([source], tmp_path / "out.mcap", {})
+        cut([source], tmp_path / "out.mcap", ALWAYS, {})
     assert list(tmp_path.iterdir()) == [source]
 
 
-def test_merging_what_was_recorded_side_by_side_gives_all_in_order_of_receipt(tmp_path: Path) -> None:
+def test_a_cut_of_recordings_made_side_by_side_gives_all_in_order_of_receipt(tmp_path: Path) -> None:
     other = [entry._replace(key=entry.key.replace("cstr", "b")) for entry in ENTRIES]
     a = recorded(tmp_path / "a.mcap", ENTRIES)
     b = recorded(tmp_path / "b.mcap", other, every=33)
-    assert merge([b, a], tmp_path / "both.mcap", {"plant": "both"}) == 2 * len(ENTRIES)
+    assert cut([b, a], tmp_path / "both.mcap", ALWAYS, {"plant": "both"}) == 2 * len(ENTRIES)
     both = list(read_messages(tmp_path / "both.mcap"))
     assert [entry.log_time_ns for entry in both] == sorted(entry.log_time_ns for entry in (*ENTRIES, *other))
     assert [entry for entry in both if "/cstr/" in entry.key] == ENTRIES
@@ -137,18 +138,18 @@ def test_merging_what_was_recorded_side_by_side_gives_all_in_order_of_receipt(tm
     assert read_metadata(tmp_path / "both.mcap")["plant"] == "both"
 
 
-def test_cutting_in_two_and_merging_gives_the_same_record(tmp_path: Path) -> None:
+def test_two_cuts_in_one_folder_are_read_as_the_same_record(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES)
-    parts = []
+    (tmp_path / "parts").mkdir()
+    parts: list[Path] = []
     for number, (begin, end) in enumerate(((0.0, 15.0), (15.05, 40.0))):
-        parts.append(tmp_path / f"{number}.mcap")
+        parts.append(tmp_path / "parts" / f"{number}.mcap")
         cut([source], parts[-1], sample_window([source], at(begin), at(end)), {})
-    merge(parts, tmp_path / "again.mcap", {})
-    first, again = read_record(source), read_record(tmp_path / "again.mcap")
+    first, again = read_record(source), read_record(tmp_path / "parts")
     assert np.array_equal(first.time_min, again.time_min)
     for signal in ("qc", "C", "T"):
         assert np.array_equal(first.columns[signal], again.columns[signal])
-    assert [entry for entry in read_messages(tmp_path / "again.mcap") if entry.latched] == []
+    assert [entry for entry in read_messages(tmp_path / "parts") if entry.latched] == []
 
 
 def test_the_model_that_stands_is_that_of_the_moment_and_not_a_later_one(tmp_path: Path) -> None:

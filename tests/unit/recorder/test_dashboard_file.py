@@ -15,10 +15,6 @@ from rerun.chunk import RrdReader
 from reactorwatch.errors import InputError
 from recorder.columns.run import RunColumns, SampleColumns
 from recorder.columns.run_reader import read_run, read_segments
-from recorder.dashboard.file import write_rrd, write_views
-from recorder.dashboard.read_plots import read_time_plots
-from recorder.dashboard.stream import BATCH_ROWS, RUN_TIME, SAMPLE_TIME
-from recorder.dashboard.viewer_process import viewer_program
 from recorder.panels import PANELS
 from recorder.panels.base import (
     MEASURED,
@@ -32,6 +28,9 @@ from recorder.panels.base import (
     View,
     ViewReference,
 )
+from recorder.view.file import read_time_plots, write_rrd, write_views
+from recorder.view.stream import BATCH_ROWS, RUN_TIME, SAMPLE_TIME
+from recorder.view.viewer import viewer_program
 from tests.unit.recorder import golden
 
 V = TypeVar("V", bound=View)

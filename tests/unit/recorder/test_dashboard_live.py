@@ -12,9 +12,9 @@ from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.find import find_process
 from recorder.columns.run import RunColumns
 from recorder.columns.run_reader import read_run
-from recorder.dashboard.live import DRAW_INTERVAL_NS, LiveDashboard
-from recorder.dashboard.renderer import Renderer
-from recorder.dashboard.stream import SAMPLE_TIME
+from recorder.view.drawing import Renderer
+from recorder.view.live import DRAW_INTERVAL_NS, LiveDashboard
+from recorder.view.stream import SAMPLE_TIME
 from tests.unit.recorder import golden
 
 MESSAGES = [Encoded(entry.key, entry.payload, entry.encoding) for entry in golden.entries()]

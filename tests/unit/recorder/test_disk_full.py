@@ -8,9 +8,9 @@ import pytest
 
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import decode
-from recorder.policy.own_alarms import DISK_ALARM
-from recorder.storage.part_file import PartFile
-from recorder.tools.mcap_file import read_messages, recordings_in
+from recorder.core import DISK_ALARM
+from recorder.files.part_file import PartFile
+from recorder.files.recording import read_messages, recordings_in
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import SECOND, recorder
 from tests.unit.recorder.test_files import alarm, samples

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from recorder.policy.file_names import FileNames
+from recorder.keep import FileNames
 
 NOON = datetime(2026, 7, 1, 12, 0, 5, tzinfo=UTC)
 NOON_NS = round(NOON.timestamp()) * 10**9

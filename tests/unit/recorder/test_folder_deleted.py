@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.policy.own_alarms import DISK_ALARM
-from recorder.storage.part_file import DELETED
+from recorder.core import DISK_ALARM
+from recorder.files.part_file import DELETED
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import SECOND, recorder
 from tests.unit.recorder.test_disk_full import recorded

@@ -8,9 +8,8 @@ from mcap.writer import CompressionType, Writer
 
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
-from recorder.storage.mcap_scan import LATEST_NS
-from recorder.storage.recover import recover
-from recorder.tools.cut import cut, merge, receipt_window
+from recorder.files.copies import cut, receipt_window, recover
+from recorder.files.index import LATEST_NS
 
 MINUTE_NS = 60 * 10**9
 CALIBRATION = {"sensor": "T", "offset": "0.2"}
@@ -61,14 +60,19 @@ def test_a_cut_keeps_them(tmp_path: Path) -> None:
     assert parts(tmp_path / "new.mcap") == whole("a") == parts(source)
 
 
-def test_a_merge_keeps_them_and_says_once_what_all_say(tmp_path: Path) -> None:
+def test_a_cut_of_two_recordings_keeps_them_and_writes_equal_ones_once(tmp_path: Path) -> None:
     sources = [foreign(tmp_path / "a.mcap"), foreign(tmp_path / "b.mcap", minute=1, notes="b")]
-    merge(sources, tmp_path / "new.mcap", {})
+    cut(sources, tmp_path / "new.mcap", receipt_window(0, LATEST_NS), {})
     assert parts(tmp_path / "new.mcap") == whole("b")
 
 
 def test_of_several_profiles_none_is_kept(tmp_path: Path) -> None:
-    merge([foreign(tmp_path / "a.mcap"), foreign(tmp_path / "b.mcap", "x", 1)], tmp_path / "new.mcap", {})
+    cut(
+        [foreign(tmp_path / "a.mcap"), foreign(tmp_path / "b.mcap", "x", 1)],
+        tmp_path / "new.mcap",
+        receipt_window(0, 2**63 - 1),
+        {},
+    )
     assert parts(tmp_path / "new.mcap")[0] == ""
 
 

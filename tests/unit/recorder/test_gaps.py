@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from mcap.records import Metadata
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
@@ -10,9 +11,8 @@ from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.__main__ import open_files
 from recorder.config import RecorderConfig
-from recorder.storage.gaps import from_metadata, to_metadata
-from recorder.storage.recover import recover
-from recorder.tools.cut import cut, merge, receipt_window
+from recorder.files.copies import cut, receipt_window, recover
+from recorder.files.metadata import GAP, gap_metadata, parse_gap
 from recorder.tools.inspect import inspect
 
 from .recording import SECOND, Fed, recorder
@@ -37,9 +37,9 @@ def fed(tmp_path: Path) -> Fed:
 
 
 def test_a_gap_says_all_that_is_known_of_it() -> None:
-    assert from_metadata(to_metadata(ALARMS)) == ALARMS
-    assert to_metadata(ALARMS)["noticed"] == "1970-01-01T00:00:20.000+00:00"
-    assert from_metadata({"stream": "x"}) is None
+    assert parse_gap(Metadata(GAP, gap_metadata(ALARMS))) == ALARMS
+    assert gap_metadata(ALARMS)["noticed"] == "1970-01-01T00:00:20.000+00:00"
+    assert parse_gap(Metadata(GAP, {"stream": "x"})) is None
 
 
 def test_it_is_in_the_file_and_counted_as_lost(fed: Fed, tmp_path: Path) -> None:
@@ -63,11 +63,11 @@ def test_recovery_and_merging_keep_it_and_a_cut_keeps_those_of_its_time(fed: Fed
     run = tmp_path / "run.mcap"
     (tmp_path / "cut_off.mcap").write_bytes(run.read_bytes()[:-1])
     recover(tmp_path / "cut_off.mcap", tmp_path / "saved.mcap")
-    merge([run], tmp_path / "merged.mcap", {})
+    cut([run], tmp_path / "cut.mcap", receipt_window(0, 2**63 - 1), {})
     cut([run], tmp_path / "with.mcap", receipt_window(11 * SECOND, 20 * SECOND), {})
     cut([run], tmp_path / "without.mcap", receipt_window(11 * SECOND, 19 * SECOND), {})
-    kept = {name: inspect(tmp_path / f"{name}.mcap").gaps for name in ("saved", "merged", "with", "without")}
-    assert kept == {"saved": (ALARMS,), "merged": (ALARMS,), "with": (ALARMS,), "without": ()}
+    kept = {name: inspect(tmp_path / f"{name}.mcap").gaps for name in ("saved", "cut", "with", "without")}
+    assert kept == {"saved": (ALARMS,), "cut": (ALARMS,), "with": (ALARMS,), "without": ()}
 
 
 def test_what_the_files_before_hold_is_not_written_again_once(tmp_path: Path) -> None:

@@ -11,10 +11,17 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.runtime.bus import Request
-from recorder.dashboard import history_query
-from recorder.dashboard.history_query import HistoryQuery, RunHistory, alarm_changes, query_history
-from recorder.dashboard.live import DRAW_INTERVAL_NS, ZERO_TIMEOUT_NS, LiveDashboard
-from recorder.dashboard.stream import RUN_TIME
+from recorder.view import live
+from recorder.view.live import (
+    DRAW_INTERVAL_NS,
+    ZERO_TIMEOUT_NS,
+    HistoryQuery,
+    LiveDashboard,
+    RunHistory,
+    alarm_changes,
+    query_history,
+)
+from recorder.view.stream import RUN_TIME
 from tests.memory_bus import Exchange, MemoryBus
 
 MINUTE = 60_000_000_000
@@ -55,7 +62,7 @@ class Remembering(MemoryBus):
 
 @pytest.fixture
 def past(monkeypatch: pytest.MonkeyPatch) -> RunHistory:
-    monkeypatch.setattr(history_query, "REPLY_TIMEOUT_S", 60.0)
+    monkeypatch.setattr(live, "REPLY_TIMEOUT_S", 60.0)
     exchange = Exchange()
 
     def answer(request: Request) -> None:
@@ -118,7 +125,7 @@ def test_a_change_that_publishers_remember_is_shown_once(tmp_path: Path, past: R
 
 
 def test_the_present_state_of_each_is_the_last_that_is_known(past: RunHistory) -> None:
-    last = {change.alarm: change.state for change in alarm_changes(LISTED) if change.event != "suspected"}
+    last = {change.alarm: change.state for change in alarm_changes(LISTED)}
     assert last == STATES
 
 
@@ -163,7 +170,7 @@ def test_a_monitor_that_comes_later_answers_late_and_restarts_is_asked_until_it_
     tmp_path: Path, past: RunHistory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each alarm is shown once, also those that came by themselves."""
-    monkeypatch.setattr(history_query, "RETRY_S", 0.0)
+    monkeypatch.setattr(live, "RETRY_S", 0.0)
     assert past.answered == {"monitor"}
     ask = Answering(RunHistory(), RunHistory(), past)
     query = HistoryQuery(ask)

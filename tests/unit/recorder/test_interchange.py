@@ -12,8 +12,8 @@ from rerun.chunk import RrdReader
 
 from reactorwatch.contract.codec import decode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Fault, Health, Sample
-from recorder.dashboard.viewer_process import viewer_program
-from recorder.tools.mcap_file import RecordingWriter
+from recorder.files.writer import RecordingWriter
+from recorder.view.viewer import viewer_program
 from tests.unit.recorder import golden
 
 

@@ -3,8 +3,8 @@
 from google.protobuf.message import Message
 
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.message import RecordedMessage
-from recorder.policy.latched import LatchedMessages
+from recorder import RecordedMessage
+from recorder.keep import LatchedMessages
 
 
 def remembered(*told: tuple[str, Message], most: int = 100) -> LatchedMessages:

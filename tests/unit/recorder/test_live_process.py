@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from mcap.records import Metadata
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
@@ -18,12 +19,11 @@ from reactorwatch.process.fault import parse_fault
 from recorder.__main__ import open_files
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
-from recorder.files import RecordingFiles
-from recorder.storage.mcap_types import Metadata
-from recorder.storage.process_metadata import PROCESS, processes_in, to_metadata
-from recorder.tools.cut import cut, receipt_window
+from recorder.files.copies import cut, receipt_window
+from recorder.files.metadata import PROCESS, process_metadata, processes_in
+from recorder.files.recording import recorded_process
+from recorder.recording_files import RecordingFiles
 from recorder.tools.inspect import inspect
-from recorder.tools.mcap_file import recorded_process
 from recorder.tools.player import samples_of
 from tests.unit.plant_node.test_plant_of_any_process import RIG
 
@@ -32,7 +32,7 @@ NAMES = [make().name for make in MODELS]
 
 
 def store(process: Process) -> Process:
-    return processes_in([Metadata(PROCESS, to_metadata("unit", process))])["unit"]
+    return processes_in([Metadata(PROCESS, process_metadata("unit", process))])["unit"]
 
 
 def write_samples(files: RecordingFiles, plant: str, process: str, rows: int) -> None:
@@ -79,7 +79,7 @@ def test_equations_that_are_not_of_the_catalogue_are_left_out_and_the_signals_st
 
 
 def test_equations_of_a_later_version_are_left_out() -> None:
-    metadata = to_metadata("unit", find_process("cstr"))
+    metadata = process_metadata("unit", find_process("cstr"))
     for key, value in (("equations", '{"format": "reactorwatch.model.v9"}'), ("parameters", "[]")):
         stored = processes_in([Metadata(PROCESS, {**metadata, key: value})])["unit"]
         assert (stored.model, stored.outputs) == (None, ("C", "T"))

@@ -1,14 +1,17 @@
 """Damaged recordings: one clear line, never a traceback, and never a wrong message."""
 
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from reactorwatch.errors import InputError
-from recorder.message import RecordedMessage
-from recorder.storage.mcap_chunks import TABLE_CURE
-from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
+from recorder import RecordedMessage
+from recorder.files.index import FOOTER, RECORD, TABLE_CURE, read_summary
+from recorder.files.recording import plants_in, read_messages, read_metadata
+from recorder.files.writer import RecordingWriter
+from recorder.tools.convert import read_record
 from tests.unit.recorder import golden
 
 ENTRIES = [entry for entry in golden.entries() if "/sample/" in entry.key][:60]
@@ -99,3 +102,33 @@ def test_every_way_of_reading_says_the_same_and_says_it_at_the_call(tmp_path: Pa
             reading(tmp_path / "none.mcap")
         with pytest.raises(InputError, match=r"run\.mcap: is cut off"):
             reading(tmp_path)  # a folder is read as the recordings in it
+
+
+def without_checksum(content: bytes) -> bytearray:
+    """The same file, whose index has no checksum, as the format allows."""
+    changed = bytearray(content)
+    changed[-12:-8] = bytes(4)
+    return changed
+
+
+def test_an_index_without_a_checksum_that_cannot_be_parsed_is_named(whole: bytes, tmp_path: Path) -> None:
+    path, content = tmp_path / "run.mcap", without_checksum(whole)
+    start = FOOTER.unpack_from(content, len(content) - FOOTER.size - 8)[2]
+    opcode, _ = RECORD.unpack_from(content, start)
+    RECORD.pack_into(content, start, opcode, 2**40)
+    path.write_bytes(content)
+    said = read(path)
+    assert isinstance(said, str)
+    assert said.startswith(f"{path}: its index is damaged (")
+
+
+@pytest.mark.parametrize("length", [10, 10_000])
+def test_an_index_that_names_another_record_as_metadata_is_named(whole: bytes, tmp_path: Path, length: int) -> None:
+    """The record is longer than the index says, or of another kind."""
+    path, content = tmp_path / "run.mcap", without_checksum(whole)
+    path.write_bytes(content)
+    (item,) = read_summary(path).metadata_indexes
+    header = struct.pack("<QQ", 8, length)
+    path.write_bytes(bytes(content).replace(struct.pack("<QQ", item.offset, item.length), header))
+    with pytest.raises(InputError, match="its metadata cannot be read"):
+        read_metadata(path)

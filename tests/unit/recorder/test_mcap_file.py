@@ -10,14 +10,16 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
 from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
-from recorder.message import RecordedMessage
-from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
+from reactorwatch.version import build_metadata
+from recorder import RecordedMessage
+from recorder.files.recording import plants_in, read_messages, read_metadata
+from recorder.files.writer import RecordingWriter
+from recorder.tools.convert import read_record
 from tests.unit.recorder import golden
 
 
@@ -87,7 +89,7 @@ def test_bytes_of_strangers_are_kept_with_the_encoding_they_claimed_and_no_schem
 
 
 def test_metadata_tells_the_version_and_what_was_given(tmp_path: Path) -> None:
-    assert read_metadata(recorded(tmp_path / "run.mcap", [])) == {"version": __version__, "seed": "3"}
+    assert read_metadata(recorded(tmp_path / "run.mcap", [])) == {**build_metadata(), "seed": "3"}
 
 
 def test_a_recording_of_nothing_is_a_recording(tmp_path: Path) -> None:

@@ -11,12 +11,12 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, decode, encode
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal
+from recorder import RecordedMessage
 from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
-from recorder.files import RecordingFiles
-from recorder.message import RecordedMessage
+from recorder.files.recording import read_messages
 from recorder.node import RecorderNode
-from recorder.tools.mcap_file import read_messages
+from recorder.recording_files import RecordingFiles
 from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
 from tests.unit.recorder import golden

@@ -7,10 +7,9 @@ from reactorwatch.cli.recording_reports import info_object
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, encode
-from recorder.message import RecordedMessage
-from recorder.tools.inspect import FileInfo, inspect, zero_ns_of
-from recorder.tools.mcap_file import RecordingWriter
-from recorder.tools.overview import Gap, overview
+from recorder import RecordedMessage
+from recorder.files.writer import RecordingWriter
+from recorder.tools.inspect import FileInfo, MissingSamples, inspect, overview, zero_ns_of
 from tests.unit.recorder import golden
 
 SECOND = 1_000_000_000
@@ -52,7 +51,7 @@ def test_counts_and_times_are_those_of_the_entries() -> None:
 def test_gaps_are_named_by_the_numbers_that_are_missing() -> None:
     seen = overview(sampled(0, 1, 2, 5, 6, 10))
     after = [1000 + 2 * SECOND, 1000 + 6 * SECOND]
-    assert seen.gaps == [Gap(KEY, 3, 4, after[0]), Gap(KEY, 7, 9, after[1])]
+    assert seen.gaps == [MissingSamples(KEY, 3, 4, after[0]), MissingSamples(KEY, 7, 9, after[1])]
     assert seen.lost == 5
 
 

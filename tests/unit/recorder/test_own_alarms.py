@@ -7,7 +7,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, CommandReply, ListAlarms
-from recorder.policy.own_alarms import DISK_ALARM, PRIORITIES, OwnAlarms
+from recorder.core import DISK_ALARM, PRIORITIES, OwnAlarms
 
 NORMAL, RAISED = messages.ALARM_STATE_NORMAL, messages.ALARM_STATE_UNACKNOWLEDGED
 SEEN, GONE = messages.ALARM_STATE_ACKNOWLEDGED, messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED
@@ -85,7 +85,7 @@ def test_what_cannot_be_done_is_refused_with_the_reason(command: str, message: M
 @EACH
 def test_each_is_acknowledged_once_and_not_before_it_is_raised(name: str) -> None:
     alarms = OwnAlarms("cstr")
-    assert "has not come up" in ask(alarms, keys.ACKNOWLEDGE_RECORDER, by_ada(name))[0].text
+    assert "is normal, there is nothing to acknowledge" in ask(alarms, keys.ACKNOWLEDGE_RECORDER, by_ada(name))[0].text
     alarms.raise_alarm(name, "no space left", 1)
     assert ask(alarms, keys.ACKNOWLEDGE_RECORDER, by_ada(name))[0].accepted
     assert "is acknowledged already" in ask(alarms, keys.ACKNOWLEDGE_RECORDER, by_ada(name))[0].text

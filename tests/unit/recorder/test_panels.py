@@ -3,13 +3,14 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
 
 import recorder.panels
 from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
 from recorder.columns.run import (
@@ -18,14 +19,12 @@ from recorder.columns.run import (
     FROZEN,
     REFERENCE,
     ChartColumns,
-    HealthReport,
     ReconstructionColumns,
     RunColumns,
     SampleColumns,
-    Snapshot,
 )
-from recorder.columns.run_reader import read_run, read_segments
-from recorder.panels import PANELS, alarms, charts, health, model, overview, phase_plane
+from recorder.columns.run_reader import RunReader, read_run, read_segments
+from recorder.panels import PANELS, phase_plane, signals, status
 from recorder.panels.base import ALARM, EventLog, Panel, PlanePlot, StateLines, TimePlot, View, ViewReference
 from tests.unit.recorder import golden
 
@@ -42,7 +41,7 @@ def of_kind(views: Sequence[View], kind: type[V]) -> Iterator[V]:
 
 
 def log_of(run: RunColumns) -> EventLog:
-    return next(of_kind(alarms.draw(run), EventLog))
+    return next(of_kind(status.draw_alarms(run), EventLog))
 
 
 def only(run: RunColumns, *signals_left: str) -> RunColumns:
@@ -57,12 +56,11 @@ def test_every_file_of_the_folder_is_in_the_catalogue() -> None:
     files = {path.stem for path in folder.glob("*.py")} - {"__init__", "base"}
     listed = {panel.draw.__module__.rsplit(".", 1)[1] for panel in PANELS}
     assert listed == files
-    assert len(PANELS) == len(files)
 
 
 def some_runs(run: RunColumns) -> Iterator[RunColumns]:
     yield run
-    yield replace(run, samples={**run.samples, "C": replace(run.samples["C"], value=run.samples["C"].value * np.nan)})
+    yield replace(run, samples={**run.samples, "C": run.samples["C"]._replace(value=run.samples["C"].value * np.nan)})
     for left in (("T",), ("C", "T"), ("qc", "C", "T"), ()):
         yield only(run, *left)
     yield from read_segments(golden.entries(), 150)
@@ -103,7 +101,7 @@ def test_what_is_shown_again_is_there(run: RunColumns) -> None:
 
 
 def test_signals_show_measured_predicted_and_limits_in_colours_of_their_own(run: RunColumns) -> None:
-    plots = {plot.title: plot for plot in of_kind(overview.draw(run), TimePlot)}
+    plots = {plot.title: plot for plot in of_kind(signals.draw_overview(run), TimePlot)}
     assert list(plots) == ["C: concentration of A in the reactor", "T: temperature of the reactor", "qc: coolant flow"]
     temperature = plots["T: temperature of the reactor"]
     assert temperature.unit == "K"
@@ -120,7 +118,8 @@ def test_signals_show_measured_predicted_and_limits_in_colours_of_their_own(run:
 def test_what_a_suspected_sensor_should_read_is_drawn_beside_what_it_reads(run: RunColumns) -> None:
     rebuilt = ReconstructionColumns(run.samples["T"].time_ns[5:9], np.arange(4.0), np.ones(4))
     plots = {
-        plot.title[0]: plot for plot in of_kind(overview.draw(replace(run, reconstructions={"T": rebuilt})), TimePlot)
+        plot.title[0]: plot
+        for plot in of_kind(signals.draw_overview(replace(run, reconstructions={"T": rebuilt})), TimePlot)
     }
     assert next(series for series in plots["T"].series if series.name == "reconstructed").value is rebuilt.value
     assert "reconstructed" not in {series.name for series in plots["C"].series}
@@ -131,7 +130,7 @@ def test_signals_of_no_known_process_are_drawn_by_their_names(run: RunColumns) -
     strange = replace(
         only(run, "T"), samples={"pH": run.samples["T"]}, units={"pH": ""}, statistics={"pH": run.statistics["T"]}
     )
-    (plot,) = of_kind(overview.draw(strange), TimePlot)
+    (plot,) = of_kind(signals.draw_overview(strange), TimePlot)
     assert (plot.title, plot.unit) == ("pH", "")
 
 
@@ -139,14 +138,14 @@ def test_residuals_open_on_what_was_judged(run: RunColumns) -> None:
     """A first prediction that is wild does not set the scale."""
     wild = run.estimates["T"].residual.copy()
     wild[0] = 1e6
-    changed = replace(run, estimates={"T": replace(run.estimates["T"], residual=wild)}, charts={})
-    (plot,) = charts.draw(changed)
+    changed = replace(run, estimates={"T": run.estimates["T"]._replace(residual=wild)}, charts={})
+    (plot,) = signals.draw_charts(changed)
     watched = np.isfinite(run.estimates["T"].upper_limit)
     assert plot.shown is not None
     lower, upper = plot.shown
     assert lower < wild[watched].min() < wild[watched].max() < upper < 1.0
-    learning = replace(run.estimates["T"], lower_limit=wild * np.nan, upper_limit=wild * np.nan)
-    (plot,) = charts.draw(replace(run, estimates={"T": learning}, charts={}))
+    learning = run.estimates["T"]._replace(lower_limit=wild * np.nan, upper_limit=wild * np.nan)
+    (plot,) = signals.draw_charts(replace(run, estimates={"T": learning}, charts={}))
     assert plot.shown is None
 
 
@@ -159,7 +158,7 @@ def chart(*statistic: float) -> ChartColumns:
 
 def test_every_chart_is_drawn_with_its_limits_those_of_all_signals_last(run: RunColumns) -> None:
     names = ("shewhart/T", "mewma/all", "ewma/C")
-    plots = charts.draw(replace(run, estimates={}, charts=dict.fromkeys(names, chart(0.0, 1.0))))
+    plots = signals.draw_charts(replace(run, estimates={}, charts=dict.fromkeys(names, chart(0.0, 1.0))))
     assert [plot.title for plot in plots] == ["Chart ewma/C", "Chart shewhart/T", "Chart mewma/all"]
     lines = {series.name: series.value.tolist() for series in plots[0].series}
     assert (lines["upper limit"], lines["centre"], lines["lower limit"]) == ([4.0, 4.0], [1.0, 1.0], [-2.0, -2.0])
@@ -167,7 +166,7 @@ def test_every_chart_is_drawn_with_its_limits_those_of_all_signals_last(run: Run
 
 
 def test_what_is_out_of_limits_is_drawn_as_an_alarm(run: RunColumns) -> None:
-    (plot,) = charts.draw(replace(run, estimates={}, charts={"ewma/T": chart(1.0, 2.0, 9.0, 8.0, 2.0)}))
+    (plot,) = signals.draw_charts(replace(run, estimates={}, charts={"ewma/T": chart(1.0, 2.0, 9.0, 8.0, 2.0)}))
     out = next(series for series in plot.series if series.name == "statistic out")
     assert out.colour == ALARM
     # the line comes from where it was, and ends with the last that is out
@@ -176,7 +175,7 @@ def test_what_is_out_of_limits_is_drawn_as_an_alarm(run: RunColumns) -> None:
 
 
 def test_a_statistic_that_goes_through_the_roof_leaves_the_limits_visible(run: RunColumns) -> None:
-    (plot,) = charts.draw(replace(run, estimates={}, charts={"mewma/all": chart(1.0, 1e6, -1e6)}))
+    (plot,) = signals.draw_charts(replace(run, estimates={}, charts={"mewma/all": chart(1.0, 1e6, -1e6)}))
     assert plot.shown is not None
     lower, upper = plot.shown
     assert 4.0 < upper < 100.0
@@ -200,34 +199,54 @@ def test_the_log_of_a_stretch_counts_from_the_beginning_of_the_run() -> None:
     assert [text.split("  ")[0] for text in texts] == ["20.0 min", "22.0 min", "27.0 min"]
 
 
+def changed_alarm(before: messages.Alarm, **values: Any) -> messages.Alarm:
+    """Copy of an alarm with other values."""
+    names = ("time_ns", "alarm", "state", "priority", "text", "event", "suspects")
+    return messages.Alarm(**{**{name: getattr(before, name) for name in names}, **values})
+
+
 def test_the_log_tells_the_suspects_of_one_look_once(run: RunColumns) -> None:
     suspect = messages.Suspect(cause="coolant_flow", probability=0.9, profile="step", size=-0.05, unit="1")
     suspect.onset_ns = run.span_ns[0] + 20 * 60_000_000_000
-    look = run.alarms[0]._replace(event="suspected", suspects=[suspect])
-    raised = run.alarms[0]._replace(event="raised")
-    twice = replace(run, alarms=(raised, look, look._replace(alarm="ewma/T")))
-    told = ("suspect", "22.0 min  coolant_flow (90 %; step of -0.05 at 20.0 min)")
-    assert [(event.kind, event.text) for event in log_of(twice).events][1:] == [
+    raised = changed_alarm(run.alarms[0], event="raised")
+    look = messages.Incident(time_ns=raised.time_ns, number=1, suspects=[suspect])
+    with_look = replace(run, alarms=(raised,), incidents=(look,))
+    event = ("suspect", "22.0 min  coolant_flow (90 %; step of -0.05 at 20.0 min)")
+    assert [(event.kind, event.text) for event in log_of(with_look).events][1:] == [
         ("raised", "22.0 min  shewhart/T: T is lower than the model expects"),
-        told,
+        event,
     ]
-    known = replace(twice, context=replace(run.context, suspects_ns=look.time_ns))
-    assert told not in [(event.kind, event.text) for event in log_of(known).events], "told by the stretch before"
+
+
+@pytest.mark.parametrize("before", [False, True], ids=["incidents", "alarms, as earlier versions published them"])
+def test_suspects_that_are_published_again_are_read_once(*, before: bool) -> None:
+    suspect = messages.Suspect(cause="coolant_flow", probability=0.9)
+    reader = RunReader()
+    for minute, name in ((22, "shewhart/T"), (22, "ewma/T"), (23, "ewma/T")):
+        time_ns = golden.ZERO_NS + minute * 60_000_000_000
+        if before:
+            alarm = messages.Alarm(time_ns=time_ns, alarm=name, incident=1, event="suspected", suspects=[suspect])
+            reader.add(encode(Publication(f"reactor/cstr/alarm/{name}", alarm)))
+        else:
+            incident = messages.Incident(time_ns=time_ns, number=1, suspects=[suspect])
+            reader.add(encode(Publication("reactor/cstr/incident/1", incident)))
+    parts = reader.next_segment(), reader.next_segment()
+    assert [[item.time_ns for item in part.incidents] for part in parts] == [[golden.ZERO_NS + 22 * 60_000_000_000], []]
 
 
 def test_every_state_of_an_alarm_has_a_word_and_a_colour(run: RunColumns) -> None:
     changes = [
-        run.alarms[0]._replace(state=state, time_ns=state + 1) for state in messages.AlarmState.values() if state
+        changed_alarm(run.alarms[0], state=state, time_ns=state + 1) for state in messages.AlarmState.values() if state
     ]
-    (lanes,) = of_kind(alarms.draw(replace(run, alarms=tuple(changes))), StateLines)
+    (lanes,) = of_kind(status.draw_alarms(replace(run, alarms=tuple(changes))), StateLines)
     (line,) = lanes.lines
     assert len(set(line.states)) == len(changes)
     assert set(line.states) <= lanes.colours.keys()
 
 
 def test_the_life_of_an_alarm_is_a_line_that_begins_with_the_run(run: RunColumns) -> None:
-    first = run.alarms[0]._replace(event="raised")
-    (lanes,) = of_kind(alarms.draw(replace(run, alarms=(first, *run.alarms[1:]))), StateLines)
+    first = changed_alarm(run.alarms[0], event="raised")
+    (lanes,) = of_kind(status.draw_alarms(replace(run, alarms=(first, *run.alarms[1:]))), StateLines)
     (line,) = lanes.lines
     assert line.name == "shewhart/T"
     assert line.states == ("normal", "raised", "cleared")
@@ -237,9 +256,15 @@ def test_the_life_of_an_alarm_is_a_line_that_begins_with_the_run(run: RunColumns
 
 def test_what_is_known_of_an_alarm_from_before_is_not_said_again(run: RunColumns) -> None:
     earlier = replace(run.context, first_ns=run.span_ns[0], alarm_states={"shewhart/T": messages.ALARM_STATE_NORMAL})
-    again = replace(run, alarms=(run.alarms[0]._replace(event="raised"),), context=earlier)
-    (lanes,) = of_kind(alarms.draw(again), StateLines)
+    again = replace(run, alarms=(changed_alarm(run.alarms[0], event="raised"),), context=earlier)
+    (lanes,) = of_kind(status.draw_alarms(again), StateLines)
     assert lanes.lines[0].states == ("raised",)
+
+
+def snapshot(at: int, parameters: dict[str, tuple[float, float]], excitation: float) -> messages.ModelSnapshot:
+    """Model at a time; parameters map a name to value and standard deviation."""
+    listed = [messages.Parameter(name=name, value=value, sd=sd) for name, (value, sd) in parameters.items()]
+    return messages.ModelSnapshot(time_ns=at, parameters=listed, excitation=excitation)
 
 
 @pytest.mark.parametrize(
@@ -247,9 +272,9 @@ def test_what_is_known_of_an_alarm_from_before_is_not_said_again(run: RunColumns
 )
 def test_parameters_of_both_models_are_drawn_with_their_intervals(run: RunColumns, purpose: str, name: str) -> None:
     """A model that is not the reference is not labelled as it."""
-    adapting = tuple(Snapshot(at, {"a1": (0.9 + at, 0.1), "b1": (2.0, 0.5)}, 0.02 * at, 50.0) for at in (1, 2))
-    judged = (Snapshot(2, {"a1": (0.8, 0.1), "b1": (1.9, 0.5)}, 0.03, 33.0),)
-    plots = model.draw(replace(run, models={("T", ADAPTIVE): adapting, ("T", purpose): judged}))
+    adapting = tuple(snapshot(at, {"a1": (0.9 + at, 0.1), "b1": (2.0, 0.5)}, 0.02 * at) for at in (1, 2))
+    judged = (snapshot(2, {"a1": (0.8, 0.1), "b1": (1.9, 0.5)}, 0.03),)
+    plots = signals.draw_models(replace(run, models={("T", ADAPTIVE): adapting, ("T", purpose): judged}))
     assert [plot.title.split(" of ")[0] for plot in plots] == [
         "Parameters a",
         "Parameters b",
@@ -265,9 +290,9 @@ def test_parameters_of_both_models_are_drawn_with_their_intervals(run: RunColumn
 
 def test_parameters_of_several_inputs_are_drawn_for_each_input_by_its_name(run: RunColumns) -> None:
     names = ("a1", "b1_1", "b1_2", "b2_1", "b2_2", "c")
-    snapshot = Snapshot(1, dict.fromkeys(names, (1.0, 0.1)), 0.5, 2.0)
-    described = replace(run, models={("h1", ADAPTIVE): (snapshot,)}, process=find_process("three_tanks"))
-    plots = {plot.title: plot for plot in model.draw(described)}
+    adapting = snapshot(1, dict.fromkeys(names, (1.0, 0.1)), 0.5)
+    described = replace(run, models={("h1", ADAPTIVE): (adapting,)}, process=find_process("three_tanks"))
+    plots = {plot.title: plot for plot in signals.draw_models(described)}
     assert list(plots)[:4] == [
         "Parameters a of the model of h1: of the output",
         "Parameters b of the model of h1: of the input Q1",
@@ -277,13 +302,13 @@ def test_parameters_of_several_inputs_are_drawn_for_each_input_by_its_name(run: 
     drawn = [line.name for line in plots["Parameters b of the model of h1: of the input Q2"].series]
     assert [name for name in drawn if name in names] == ["b1_2", "b2_2"]
     assert "Parameters b of the model of h1: of the input 2" in [
-        plot.title for plot in model.draw(replace(described, process=None))
+        plot.title for plot in signals.draw_models(replace(described, process=None))
     ]
 
 
 def test_the_noise_levels_of_the_equations_that_judge_are_drawn(run: RunColumns) -> None:
-    judged = tuple(Snapshot(at, {"sensor_sd": (0.3, 0.0), "C_sd": (1e-4, 0.0)}, 0.0, 0.0) for at in (1, 2))
-    (plot,) = model.draw(replace(run, models={("T", EQUATIONS): judged}))
+    judged = tuple(snapshot(at, {"sensor_sd": (0.3, 0.0), "C_sd": (1e-4, 0.0)}, 0.0) for at in (1, 2))
+    (plot,) = signals.draw_models(replace(run, models={("T", EQUATIONS): judged}))
     assert plot.title == "Noise levels of the equations for T"
     assert {series.name: series.value.tolist() for series in plot.series} == {
         "sensor_sd": [0.3, 0.3],
@@ -294,12 +319,12 @@ def test_the_noise_levels_of_the_equations_that_judge_are_drawn(run: RunColumns)
 def test_health_shows_phases_lag_and_troubles_of_each_node(run: RunColumns) -> None:
     reports = {
         "monitor": (
-            HealthReport(5, "training", 1.5, {"lost": 0, "late": 0}),
-            HealthReport(9, "watching", 2.5, {"lost": 3, "late": 4}),
+            messages.Health(time_ns=5, phase="training", lag_ms=1.5),
+            messages.Health(time_ns=9, phase="watching", lag_ms=2.5, lost=3, late=4),
         ),
-        "plant": (HealthReport(5, "running", 0.0, {"lost": 0, "late": 0}),),
+        "plant": (messages.Health(time_ns=5, phase="running"),),
     }
-    phases, lag, troubles = health.draw(replace(run, health=reports))
+    phases, lag, troubles = status.draw_health(replace(run, health=reports))
     assert isinstance(phases, StateLines)
     assert [(line.name, line.states) for line in phases.lines] == [
         ("monitor", ("training", "watching")),
@@ -321,7 +346,7 @@ def described(*signals: tuple[str, str, str]) -> RunColumns:
 
 def overview_of(run: RunColumns) -> dict[str, tuple[list[str], bool]]:
     """Lines of each plot of the overview, and whether the signal of the plot is held between its samples."""
-    plots = of_kind(overview.draw(run), TimePlot)
+    plots = of_kind(signals.draw_overview(run), TimePlot)
     return {plot.title: ([line.legend or line.name for line in plot.series], plot.series[-1].held) for plot in plots}
 
 

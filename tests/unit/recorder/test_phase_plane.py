@@ -5,7 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.steady_state import SteadyState, steady_states
 from recorder.columns.run import RunColumns, SampleColumns, SignalStatistics
 from recorder.columns.run_reader import read_run, read_segments
 from recorder.panels import phase_plane
@@ -113,6 +116,21 @@ def test_stretch_by_stretch_the_path_is_the_same_wherever_it_is_cut(run: RunColu
     drawn = steps(near for part in read_segments(golden.entries(), each) for near in phase_plane.draw(part)[:1])
     assert set().union(*drawn.values()) == set().union(*whole.values())
     assert len(drawn["alarm active"] ^ whole["alarm active"]) <= 2
+
+
+def test_the_steady_states_of_a_run_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    solved: list[float] = []
+
+    def count(model: ProcessModel, level: NDArray[np.float64]) -> list[SteadyState]:
+        solved.append(float(level[0]))
+        return steady_states(model, level)
+
+    phase_plane.steady_states_at.cache_clear()
+    monkeypatch.setattr(phase_plane, "steady_states", count)
+    drawn = [phase_plane.draw(part) for part in read_segments(golden.entries(), 100)]
+    assert len({(planes[1].note, planes[1].marks) for planes in drawn if planes}) == 1
+    assert sum(bool(planes) for planes in drawn) > 3
+    assert len(solved) == len(set(solved))
 
 
 def test_the_plane_marks_the_fault_and_the_first_alarm(run: RunColumns) -> None:

@@ -8,9 +8,10 @@ import pytest
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
+from reactorwatch.contract.codec import Encoded, Publication, encode
+from reactorwatch.errors import InputError
 from reactorwatch.records.record import NEVER_NS, Record
-from recorder.message import RecordedMessage
+from recorder import RecordedMessage
 from recorder.tools.player import BATCH, EVERYTHING, Player, filter_playable, filter_time, samples_of
 from tests.unit.recorder import golden
 
@@ -25,13 +26,9 @@ def at(*seconds: float) -> Callable[[], Iterator[Publication]]:
     )
 
 
-def tell(player: Player, command: str, now_s: float, rows: int = 0, rate: float = 0.0) -> list[float]:
-    """Give a command that is accepted; the sample times of what goes out because of it."""
-    message = messages.ReplayCommand(rows=rows, rate=rate)
-    question = Encoded(f"reactor/x/command/{command}", *encode_message(message))
-    reply, publications = player.on_command(question, round(now_s * SECOND))
-    assert reply.accepted, reply.text
-    return [publication.message.time_ns / SECOND for publication in publications]
+def stepped(player: Player, now_s: float, rows: int = 1) -> list[float]:
+    """Sample times of the rows that steps publish."""
+    return [publication.message.time_ns / SECOND for publication in player.step(rows, round(now_s * SECOND))]
 
 
 def ticked(player: Player, now_s: float) -> list[float]:
@@ -160,19 +157,19 @@ def test_a_loop_as_fast_as_it_goes_leaves_the_loop_its_word() -> None:
 def test_a_pause_holds_the_plants_time_and_the_rest_of_a_row_is_waited_for_afterwards() -> None:
     player = Player(at(0, 10, 20), 1.0)
     assert ticked(player, 0) == [0]
-    assert tell(player, "pause", 4) == []
+    player.pause(4 * SECOND)
     assert player.next_tick_ns() >= NEVER_NS
     assert ticked(player, 500) == []
-    assert tell(player, "resume", 1000) == []
+    player.resume(1000 * SECOND)
     assert player.next_tick_ns() == 1006 * SECOND
     assert ticked(player, 1006) == [10]
 
 
 def test_a_step_is_a_row_and_the_play_goes_on_from_it() -> None:
     player = Player(at(0, 0, 10, 10, 20, 30), 1.0)
-    tell(player, "pause", 0)
-    assert [tell(player, "step", 1), tell(player, "step", 2, rows=2)] == [[0, 0], [10, 10, 20]]
-    tell(player, "resume", 50)
+    player.pause(0)
+    assert [stepped(player, 1), stepped(player, 2, rows=2)] == [[0, 0], [10, 10, 20]]
+    player.resume(50 * SECOND)
     assert played(player, 50 * SECOND) == [(60, 30)]
     assert player.published == 6
 
@@ -180,45 +177,35 @@ def test_a_step_is_a_row_and_the_play_goes_on_from_it() -> None:
 def test_a_step_goes_over_the_end_of_a_loop_and_not_over_that_of_a_play() -> None:
     looped, once = Player(at(0, 1), 1.0, loop=True), Player(at(0, 1), 1.0)
     for player in (looped, once):
-        tell(player, "pause", 0)
-    assert tell(looped, "step", 1, rows=3) == [0, 1, 0]
-    tell(looped, "resume", 10)
+        player.pause(0)
+    assert stepped(looped, 1, rows=3) == [0, 1, 0]
+    looped.resume(10 * SECOND)
     assert looped.next_tick_ns() == 11 * SECOND
-    assert tell(once, "step", 1, rows=3) == [0, 1]
+    assert stepped(once, 1, rows=3) == [0, 1]
     assert once.finished
 
 
 def test_the_rate_changes_from_now_on() -> None:
     player = Player(at(0, 10, 20), 1.0)
     ticked(player, 0)
-    tell(player, "set_rate", 4, rate=0.5)
+    player.set_rate(0.5, 4 * SECOND)
     assert played(player) == [(16, 10), (36, 20)]
 
 
 def test_a_play_as_fast_as_it_goes_can_be_slowed_down() -> None:
     player = Player(at(*range(0, 10 * BATCH, 10), 10 * BATCH, 10 * BATCH + 10), math.inf)
     assert len(ticked(player, 7)) == BATCH
-    tell(player, "set_rate", 8, rate=5.0)
+    player.set_rate(5.0, 8 * SECOND)
     assert played(player, 8 * SECOND) == [(8, 10 * BATCH), (10, 10 * BATCH + 10)]
 
 
-@pytest.mark.parametrize(
-    ("command", "message", "why"),
-    [
-        ("set_rate", messages.ReplayCommand(rate=-1.0), "rate must be positive, got -1"),
-        ("set_rate", messages.ReplayCommand(rate=math.nan), "rate must be positive, got nan"),
-        ("step", messages.ReplayCommand(), "pause it before a step"),
-        ("rewind", messages.ReplayCommand(), "unknown command 'rewind'"),
-        ("pause", messages.ListAlarms(), "must carry"),
-    ],
-)
-def test_what_cannot_be_done_is_refused_and_changes_nothing(
-    command: str, message: messages.ReplayCommand | messages.ListAlarms, why: str
-) -> None:
+def test_a_rate_that_is_not_positive_and_a_step_while_playing_are_refused_and_change_nothing() -> None:
     player = Player(at(0, 1), 1.0)
-    reply, publications = player.on_command(Encoded(f"reactor/x/command/{command}", *encode_message(message)), 0)
-    assert (reply.accepted, publications) == (False, [])
-    assert why in reply.text
+    for rate in (-1.0, 0.0, math.nan):
+        with pytest.raises(InputError, match=f"rate must be positive, got {rate:g}"):
+            player.set_rate(rate, 0)
+    with pytest.raises(InputError, match="pause it before a step"):
+        player.step(1, 0)
     assert played(player) == [(0, 0), (1, 1)]
 
 

@@ -7,7 +7,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Power, Promise
 from recorder.columns.run_reader import read_run
 from recorder.panels.base import ALARM, EventLog, TimePlot
-from recorder.panels.promise import draw
+from recorder.panels.status import PROMISE
 
 MINUTE_NS = 60_000_000_000
 
@@ -26,7 +26,7 @@ def promise(minute: int, found: int, *, kept: bool = True) -> Encoded:
 
 
 def test_alarms_found_and_promised_are_two_lines() -> None:
-    plot, _ = draw(read_run([promise(100, 0), promise(105, 0), promise(107, 2)]))
+    plot, _ = PROMISE.draw(read_run([promise(100, 0), promise(105, 0), promise(107, 2)]))
     assert isinstance(plot, TimePlot)
     promised, found = plot.series
     assert np.allclose(promised.value, [1.0, 1.05, 1.07])
@@ -35,7 +35,7 @@ def test_alarms_found_and_promised_are_two_lines() -> None:
 
 
 def test_the_log_has_a_line_for_each_change_and_the_power_once() -> None:
-    _, log = draw(read_run([promise(100, 0), promise(105, 0), promise(107, 2), promise(110, 2, kept=False)]))
+    _, log = PROMISE.draw(read_run([promise(100, 0), promise(105, 0), promise(107, 2), promise(110, 2, kept=False)]))
     assert isinstance(log, EventLog)
     assert [event.kind for event in log.events] == ["promise", "power", "promise", "promise"]
     assert "T.bias (K): none within 10 min, 0.21 within an hour, 0.1 within a day" in log.events[1].text
@@ -43,4 +43,4 @@ def test_the_log_has_a_line_for_each_change_and_the_power_once() -> None:
 
 
 def test_a_run_without_a_promise_has_no_such_panel() -> None:
-    assert draw(read_run([])) == ()
+    assert PROMISE.draw(read_run([])) == ()

@@ -14,12 +14,11 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from reactorwatch.errors import InputError
-from recorder.message import RecordedMessage
-from recorder.storage.mcap_chunks import metadata_records
-from recorder.storage.mcap_scan import RawMessage, Scan
-from recorder.storage.mcap_writer import RecordingWriter
-from recorder.storage.recover import RecoveryResult, recover
-from recorder.tools.mcap_file import read_messages, read_metadata
+from recorder import RecordedMessage
+from recorder.files.copies import RecoveryResult, recover
+from recorder.files.reader import Reader, StoredMessage, metadata_records
+from recorder.files.recording import read_messages, read_metadata
+from recorder.files.writer import RecordingWriter
 from tests.unit.recorder import golden
 
 ENTRIES = list(golden.entries())[:90]
@@ -251,7 +250,7 @@ def test_a_pass_over_a_stretch_of_time_reads_only_the_chunks_in_it(tmp_path: Pat
     path = tmp_path / "run.mcap"
     _, end = chunks(whole)[0]
     path.write_bytes(whole[: end - 10] + bytes(10) + whole[end:])
-    scan = Scan(path, ENTRIES[CHUNK].log_time_ns, ENTRIES[2 * CHUNK - 1].log_time_ns)
-    found: list[RawMessage] = list(scan)
+    reader = Reader(path, ENTRIES[CHUNK].log_time_ns, ENTRIES[2 * CHUNK - 1].log_time_ns)
+    found: list[StoredMessage] = list(reader)
     assert [stored.payload for stored in found] == [entry.payload for entry in ENTRIES[CHUNK : 2 * CHUNK]]
-    assert scan.is_intact
+    assert not reader.damages

@@ -5,10 +5,10 @@ import pytest
 
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, encode
+from recorder import RecordedMessage
 from recorder.columns.run import ADAPTIVE, RunColumns
 from recorder.columns.run_reader import read_run, read_segments
-from recorder.message import RecordedMessage
-from recorder.panels import charts, overview
+from recorder.panels import signals
 from recorder.panels.base import TimePlot
 
 ROWS = 5
@@ -43,13 +43,13 @@ def run() -> RunColumns:
 
 
 def test_both_predictions_are_drawn_and_the_one_that_judges_is_named(run: RunColumns) -> None:
-    (plot,) = [item for item in overview.draw(run) if isinstance(item, TimePlot)]
+    (plot,) = [item for item in signals.draw_overview(run) if isinstance(item, TimePlot)]
     legends = {series.name: series.legend for series in plot.series}
     assert legends["predicted"] == "predicted by black-box"
     assert legends["predicted beside"] == "arx, for comparison"
     beside = next(series for series in plot.series if series.name == "predicted beside")
     np.testing.assert_array_equal(beside.value, 400.0 + np.arange(1, ROWS + 1))
-    assert [item.title for item in charts.draw(run)] == ["Residual of T"]
+    assert [item.title for item in signals.draw_charts(run)] == ["Residual of T"]
 
 
 def test_a_recursive_model_that_judges_is_drawn_as_one_that_adapts(run: RunColumns) -> None:

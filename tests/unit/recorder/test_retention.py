@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.policy.retention import CompleteRecording, Limits, select_deletions
+from recorder.keep import CompleteRecording, Limits, select_deletions
 
 FILES = [CompleteRecording(Path(f"{name}.mcap"), 100, at) for name, at in (("c", 30), ("a", 10), ("b", 20))]
 
@@ -35,6 +35,11 @@ def test_the_oldest_go_until_the_rest_and_the_file_being_written_are_within_limi
 def test_when_no_file_is_being_written_none_goes_for_it() -> None:
     assert select_deletions(FILES, None, Limits(files=3, size_bytes=300), 40) == []
     assert [path.stem for path in select_deletions(FILES, None, Limits(files=2), 40)] == ["a"]
+
+
+def test_the_last_recording_stays_however_large_it_is_and_goes_with_its_age() -> None:
+    assert [path.stem for path in select_deletions(FILES, None, Limits(size_bytes=10), 40)] == ["a", "b"]
+    assert [path.stem for path in select_deletions(FILES, None, Limits(age_ns=5), 40)] == ["a", "b", "c"]
 
 
 def test_what_a_black_box_still_needs_stays() -> None:

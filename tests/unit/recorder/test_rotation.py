@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.policy.rotation import SECOND_NS, FlushAndRotation, Fsync
+from recorder.keep import SECOND_NS, FlushAndRotation, Fsync
 
 HALF = SECOND_NS // 2
 START = 1_000 * SECOND_NS

@@ -8,11 +8,12 @@ import pytest
 from reactorwatch.cli.recording_reports import info_object, info_text
 from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import Record
+from recorder import RecordedMessage
 from recorder.columns.run_reader import read_run
-from recorder.message import RecordedMessage
-from recorder.tools.convert import export_csv
+from recorder.files.recording import read_messages
+from recorder.files.writer import RecordingWriter
+from recorder.tools.convert import export_csv, read_record
 from recorder.tools.inspect import inspect, zero_ns_of
-from recorder.tools.mcap_file import RecordingWriter, read_messages, read_record
 from recorder.tools.player import Player, filter_playable, samples_of
 
 SECOND = 1_000_000_000

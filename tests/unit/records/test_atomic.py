@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write, is_disk_full
+from reactorwatch.errors import InputError, is_passing
+from reactorwatch.records.atomic import atomic_write
 
 
 def test_the_new_file_takes_the_place_of_the_old_when_the_block_ends(tmp_path: Path) -> None:
@@ -43,7 +43,7 @@ def test_an_exception_leaves_the_old_file_and_nothing_beside_it(
 
     with pytest.raises(raised, match=said) as caught:
         fail()
-    assert is_disk_full(caught.value) == is_disk_full(error)
+    assert is_passing(caught.value) == is_passing(error)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 

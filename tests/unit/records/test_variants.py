@@ -178,7 +178,7 @@ REFUSED = {
     "a day or a month": (
         table([f"03/04/2026 10:{row // 60:02d}:{row % 60:02d}" for row in range(ROWS)], cells(), STAMPS),
         FileFormat(),
-        "day and month are ambiguous; state --time-format",
+        "day and month are ambiguous in all rows, such as '03/04/2026 10:00:00'; state --dates month-first or --dates",
     ),
     "summer time ends, no zone": (
         table(FALLS, cells(), STAMPS),
@@ -239,6 +239,8 @@ def test_what_can_be_read_in_several_ways_is_refused_with_the_option_that_decide
         ("a comma that may be a thousand", FileFormat(decimal=".")),
         ("the comma twice", FileFormat(decimal=",")),
         ("columns of text", FileFormat(missing=("low", "high"))),
+        ("a day or a month", FileFormat(dates="day-first")),
+        ("a day or a month", FileFormat(dates="month-first")),
         ("a day or a month", FileFormat(time_format="%d/%m/%Y %H:%M:%S")),
         ("a day or a month", FileFormat(time_format="%m/%d/%Y %H:%M:%S")),
         ("summer time ends, no zone", FileFormat(zone="Europe/Berlin")),
@@ -263,6 +265,7 @@ def test_the_option_that_is_named_settles_it(tmp_path: Path, name: str, stated: 
         ({"period": "-4 s"}, "--period must be a positive number"),
         ({"time_format": "%Y-%Q"}, "--time-format '%Y-%Q': unknown directive '%Q'"),
         ({"time_format": "%Y-%Y"}, "--time-format '%Y-%Y': each part once"),
+        ({"dates": "us"}, "unknown --dates 'us'.*month-first"),
         ({"zone": "Mars/Olympus"}, "--zone must be a time zone such as Europe/Berlin"),
     ],
 )

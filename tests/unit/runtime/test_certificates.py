@@ -2,6 +2,7 @@
 
 import datetime
 import json
+import os
 import shutil
 import stat
 import tomllib
@@ -78,6 +79,19 @@ def test_a_folder_holds_a_certificate_with_its_key_and_the_settings_to_use_them(
             certificate=str(folder / "certificate.pem"),
             key=str(folder / "key.pem"),
         )
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o002, 0o027, 0o077])
+def test_all_folders_of_a_site_are_for_their_owner_alone_whatever_the_umask(tmp_path: Path, umask: int) -> None:
+    site, before = tmp_path / "new" / "site", os.umask(umask)
+    try:
+        make_site(site, ("a", "b"), ENDPOINT, ENDPOINT, 10.0, NOW)
+        make_site(site, ("c",), ENDPOINT, ENDPOINT, 10.0, NOW)
+    finally:
+        os.umask(before)
+    folders = [site.parent, *(path for path in (site, *site.rglob("*")) if path.is_dir())]
+    assert len(folders) == 2 + 2 + 3 * (1 + len(ROLES))
+    assert {stat.S_IMODE(folder.stat().st_mode) for folder in folders} == {0o700}
 
 
 def test_private_keys_are_for_their_owner_s_eyes_and_the_authority_s_lies_in_one_place(tmp_path: Path) -> None:

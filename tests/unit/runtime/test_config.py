@@ -68,7 +68,7 @@ def test_an_endpoint_that_is_none_is_refused(endpoint: str) -> None:
 
 
 def test_every_node_has_a_table() -> None:
-    nodes = {"bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log"}
+    nodes = {"bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log", "limits"}
     assert set(SECTIONS) == nodes
 
 
@@ -86,6 +86,11 @@ def test_settings_that_are_written_are_read_as_they_were(tmp_path: Path) -> None
     tables = read_settings(path)
     for name, settings in written.items():
         assert section(type(settings), name, tables, {}) == settings
+
+
+def test_a_key_that_has_no_effect_any_more_is_still_read() -> None:
+    tables = {"monitor": {"alarm_state_file": "alarms.state", "state_file": "monitor.state"}}
+    assert section(MonitorConfig, "monitor", tables, {}).state_file == "monitor.state"
 
 
 def test_an_older_name_of_a_key_is_valid_and_both_together_are_not() -> None:

@@ -113,6 +113,37 @@ def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(
     assert ahead[0] <= 100 + 2
 
 
+def test_a_node_that_publishes_what_it_receives_itself_does_not_wait_for_room_in_its_full_inbox(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The bus takes a publication only when a receiver that waits for room has handed over the messages before."""
+    monkeypatch.setattr("reactorwatch.runtime.event_loop.MAX_INBOX_MESSAGES", 2)
+    has_handed_over = threading.Event()
+    waits: list[bool] = []
+
+    class Blocking(MemoryBus):
+        def publish(self, message: Encoded) -> None:
+            waits.append(has_handed_over.wait(WITHIN_S))
+
+    exchange = Exchange()
+    loop = EventLoop(Echo(ticks=1), Blocking(exchange), StopSignal())
+    loop.subscribe("in/**")
+    speaker = MemoryBus(exchange)
+    for number in range(2):
+        speaker.publish(Encoded(f"in/{number}", b"", ""))
+
+    def receive() -> None:
+        for number in range(2, 1000):
+            speaker.publish(Encoded(f"in/{number}", b"", ""))
+        has_handed_over.set()
+
+    receiver = threading.Thread(target=receive)
+    receiver.start()
+    loop.run()
+    receiver.join(WITHIN_S)
+    assert waits[0]
+
+
 def test_a_stop_wakes_a_loop_that_waits_for_nothing() -> None:
     stop, node = StopSignal(), Echo()
     thread = threading.Thread(target=EventLoop(node, MemoryBus(Exchange()), stop).run)

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.parallel.jobs import RETRIES, Executor, Failed, SerialExecutor, choose_executor, in_job_order
+from reactorwatch.runtime.parallel import choose_executor
+from reactorwatch.runtime.parallel.jobs import RETRIES, Executor, Failed, SerialExecutor, in_job_order
 from reactorwatch.runtime.parallel.process_pool import THREADS, ProcessExecutor, available_cores
 from tests.cluster import dask_cluster
 from tests.running import WITHIN_S

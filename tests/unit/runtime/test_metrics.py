@@ -2,7 +2,9 @@
 
 import socket
 import sys
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from urllib.request import urlopen
 
 import pytest
@@ -200,13 +202,45 @@ def test_the_page_goes_with_the_node(port: int) -> None:
         page(port, "plant")
 
 
-def test_a_port_that_is_taken_is_told_with_the_node_and_the_address(port: int) -> None:
+class Lines:
+    """A log that a test waits for."""
+
+    def __init__(self) -> None:
+        self.warnings, self.served = list[str](), threading.Event()
+
+    def warning(self, text: str) -> None:
+        self.warnings.append(text)
+
+    def info(self, _event: str, **_fields: str) -> None:
+        self.served.set()
+
+
+def test_a_port_that_is_taken_stops_no_node_health_says_so_and_it_is_served_once_it_is_free(
+    port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    with socket.create_server((LOOPBACK, port + 1)):
-        metrics = serve_metrics(MetricsConfig(port=port), Metrics("monitor", {"R-101": None}))
-        said = rf"\[metrics\] port {port}: the monitor cannot listen at 127\.0\.0\.1:{port + 1}: "
-        with pytest.raises(InputError, match=said), metrics:
-            pass
+    monkeypatch.setattr("reactorwatch.runtime.metrics.log", lines := Lines())
+    key = "reactor/R-101/health/monitor"
+    taken = socket.create_server((LOOPBACK, port + 1))
+    with closing(taken), serve_metrics(MetricsConfig(port=port), Metrics("monitor", {"R-101": None})) as metrics:
+        assert metrics is not None
+        metrics.on_publish(Publication(key, without := Health()))
+        said = f"[metrics] port {port}: the monitor cannot listen at 127.0.0.1:{port + 1}: Address already in use"
+        assert without.waiting_for == said
+        taken.close()
+        assert lines.served.wait(WITHIN_S)
+        metrics.on_publish(Publication(key, served := Health(received=7)))
+        assert not served.waiting_for
+        assert page(port)['reactorwatch_messages_received_total{node="monitor",plant="R-101"}'] == 7
+    assert lines.warnings == [said]
+
+
+def test_a_node_ends_at_once_while_its_port_is_taken(port: int) -> None:
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    with socket.create_server((LOOPBACK, port)):
+        with serve_metrics(MetricsConfig(port=port), Metrics("plant")) as metrics:
+            assert metrics is not None
+        assert "metrics" not in {thread.name for thread in threading.enumerate()}
 
 
 def test_without_the_library_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

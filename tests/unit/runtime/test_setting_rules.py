@@ -15,6 +15,7 @@ from monitor_node.fleet.config import FleetConfig
 from plant_node.config import PlantConfig
 from reactorwatch.cli.supervise import diagnosis_settings
 from reactorwatch.errors import InputError
+from reactorwatch.limits import Limits
 from reactorwatch.runtime.config import SECTIONS, BusConfig, LogConfig, MetricsConfig, section
 from reactorwatch.runtime.setting_rules import MAX_SPAN_S, PROTOCOLS, check_endpoint, valid_choices
 from recorder.__main__ import build_black_box
@@ -30,6 +31,7 @@ TABLES: dict[str, type[msgspec.Struct]] = {
     "diagnosis": DiagnosisConfig,
     "metrics": MetricsConfig,
     "log": LogConfig,
+    "limits": Limits,
 }
 KEYS = [(table, field.name) for table, kind in TABLES.items() for field in msgspec.structs.fields(kind)]
 
@@ -123,6 +125,7 @@ def test_every_table_with_bounds_is_tried() -> None:
         "recorder",
         "diagnosis",
         "metrics",
+        "limits",
     }
 
 

@@ -10,6 +10,7 @@ from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart
+from reactorwatch.stored_state import copy_of
 from tests.unit.spc.members import MEMBERS, Member, value
 
 COMPILED_CHARTS = [chart for chart in CHARTS if issubclass(chart, CompiledChart)]
@@ -22,8 +23,8 @@ def member(request: pytest.FixtureRequest) -> Member:
 
 
 def restored(chart: Any) -> Any:
-    """The chart from its state's bytes."""
-    return type(chart).from_state(type(chart.state).from_bytes(chart.state.to_bytes()))
+    """The chart from the bytes of its memory."""
+    return type(chart).resume(copy_of(chart.memory))
 
 
 def test_stopped_and_gone_on_is_never_stopped(member: Member) -> None:
@@ -43,20 +44,20 @@ def test_what_is_no_number_is_refused_and_leaves_no_trace(member: Member, bad: f
         assert chart.update(x) == undisturbed.update(x)
     spoilt = np.array(samples[4])
     spoilt.flat[0] = bad
-    before = chart.state
+    before = chart.memory.to_bytes()
     with pytest.raises(ValueError, match="a chart takes finite values"):
         chart.update(spoilt if spoilt.ndim else float(spoilt))
-    assert chart.state == before
+    assert chart.memory.to_bytes() == before
     assert chart.update(samples[4]) == undisturbed.update(samples[4])
 
 
 def test_memory_is_bounded(member: Member) -> None:
-    """After 3,000 samples the state takes no more bytes than after 10, but for how long its numbers are written."""
+    """After 3,000 samples the memory takes no more bytes than after 10, but for how long its numbers are written."""
     chart = member.new()
     sizes = []
     for x in member.sample(np.random.default_rng(3), 3000):
         chart.update(x)
-        sizes.append(len(chart.state.to_bytes()))
+        sizes.append(len(chart.memory.to_bytes()))
     assert max(sizes[10:]) <= max(sizes[:10]) + 9
 
 
@@ -66,7 +67,7 @@ def test_restarted_is_as_new(member: Member) -> None:
     for x in samples[:10]:
         chart.update(x)
     chart.restart()
-    assert chart.state == fresh.state
+    assert chart.memory.to_bytes() == fresh.memory.to_bytes()
     assert [chart.update(x) for x in samples[10:]] == [fresh.update(x) for x in samples[10:]]
 
 
@@ -113,31 +114,31 @@ def test_a_bank_gives_the_bits_of_the_single_chart(kind: type[CompiledChart]) ->
             else:
                 assert np.isnan(said.statistic[plant])
                 assert not said.out[plant]
-        bank = Bank.from_state(kind, type(bank.state).from_bytes(bank.state.to_bytes()))
-    assert all(bank.chart(plant).state == chart.state for plant, chart in enumerate(singles))
+        bank = Bank.resume(kind, copy_of(bank.memory))
+    assert all(bank.chart(plant).memory.to_bytes() == chart.memory.to_bytes() for plant, chart in enumerate(singles))
 
 
 def test_a_bank_refuses_a_row_as_a_whole() -> None:
     bank = Bank([Ewma(0.0, 1.0) for _ in range(3)])
-    before = bank.state
+    before = bank.memory.to_bytes()
     with pytest.raises(ValueError, match="plant 1: a chart takes finite values"):
         bank.update([1.0, np.nan, 1.0])
     with pytest.raises(ValueError, match=r"values must have shape \(3,\), got \(2,\)"):
         bank.update([1.0, 1.0])
-    assert bank.state == before
+    assert bank.memory.to_bytes() == before
 
 
 def test_a_bank_restarts_the_plants_it_is_told() -> None:
     bank = Bank([Ewma(0.0, 1.0) for _ in range(3)])
     bank.update([1.0, 2.0, 3.0])
     bank.restart(np.array([False, True, False]))
-    assert bank.chart(1).state == Ewma(0.0, 1.0).state
-    assert bank.chart(2).state != Ewma(0.0, 1.0).state
+    assert bank.chart(1).memory.to_bytes() == Ewma(0.0, 1.0).memory.to_bytes()
+    assert bank.chart(2).memory.to_bytes() != Ewma(0.0, 1.0).memory.to_bytes()
 
 
-def test_a_state_of_another_chart_is_refused() -> None:
-    with pytest.raises(ValueError, match="state must be of the chart shewhart, got ewma"):
-        Shewhart.from_state(Ewma(0.0, 1.0).state)
+def test_a_memory_of_another_chart_is_refused() -> None:
+    with pytest.raises(ValueError, match="the memory must be of the chart shewhart, got ewma"):
+        Shewhart.resume(Ewma(0.0, 1.0).memory)
 
 
 @pytest.mark.parametrize(

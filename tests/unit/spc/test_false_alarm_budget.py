@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from monitor_node.alarms.on_off_delay import OnOffDelay
+from monitor_node.alarms.alarms import Condition, OnOffDelay
 from reactorwatch.errors import InputError
 from reactorwatch.spc import false_alarm_budget as budget
 from reactorwatch.spc.charts import cusum, ewma, shewhart
@@ -145,11 +145,11 @@ def test_the_width_of_a_rule_of_several_points_gives_its_rate() -> None:
     width = shewhart.designed_width(budget.point_probability(3000.0, 3, 5), KNOWN)
     out = np.abs(np.random.default_rng(5).normal(size=1_000_000)) > width
     alarms = 0
-    rule = OnOffDelay(3, 5, 1)
+    rule, condition = OnOffDelay(3, 5, 1), Condition()
     for point in out.tolist():
-        if rule.update(point):
+        if rule.update(condition, point):
             alarms += 1
-            rule = OnOffDelay(3, 5, 1)
+            condition = Condition()
     assert alarms * 3000.0 / out.size == pytest.approx(1.0, abs=4 / np.sqrt(333))
 
 

@@ -107,7 +107,7 @@ def test_the_covariance_is_that_of_correlated_scores() -> None:
     x = signal.lfilter([np.sqrt(1.0 - r * r)], [1.0, -r], rng.standard_normal(rows))
     e = 0.1 * signal.lfilter([np.sqrt(1.0 - q * q)], [1.0, -q], rng.standard_normal(rows))
     chart = parameter_drift.learn(np.column_stack([x, np.ones(rows)]), e, 0.999, rows, 1e4, ["b1", "c"], past_outputs=0)
-    root = np.array(chart.state.root)
+    root = chart.memory.root
     covariance = np.linalg.inv(root.T @ root) / (2.0 * 0.001 / 1.999)
     tolerance = 4.0 * np.sqrt(2.0 / (0.4 * rows ** (2 / 3)))
     assert covariance[0, 0] == pytest.approx(0.01 * (1 + r * q) / (1 - r * q), rel=tolerance)
@@ -125,7 +125,7 @@ def test_the_difference_has_the_variance_of_two_weighted_means() -> None:
     chart = parameter_drift.learn(x[:, None], e, FORGETTING, 60, 1e4, ["b1"], past_outputs=0)
     weights = FORGETTING ** np.arange(5000)
     exact = sum(np.sum(w**2) / np.sum(w) ** 2 for w in (weights, weights[:60]))
-    assert 1.0 / chart.state.root[0][0] ** 2 == pytest.approx(exact, rel=4.0 * np.sqrt(2.0 / (0.4 * rows ** (2 / 3))))
+    assert 1.0 / chart.memory.root[0, 0] ** 2 == pytest.approx(exact, rel=4.0 * np.sqrt(2.0 / (0.4 * rows ** (2 / 3))))
 
 
 def test_a_changed_gain_is_seen_and_blamed_on_the_input() -> None:

@@ -6,9 +6,10 @@ from scipy import signal, stats
 
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Array
-from reactorwatch.spc.charts.parameters import ParameterState, ParameterT2
+from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.run_length.design import mewma_limit
 from reactorwatch.spc.run_length.parameters import parameter_limit, prepare_limit
+from reactorwatch.stored_state import copy_of
 from tests.unit.spc.members import COVARIANCE, ROOT, difference
 
 NAMES = ["a1", "b1", "c"]
@@ -77,10 +78,10 @@ def test_a_parameter_that_alone_moves_has_all_of_the_statistic() -> None:
 def test_stopped_with_its_excitation_and_gone_on_is_never_stopped() -> None:
     steady, stopped = chart(), chart()
     for row, d in zip(0.5 * rows(7, 40), difference(np.random.default_rng(7), 40), strict=True):
-        stopped = ParameterT2.from_state(ParameterState.from_bytes(stopped.state.to_bytes()))
+        stopped = ParameterT2.resume(copy_of(stopped.memory))
         assert stopped.update(d, row) == steady.update(d, row)
     stopped.restart()
-    assert stopped.state == chart().state != steady.state
+    assert stopped.memory.to_bytes() == chart().memory.to_bytes() != steady.memory.to_bytes()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
@@ -88,7 +89,7 @@ def test_a_regressor_that_is_no_number_is_refused_and_leaves_no_trace(bad: float
     watched = chart()
     with pytest.raises(ValueError, match="a chart takes finite values"):
         watched.update([0.1, 0.1, 0.1], [1.0, bad, 1.0])
-    assert watched.state == chart().state
+    assert watched.memory.to_bytes() == chart().memory.to_bytes()
 
 
 def test_a_wrong_number_of_parameters_is_refused() -> None:
@@ -113,10 +114,11 @@ def test_settings_out_of_range_are_named(arguments: tuple[object, ...], message:
         ParameterT2(*arguments)  # type: ignore[arg-type]
 
 
-def test_a_damaged_state_is_refused() -> None:
-    state = chart().state
+def test_a_damaged_memory_is_refused() -> None:
+    memory = chart().memory
+    memory.excitation = np.array([[1.0, 0.0]])
     with pytest.raises(ValueError, match="excitation must be 2 rows of finite numbers"):
-        ParameterT2.from_state(ParameterState(NAMES, state.root, 16.0, state.inputs, 0.99, [[1.0, 0.0]]))
+        ParameterT2.resume(memory)
 
 
 @pytest.mark.parametrize(("dimension", "weight"), [(1, 0.1), (3, 0.01), (7, 0.001)])

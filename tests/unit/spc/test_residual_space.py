@@ -142,7 +142,7 @@ def test_a_missing_signal_is_replaced_by_its_mean_given_the_others() -> None:
     filled = chart.fill(row)
     assert filled is not None
     p = len(row)
-    matrix, centre = chart.numbers[1 + 2 * p :].reshape(p, p), chart.numbers[1 : 1 + p]
+    matrix, centre = chart.memory.numbers[1 + 2 * p :].reshape(p, p), chart.memory.numbers[1 : 1 + p]
     assert (matrix @ (filled - centre))[[1, 4]] == pytest.approx(0.0, abs=1e-9)
     assert np.delete(filled, [1, 4]) == pytest.approx(np.delete(values[17], [1, 4]))
     row[[0, 2]] = np.nan

@@ -18,8 +18,8 @@ from functools import cache
 
 import casadi as ca
 
-from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
-from reactorwatch.process.places import INPUT, SENSOR, SOURCE, Place
+from reactorwatch.process.model import Output, Place, ProcessModel, new_clock, parameter, variable
+from reactorwatch.process.places import INPUT, SENSOR, SOURCE
 
 SMALL_LEVEL_V = 0.01
 """Level in V below which its root is replaced by a straight line; at 1 V that changes it by less than 3 in 100,000."""

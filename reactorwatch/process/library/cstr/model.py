@@ -17,8 +17,8 @@ from functools import cache
 
 import casadi as ca
 
-from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
-from reactorwatch.process.places import CAPACITY, FACTOR, INPUT, SENSOR, SOURCE, Place
+from reactorwatch.process.model import Output, Place, ProcessModel, new_clock, parameter, variable
+from reactorwatch.process.places import CAPACITY, FACTOR, INPUT, SENSOR, SOURCE
 
 SMALLEST_COOLANT_FLOW = 1e-6
 """l/min. A smaller flow counts as this: K2 qc (1 - exp(-K3/qc)) goes to zero with qc, but K3/qc is undefined there."""

@@ -19,8 +19,8 @@ from functools import cache
 
 import casadi as ca
 
-from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
-from reactorwatch.process.places import FACTOR, SENSOR, SOURCE, Place
+from reactorwatch.process.model import Output, Place, ProcessModel, new_clock, parameter, variable
+from reactorwatch.process.places import FACTOR, SENSOR, SOURCE
 
 SMALL_LEVEL_CM = 0.01
 """Difference of levels below which the root becomes a straight line; at 1 cm that changes it by 3 in 100,000."""

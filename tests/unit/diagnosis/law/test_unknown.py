@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.estimates import covariances_of
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
-from reactorwatch.diagnosis.law.describe import describe_law
+from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
 from reactorwatch.diagnosis.law.fit import select_terms
 from reactorwatch.diagnosis.law.formula import round_reference
 from reactorwatch.diagnosis.law.unknown import Unknown, find_laws, fit_places, start_places
@@ -111,7 +112,8 @@ def test_the_curves_of_smooth_correction_and_formula_agree() -> None:
 
 def described(kind: str) -> Law:
     model, run, unknown = found(kind)
-    return describe_law(model, run, unknown, {})
+    law, hypothesis = law_hypothesis(unknown.laws[0], run, model, {})
+    return describe_law(model, run, unknown, law, covariances_of(run, hypothesis), {})
 
 
 def test_only_functions_that_are_worth_their_charge_are_selected() -> None:

@@ -4,7 +4,7 @@ from typing import TypeVar
 
 from google.protobuf.message import Message
 
-from monitor_node.alarms.alarms import ChartAlarm, Explanation
+from monitor_node.alarms.alarms import AlarmChange, ChartAlarm, Explanation
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract.codec import Publication
@@ -42,7 +42,7 @@ class Desk:
         raised = alarm.update(judgement)
         if raised is not None:
             explanation = Explanation(f"{alarm.name} is out", {}) if raised else None
-            self.said.append(self.board.record_change(alarm, to_time_ns(minutes), judgement, "K", explanation))
+            self.said += self.board.apply(to_time_ns(minutes), [AlarmChange(alarm, judgement, "K", explanation)])
 
     def told(self, kind: type[M]) -> list[M]:
         """The messages of a kind."""

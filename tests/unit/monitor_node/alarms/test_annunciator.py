@@ -6,14 +6,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor_node.alarms.alarms import SuspectedCause
-from monitor_node.alarms.states import Event, State
+from monitor_node.alarms.alarms import AlarmChange, Explanation, SuspectedCause
+from monitor_node.alarms.annunciator import AnnunciatorMemory
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.contract.alarm_states import Event, State
 from reactorwatch.contract.codec import encode
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, AlarmState
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, AlarmState, Incident
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.spc.charts.base import Judgement
@@ -91,11 +92,11 @@ def test_a_spike_takes_no_suspects_away_from_the_incident_that_stands(spike_min:
     desk = Desk(msgspec.structs.replace(AT_ONCE, incident_min=60.0))
     spike = desk.board.declare("spike", "T", without_on_delay=True, names_cause=True, is_transient=True)
     desk.point(0.0, T=OUT)
-    desk.board.set_suspects(to_time_ns(1.0), [SuspectedCause("coolant_flow", 0.9)])
+    desk.board.set_suspects([SuspectedCause("coolant_flow", 0.9)])
     for minute, out in ((spike_min, True), (spike_min + 0.1, False)):
         judgement = Judgement(9.0 if out else 0.0, 0.0, -6.0, 6.0, out)
         desk.judge(spike, minute, judgement)
-    desk.board.set_suspects(to_time_ns(spike_min + 1.0), [SuspectedCause("coolant_flow", 0.95)])
+    desk.board.set_suspects([SuspectedCause("coolant_flow", 0.95)])
     assert [item.probability for item in desk.board.alarm("shewhart/T").suspects] == [0.95]
     assert desk.board.alarm("spike/T").incident == desk.board.incident == 1
     assert not desk.board.alarm("spike/T").first_in
@@ -119,13 +120,76 @@ def test_a_clock_that_is_set_back_begins_a_new_incident() -> None:
     assert [alarm.incident for alarm in desk.told(Alarm)] == [1, 2]
 
 
+def test_an_incident_is_published_with_each_change_of_it_and_only_then() -> None:
+    desk = Desk()
+    desk.point(0.5, T=OUT)
+    desk.point(1.0, T=OUT)  # nothing changes
+    desk.board.set_suspects([SuspectedCause("coolant_flow", 0.9)])
+    desk.point(2.0, C=OUT)  # suspects and a second alarm: one message
+    desk.board.set_suspects([SuspectedCause("coolant_flow", 0.9)])
+    desk.point(3.0, C=OUT)  # the same suspects again
+    desk.said += desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Anna", "")  # C is unacknowledged still
+    desk.said += desk.board.act("shewhart/C", Event.ACKNOWLEDGE, "Anna", "")
+    desk.point(4.0, T=IN)
+    desk.point(5.0, C=IN)
+    published = [
+        (item.time_ns, list(item.alarms), [s.cause for s in item.suspects], item.state, item.until_ns)
+        for item in desk.told(Incident)
+    ]
+    first, both = ["shewhart/T"], ["shewhart/T", "shewhart/C"]
+    assert published == [
+        (to_time_ns(0.5), first, [], AlarmState.ALARM_STATE_UNACKNOWLEDGED, 0),
+        (to_time_ns(2.0), both, ["coolant_flow"], AlarmState.ALARM_STATE_UNACKNOWLEDGED, 0),
+        (to_time_ns(3.0), both, ["coolant_flow"], AlarmState.ALARM_STATE_ACKNOWLEDGED, 0),
+        (to_time_ns(5.0), both, ["coolant_flow"], AlarmState.ALARM_STATE_NORMAL, to_time_ns(5.0)),
+    ]
+    assert {(item.number, item.since_ns) for item in desk.told(Incident)} == {(1, to_time_ns(0.5))}
+    keys = {item.key for item in desk.said if isinstance(item.message, Incident)}
+    assert keys == {"reactor/cstr/incident/1"}
+
+
+def test_the_suspects_of_an_alarm_are_those_of_its_incident_at_its_own_changes() -> None:
+    desk = Desk()
+    desk.point(0.5, T=OUT)
+    desk.board.set_suspects([SuspectedCause("coolant_flow", 0.9)])
+    desk.point(1.0, C=OUT)
+    desk.board.set_suspects([SuspectedCause("feed_flow", 0.7)])
+    desk.point(2.0, T=IN)
+    desk.point(3.0, C=OUT)
+    published = [(item.alarm, item.event, [s.cause for s in item.suspects]) for item in desk.told(Alarm)]
+    assert published == [
+        ("shewhart/T", "raised", []),
+        ("shewhart/C", "raised", ["coolant_flow"]),
+        ("shewhart/T", "cleared", ["feed_flow"]),
+    ]
+    assert [s.cause for s in desk.board.alarm("shewhart/C").suspects] == ["feed_flow"], "a list has the newest"
+
+
+def test_an_incident_that_a_later_one_follows_keeps_its_suspects_and_is_published_until_it_is_over() -> None:
+    desk = Desk(msgspec.structs.replace(AT_ONCE, incident_min=30.0))
+    desk.point(1.0, T=OUT)
+    desk.board.set_suspects([SuspectedCause("coolant_flow", 0.9)])
+    desk.point(2.0, T=OUT)
+    desk.point(60.0, T=OUT, C=OUT)
+    desk.board.set_suspects([SuspectedCause("feed_flow", 0.7)])
+    desk.point(61.0, T=IN)
+    desk.said += desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Anna", "")
+    newest = {item.number: item for item in desk.told(Incident)}
+    assert [s.cause for s in newest[1].suspects] == ["coolant_flow"]
+    assert [s.cause for s in newest[2].suspects] == ["feed_flow"]
+    assert (newest[1].until_ns, newest[1].state) == (to_time_ns(61.0), AlarmState.ALARM_STATE_NORMAL)
+    assert (newest[2].until_ns, newest[2].state) == (0, AlarmState.ALARM_STATE_UNACKNOWLEDGED)
+    assert [s.cause for s in desk.board.alarm("shewhart/T").suspects] == ["coolant_flow"]
+    assert [item.number for item in desk.board.memory.incidents] == [2], "one that is over is forgotten"
+
+
 # --- out of sight --------------------------------------------------------------------------------------------
 
 
 def test_a_shelf_ends_with_its_time_and_a_standing_alarm_comes_up_again() -> None:
     desk = Desk()
     desk.point(0, T=OUT)
-    (change, _) = desk.board.shelve("shewhart/T", 10.0, "Anna", "known")
+    (change, *_) = desk.board.shelve("shewhart/T", 10.0, "Anna", "known")
     assert isinstance(change.message, Alarm)
     assert change.message.shelved_until_ns == to_time_ns(10.0)
     desk.point(9.9, T=OUT)
@@ -145,8 +209,7 @@ def test_what_happens_out_of_sight_is_told_and_counts_when_it_comes_up() -> None
     assert (hidden.event, hidden.state, hidden.incident) == ("raised", AlarmState.ALARM_STATE_SUPPRESSED_BY_DESIGN, 0)
     assert hidden.comment == "start-up"
     assert desk.figures().alarms_10min == 0
-    change, figures = desk.board.act("shewhart/T", Event.UNSUPPRESS, "Anna", "")
-    desk.said += [change, figures]
+    desk.said += desk.board.act("shewhart/T", Event.UNSUPPRESS, "Anna", "")
     shown = desk.told(Alarm)[-1]
     assert (shown.state, shown.incident, shown.first_in) == (AlarmState.ALARM_STATE_UNACKNOWLEDGED, 1, True)
     assert (shown.time_ns, shown.raised_ns) == (to_time_ns(1.0), to_time_ns(1.0))
@@ -184,10 +247,25 @@ def busy_desk() -> Desk:
     return desk
 
 
+def stored(desk: Desk) -> AnnunciatorMemory:
+    """The memory of a board, as it is read back."""
+    return AnnunciatorMemory.from_bytes(desk.board.memory.to_bytes())
+
+
+def test_a_change_that_an_error_kept_from_being_applied_is_found_again() -> None:
+    desk, out = Desk(), Judgement(OUT, 0.0, -3.0, 3.0, True)
+    assert desk.alarm().update(out) is True
+    again = desk.board.declare("shewhart", "T")  # as the pipeline does that is made after the error
+    assert again.update(out) is True
+    desk.said += desk.board.apply(to_time_ns(1.0), [AlarmChange(again, out, "K", Explanation("out", {}))])
+    assert desk.changes() == [("shewhart/T", "raised")]
+    assert desk.board.declare("shewhart", "T").update(out) is None, "one that is active is not raised again"
+
+
 def test_a_board_that_was_stored_goes_on_as_if_nothing_had_happened() -> None:
     stayed, gone = busy_desk(), busy_desk()
     back = Desk()
-    back.board.from_bytes(gone.board.to_bytes())
+    back.board.restore(stored(gone))
     stayed.said.clear()
     rows: list[tuple[float, dict[str, float]]] = [
         (2, {"T": OUT, "C": OUT}),
@@ -208,7 +286,7 @@ def test_a_board_that_was_stored_goes_on_as_if_nothing_had_happened() -> None:
         encode(item) for item in back.said if isinstance(item.message, Alarm)
     ]
     assert encode(stayed.said[-1]) == encode(back.said[-1])
-    assert stayed.board.to_bytes() == back.board.to_bytes()
+    assert stayed.board.memory.to_bytes() == back.board.memory.to_bytes()
 
 
 def test_figures_of_each_minute_carry_its_time_and_follow_what_time_alone_changes() -> None:
@@ -226,45 +304,39 @@ def test_figures_of_each_minute_carry_its_time_and_follow_what_time_alone_change
 
 def test_an_alarm_that_there_is_no_more_is_left_out() -> None:
     desk = Desk(signals=("T",))
-    desk.board.from_bytes(busy_desk().board.to_bytes())
+    desk.board.restore(stored(busy_desk()))
     assert [alarm.alarm for alarm in desk.board.all_alarms()] == ["shewhart/T"]
     assert desk.alarm().memory.state is State.ACKNOWLEDGED
 
 
-def test_bytes_that_were_cut_anywhere_are_refused_and_change_nothing() -> None:
-    data, desk = busy_desk().board.to_bytes(), Desk()
-    before = desk.board.to_bytes()
+def test_bytes_that_were_cut_anywhere_are_refused() -> None:
+    data = busy_desk().board.memory.to_bytes()
     for length in range(len(data)):
-        with pytest.raises(InputError, match=r"^is no alarm state: "):
-            desk.board.from_bytes(data[:length])
-    assert desk.board.to_bytes() == before
+        with pytest.raises(ValueError, match=r"^not a AnnunciatorMemory: "):
+            AnnunciatorMemory.from_bytes(data[:length])
 
 
 @given(st.data())
 @settings(max_examples=300)
 def test_bytes_that_were_changed_anywhere_are_refused_or_harm_nothing(data: st.DataObject) -> None:
-    stored = bytearray(busy_desk().board.to_bytes())
+    changed = bytearray(busy_desk().board.memory.to_bytes())
     for _ in range(data.draw(st.integers(1, 3))):
-        stored[data.draw(st.integers(0, len(stored) - 1))] = data.draw(st.integers(0, 255))
+        changed[data.draw(st.integers(0, len(changed) - 1))] = data.draw(st.integers(0, 255))
     desk = Desk()
     try:
-        desk.board.from_bytes(bytes(stored))
-    except InputError:
+        desk.board.restore(AnnunciatorMemory.from_bytes(bytes(changed)))
+    except ValueError:
         return
     for minute in range(2, 6):
         desk.point(minute, T=OUT if minute % 2 else IN, C=IN)
     desk.board.all_alarms()
-    desk.board.to_bytes()
+    desk.board.memory.to_bytes()
 
 
-def test_a_state_of_another_plant_is_refused() -> None:
-    desk = Desk(msgspec.structs.replace(AT_ONCE, plant="R-101"))
-    with pytest.raises(InputError, match="is the alarm state of plant 'cstr', not of 'R-101'"):
-        desk.board.from_bytes(busy_desk().board.to_bytes())
-
-
-def test_a_state_that_cannot_be_is_refused() -> None:
-    stored = msgspec.msgpack.decode(busy_desk().board.to_bytes())
-    stored["alarms"]["shewhart/T"]["state"] = "normal"
+def test_a_state_that_cannot_be_is_refused_and_changes_nothing() -> None:
+    memory, desk = stored(busy_desk()), Desk()
+    memory.alarms["shewhart/T"].state = State.NORMAL
+    before = desk.board.memory.to_bytes()
     with pytest.raises(InputError, match="shewhart/T is normal, but its condition is active"):
-        Desk().board.from_bytes(msgspec.msgpack.encode(stored))
+        desk.board.restore(memory)
+    assert desk.board.memory.to_bytes() == before

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
-from monitor_node.alarms.on_off_delay import OnOffDelay
+from monitor_node.alarms.alarms import Condition, OnOffDelay
 from reactorwatch.spc.charts.shewhart import probability_out
 from reactorwatch.spc.m_of_n import false_alarm_rate
 
 
 def changes(rule: OnOffDelay, points: str) -> list[tuple[int, bool]]:
     """Points as text, x for out; returns (position, raised or cleared)."""
-    found = [(position, rule.update(point == "x")) for position, point in enumerate(points)]
+    condition = Condition()
+    found = [(position, rule.update(condition, point == "x")) for position, point in enumerate(points)]
     return [(position, change) for position, change in found if change is not None]
 
 
@@ -52,8 +53,8 @@ def test_the_rate_is_what_simulation_finds() -> None:
     p, generator = 0.08, np.random.default_rng(5)
     lengths = []
     for _ in range(2000):
-        rule, length = OnOffDelay(3, 5, 1), 1
-        while rule.update(bool(generator.random() < p)) is None:
+        rule, condition, length = OnOffDelay(3, 5, 1), Condition(), 1
+        while rule.update(condition, bool(generator.random() < p)) is None:
             length += 1
         lengths.append(length)
     mean, error = np.mean(lengths), np.std(lengths) / np.sqrt(len(lengths))

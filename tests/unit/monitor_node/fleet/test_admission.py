@@ -1,12 +1,9 @@
-"""Made-up names of plants cost a fleet little, and are forgotten."""
+"""Invented names of plants cost a fleet little, and are evicted."""
 
-import pytest
-
-from monitor_node.fleet.sharding import Shard, home_shard
-from monitor_node.ingest.pending import PlantHistory
+from monitor_node.fleet.config import Shard, shard_of
 from reactorwatch.contract.codec import Encoded
 
-from ..fleets import SECOND_NS, fleet, noting, run_of, shard_token
+from ..fleets import SECOND_NS, fleet, run_of
 
 TEN_MINUTES_NS = 600 * SECOND_NS
 
@@ -15,73 +12,53 @@ def first_sample(plant: str) -> Encoded:
     return run_of(plant, 1, span_min=0.5)[0]
 
 
-def test_there_is_room_for_a_thousand_names_that_nobody_vouches_for_and_for_all_plants_with_a_token() -> None:
-    monitor, sample = (
-        fleet(shard=Shard(3 - home_shard("x", 2), 2)),
-        first_sample("x"),
-    )  # those of the other shard count, too
-    for number in range(1500):
+def test_there_is_room_for_a_thousand_unverified_names_and_for_all_plants_with_a_token() -> None:
+    monitor, sample = fleet(shard=Shard(shard_of("x", 2), 2)), first_sample("x")
+    for number in range(2500):
         monitor.on_message(sample._replace(key=f"reactor/made-up{number}/sample/T"), 0)
-    assert 400 < len(monitor.plants) < 600
     before = set(monitor.plants)
-    monitor.on_message(sample._replace(key="reactor/one-more/sample/T"), 0)
+    assert len(before) == 1000
+    assert {shard_of(plant, 2) for plant in before} == {shard_of("x", 2)}
+    monitor.on_message(sample._replace(key="reactor/x/sample/T"), 0)
     ours = [
-        plant for plant in (f"with-token{number}" for number in range(20)) if home_shard(plant, 2) != home_shard("x", 2)
+        plant for plant in (f"with-token{number}" for number in range(20)) if shard_of(plant, 2) == shard_of("x", 2)
     ]
     for plant in ours:
         monitor.on_alive(f"reactor/{plant}/alive/plant", True, 0)
     assert set(monitor.plants) == before | set(ours)
 
 
-def test_a_made_up_name_is_forgotten_when_nothing_more_is_said_of_it_and_makes_room() -> None:
+def test_an_unverified_name_without_messages_is_evicted_and_makes_room() -> None:
     shown: list[tuple[str, bool]] = []
-    monitor = fleet(on_ownership=lambda plant, ours: shown.append((plant, ours)))
+    monitor = fleet(on_watch=lambda plant, watched: shown.append((plant, watched)))
     monitor.on_message(first_sample("x"), 0)
     monitor.on_tick(TEN_MINUTES_NS - 1)
     assert (monitor.plants, monitor.evictions) == (["x"], 0)
     monitor.on_tick(TEN_MINUTES_NS)
     assert (monitor.plants, monitor.evictions) == ([], 1)
     assert shown == [("x", True), ("x", False)]
-    monitor.on_message(first_sample("x"), TEN_MINUTES_NS)
+    monitor.on_tick(2 * TEN_MINUTES_NS)  # its deadlines have gone with it
+    monitor.on_message(first_sample("x"), 2 * TEN_MINUTES_NS)
     assert monitor.plants == ["x"]
 
 
-def test_a_plant_with_a_token_with_a_state_or_with_rows_is_not_forgotten(runs: dict[str, list[Encoded]]) -> None:
-    monitor = fleet(request_history=lambda plant, _: plant == "c")
+def test_a_plant_with_a_token_with_a_state_or_with_rows_is_not_evicted(runs: dict[str, list[Encoded]]) -> None:
+    monitor, before = fleet(), fleet()
     monitor.on_message(first_sample("x"), 0)
     monitor.on_alive("reactor/x/alive/plant", True, 0)
     monitor.on_messages(runs["a"][: 3 * 32], 0)
     monitor.on_messages(runs["b"][: 3 * 31], 0)
-    state = fleet()
-    state.on_messages(runs["c"][:3], 0)
-    monitor.on_message(runs["c"][0], 0)
-    monitor.on_history(PlantHistory("c", state.state_of("c"), []), 0)
+    before.on_messages(runs["c"][:3], 0)
+    state = before.monitor("c").to_bytes()
+    monitor.register("c", 0, verified=True, restore=lambda own: own.from_bytes(state))
     monitor.on_tick(TEN_MINUTES_NS)
     assert sorted(monitor.plants) == ["a", "c", "x"]
 
 
-@pytest.mark.parametrize(("messages", "known"), [(95, False), (96, True)])
-def test_a_plant_of_another_shard_is_remembered_for_its_messages(
-    messages: int, known: bool, runs: dict[str, list[Encoded]]
-) -> None:
-    asked: list[tuple[str, bool]] = []
-    at_home = home_shard("a", 2)
-    monitor = fleet(shard=Shard(3 - at_home, 2), request_history=noting(asked))
-    monitor.on_alive(shard_token(at_home), True, 0)
-    for message in runs["a"][:messages]:
-        monitor.on_message(message, 0)
-    monitor.on_tick(TEN_MINUTES_NS)
-    monitor.on_alive(shard_token(at_home), False, TEN_MINUTES_NS)
-    assert asked == [("a", True)] * known
-
-
-def test_a_name_of_which_nothing_is_known_is_not_stored(runs: dict[str, list[Encoded]]) -> None:
+def test_an_unverified_name_is_not_stored(runs: dict[str, list[Encoded]]) -> None:
     monitor = fleet()
     monitor.on_messages(runs["a"][: 3 * 31], 0)
     monitor.on_alive("reactor/b/alive/plant", True, 0)
     assert [monitor.is_worth_storing(plant) for plant in ("a", "b")] == [False, False]
     monitor.on_messages(runs["a"][3 * 31 : 3 * 32] + runs["b"][:6], 0)
     assert [monitor.is_worth_storing(plant) for plant in ("a", "b")] == [True, True]
-
-
-# --- cut off from the others -------------------------------------------------------------------------------------

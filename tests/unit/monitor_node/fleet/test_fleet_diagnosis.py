@@ -3,10 +3,10 @@
 import msgspec
 import pytest
 
-from monitor_node.baseline.training_diagnosis import FAILED, DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.monitor import FleetMonitor
+from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.diagnosis.result import NOMINAL
@@ -63,17 +63,16 @@ def own_monitor(name: str, messages: list[Encoded], finding: Finding | None) -> 
 def watched(runs: dict[str, list[Encoded]], queue: Queue) -> FleetMonitor:
     monitors = fleet(CONFIG, diagnose=queue.submit)
     for name in runs:
-        monitors.adopt(name, None, 0)
+        monitors.register(name, 0, verified=True)
     return monitors
 
 
-def test_each_training_is_submitted_once_and_pending_plants_are_packed(runs: dict[str, list[Encoded]]) -> None:
+def test_each_training_is_submitted_once(runs: dict[str, list[Encoded]]) -> None:
     queue = Queue()
     monitors = watched(runs, queue)
     publish(monitors, part(runs, 0, FOUND))
     assert sorted(name for name, _ in queue) == sorted(runs)
-    assert {"a", "b"} <= set(monitors.quiet)
-    assert all(len(job.rows.times_ns) == 8 * 400 for _, job in queue)
+    assert all(len(job.rows.times_ns) == 400 for _, job in queue)
 
 
 def test_a_fleet_publishes_of_each_plant_what_its_own_monitor_does(runs: dict[str, list[Encoded]], warm: Run) -> None:
@@ -81,42 +80,44 @@ def test_a_fleet_publishes_of_each_plant_what_its_own_monitor_does(runs: dict[st
     monitors = watched(runs, queue)
     published = publish(monitors, part(runs, 0, FOUND))
     for name, finding in reversed(findings(queue, warm)):
-        monitors.watched.on_finding(name, finding)
+        monitors.on_finding(name, finding)
     published += publish(monitors, part(runs, FOUND))
     assert len(queue) == 3
     assert len(changes(of("warm", published))) == 1
     for name, run in runs.items():
         assert of(name, published) == of(name, own_monitor(name, run, dict(findings(queue, warm))[name]))
-    assert set(monitors.quiet) == {"a", "b"}  # a model of its own is not packed
 
 
-def test_a_plant_that_is_taken_over_while_its_diagnosis_is_pending_is_diagnosed_by_the_next_monitor(
-    runs: dict[str, list[Encoded]], warm: Run
-) -> None:
+def restart(before: FleetMonitor, queue: Queue) -> FleetMonitor:
+    """Another monitor that resumes from the states of one that was stopped."""
+    after = fleet(CONFIG, diagnose=queue.submit)
+    for name in before.plants:
+        state = before.monitor(name).to_bytes()
+        after.register(name, 0, verified=True, restore=lambda monitor, state=state: monitor.from_bytes(state))  # type: ignore[misc]
+        after.monitor(name).on_history_end()
+    return after
+
+
+def test_a_diagnosis_that_is_pending_at_a_restart_is_submitted_again(runs: dict[str, list[Encoded]], warm: Run) -> None:
     before, after = Queue(), Queue()
-    first, second = watched(runs, before), fleet(CONFIG, diagnose=after.submit)
+    first = watched(runs, before)
     published = publish(first, part(runs, 0, FOUND))
-    for name in runs:
-        second.adopt(name, first.release(name), 0)
-        second.monitor(name).on_history_end()
+    second = restart(first, after)
     assert sorted(after) == sorted(before)
     for name, finding in findings(after, warm):
-        first.watched.on_finding(name, finding)  # too late: it has released the plants
-        second.watched.on_finding(name, finding)
+        second.on_finding(name, finding)
     published += publish(second, part(runs, FOUND))
     for name, run in runs.items():
         assert of(name, published) == of(name, own_monitor(name, run, dict(findings(after, warm))[name]))
 
 
-def test_a_plant_that_is_taken_over_after_the_change_keeps_it(runs: dict[str, list[Encoded]], warm: Run) -> None:
+def test_a_change_after_the_diagnosis_survives_a_restart(runs: dict[str, list[Encoded]], warm: Run) -> None:
     queue, after = Queue(), Queue()
-    first, second = watched({"warm": runs["warm"]}, queue), fleet(CONFIG, diagnose=after.submit)
+    first = watched({"warm": runs["warm"]}, queue)
     published = publish(first, runs["warm"][:FOUND])
-    first.watched.on_finding("warm", warm.finding)
+    first.on_finding("warm", warm.finding)
     published += publish(first, runs["warm"][FOUND : FOUND + 90])
-    second.adopt("warm", first.release("warm"), 0)
-    second.monitor("warm").on_history_end()
-    published += publish(second, runs["warm"][FOUND + 90 :])
+    published += publish(restart(first, after), runs["warm"][FOUND + 90 :])
     assert not after
     assert of("warm", published) == of("warm", own_monitor("warm", runs["warm"], warm.finding))
 
@@ -128,7 +129,7 @@ def test_a_diagnosis_that_failed_leaves_its_plant_and_the_others_as_they_are(
     monitors = watched(runs, queue)
     published = publish(monitors, part(runs, 0, FOUND))
     for name, _ in queue:
-        monitors.watched.on_finding(name, Finding(warm.finding.first_ns, FAILED, "the worker died"))
+        monitors.on_finding(name, Finding(warm.finding.first_ns, FAILED, "the worker died"))
     published += publish(monitors, part(runs, FOUND))
     for name, run in runs.items():
         assert of(name, published) == of(name, own_monitor(name, run, None))

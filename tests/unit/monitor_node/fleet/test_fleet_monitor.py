@@ -3,7 +3,7 @@
 import pytest
 
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet.sharding import Shard, home_shard
+from monitor_node.fleet.config import Shard, shard_of
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, CommandReply, Health
 from reactorwatch.errors import InputError
@@ -33,7 +33,7 @@ def test_many_messages_together_say_what_each_would_alone(
 
 def test_a_plant_is_watched_as_soon_as_a_node_of_it_is_alive() -> None:
     shown: list[tuple[str, bool]] = []
-    monitor = fleet(on_ownership=lambda plant, ours: shown.append((plant, ours)))
+    monitor = fleet(on_watch=lambda plant, ours: shown.append((plant, ours)))
     monitor.on_alive("reactor/x/alive/plant", True, 0)
     assert monitor.plants == ["x"]
     assert shown == [("x", True)]
@@ -75,14 +75,14 @@ def test_a_plant_that_falls_silent_is_told_of_while_others_go_on(runs: dict[str,
     assert number > 100
 
 
-def test_a_command_goes_to_its_plant_and_to_who_watches_it(runs: dict[str, list[Encoded]]) -> None:
-    monitor = fleet(shard=Shard(home_shard("a", 2), 2))
+def test_a_command_is_executed_by_the_monitor_of_its_plant_alone(runs: dict[str, list[Encoded]]) -> None:
+    monitor = fleet(shard=Shard(shard_of("a", 2), 2))
     payload, encoding = encode_message(AlarmCommand(alarm="ewma/T", by="Ada", comment="seen"))
     monitor.on_messages(runs["a"][:3] + runs["a"][3:6], 0)
     reply, _ = monitor.on_command(Encoded("reactor/a/command/comment", payload, encoding), 0)
     assert isinstance(reply, CommandReply)
     assert reply.accepted
-    theirs = next(name for name in map(str, range(99)) if home_shard(name, 2) != home_shard("a", 2))
+    theirs = next(name for name in map(str, range(99)) if shard_of(name, 2) != shard_of("a", 2))
     assert monitor.on_command(Encoded(f"reactor/{theirs}/command/comment", payload, encoding), 0) == (None, [])
 
 
@@ -91,14 +91,19 @@ def test_settings_that_make_no_monitor_are_refused_before_there_is_a_plant() -> 
         fleet(config=MonitorConfig(outputs=("pressure",), priorities={}, reference="process"))
 
 
-# --- sharing -----------------------------------------------------------------------------------------------------
-
-
 def test_shards_together_say_of_each_plant_what_one_monitor_says_once(
     runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
 ) -> None:
-    monitors = [fleet(shard=Shard(number, 3), name=str(number)) for number in (1, 2, 3)]
+    monitors = [fleet(shard=Shard(number, 3)) for number in (1, 2, 3)]
     said = [item for message in row_by_row(runs.values()) for each in monitors for item in each.on_message(message, 0)]
     assert sorted(plant for each in monitors for plant in each.plants) == ["a", "b", "c"]
     for plant in runs:
         assert of(plant, said) == expected[plant]
+
+
+@pytest.mark.parametrize("of", [2, 5, 100])
+def test_each_plant_is_in_one_shard_and_shards_are_about_equal(of: int) -> None:
+    plants = [f"plant{number}" for number in range(100 * of)]
+    counts = [sum(Shard(number, of).has(plant) for plant in plants) for number in range(1, of + 1)]
+    assert sum(counts) == len(plants)
+    assert 60 < min(counts) <= max(counts) < 140  # four standard deviations of 10

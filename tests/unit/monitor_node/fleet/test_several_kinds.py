@@ -10,9 +10,7 @@ import pytest
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.monitor import FleetMonitor
-from monitor_node.fleet.plant_kinds import load_kinds
-from monitor_node.fleet.sharding import WHOLE, ShardGroup
+from monitor_node.fleet.monitor import FleetMonitor, load_kinds
 from monitor_node.watched_process import load_process
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
@@ -62,8 +60,7 @@ def batched(items: Iterable[Item], count: int) -> Iterator[list[Item]]:
 
 
 def several_kinds() -> FleetMonitor:
-    config, model = load_process(CONFIG)
-    return FleetMonitor(config, 0, ShardGroup(PLANTS, WHOLE, "a"), model=model, kinds=load_kinds(CONFIG, FLEET))
+    return FleetMonitor(load_kinds(CONFIG, FLEET), 0)
 
 
 def test_each_plant_is_watched_as_by_a_monitor_of_its_own_process(
@@ -79,18 +76,14 @@ def test_each_plant_is_watched_as_by_a_monitor_of_its_own_process(
     for plant in runs:
         assert of(plant, found) == expected[plant], plant
         assert bool(alarms(expected[plant])) == (plant in FAULTS)
-    assert set(monitor.quiet) == set(runs) - FAULTS.keys()
 
 
 def test_a_restored_plant_resumes_with_the_process_of_its_name(runs: dict[str, list[Encoded]]) -> None:
     first, second = several_kinds(), several_kinds()
     cut = 3 * len(runs["north_1"]) // 4
     first.on_messages(runs["north_1"][:cut], 0)
-    monitor = second.watched.new_monitor("north_1", 0)
-    monitor.from_bytes(first.state_of("north_1"))
-    second.register("north_1", 0, verified=True)
-    second.watched.remove("north_1")
-    second.watched.add("north_1", monitor)
+    state = first.monitor("north_1").to_bytes()
+    second.register("north_1", 0, verified=True, restore=lambda monitor: monitor.from_bytes(state))
     after, again = (of("north_1", fleet.on_messages(runs["north_1"][cut:], 0)) for fleet in (first, second))
     assert alarms(after)
     assert after == again

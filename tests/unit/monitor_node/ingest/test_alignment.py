@@ -46,7 +46,7 @@ def test_any_order_within_the_reordering_gives_the_same_rows() -> None:
     rows = feed(aligner, samples) + aligner.flush()
     expected = feed(Aligner(SIGNALS, 4), in_order(200))
     assert [row[:2] for row in rows] == [row[:2] for row in expected]
-    counts = aligner.state.counts
+    counts = aligner.memory.counts
     assert counts.lost == counts.late == counts.duplicated == counts.incomplete_rows == 0
     assert counts.out_of_order > 0
 
@@ -58,8 +58,8 @@ def test_a_missing_sample_is_waited_for_and_then_given_up() -> None:
     assert numbers(rows) == list(range(6))
     assert math.isnan(rows[2].values[2])
     assert rows[2].values[:2] == (2.0, 2.1)
-    assert aligner.state.counts.incomplete_rows == 1
-    assert aligner.state.counts.lost == 1
+    assert aligner.memory.counts.incomplete_rows == 1
+    assert aligner.memory.counts.lost == 1
 
 
 def test_a_row_waits_no_longer_than_the_reordering() -> None:
@@ -79,8 +79,8 @@ def test_a_row_that_is_lost_altogether_holds_the_others_up_no_longer() -> None:
         5,
         6,
     ]
-    assert aligner.state.counts.incomplete_rows == 0
-    assert aligner.state.counts.lost == 3
+    assert aligner.memory.counts.incomplete_rows == 0
+    assert aligner.memory.counts.lost == 3
 
 
 def test_rows_apart_in_time_are_not_waited_between() -> None:
@@ -96,8 +96,8 @@ def test_a_sample_of_a_row_that_has_left_is_late_and_changes_nothing() -> None:
     aligner = Aligner(SIGNALS, 2)
     feed(aligner, [item for item in in_order(8) if item != ("C", 3)])
     assert feed(aligner, [("C", 3)]) == []
-    assert aligner.state.counts.late == 1
-    assert aligner.state.counts.lost == 0  # it was late, not lost
+    assert aligner.memory.counts.late == 1
+    assert aligner.memory.counts.lost == 0  # it was late, not lost
     assert numbers(feed(aligner, [(signal, 8) for signal in SIGNALS])) == [8]
 
 
@@ -108,15 +108,15 @@ def test_the_same_sample_twice_is_a_duplicate_before_and_after_its_row_left(when
     samples.insert(when, samples[when - 1])
     rows = feed(aligner, samples)
     assert numbers(rows) == [0, 1]
-    assert aligner.state.counts.duplicated == 1
-    assert aligner.state.counts.lost == 0
+    assert aligner.memory.counts.duplicated == 1
+    assert aligner.memory.counts.lost == 0
 
 
 def test_a_duplicate_of_a_complete_row_is_no_late_sample() -> None:
     aligner = Aligner(SIGNALS, 4)
     feed(aligner, [*in_order(3), ("C", 1)])
-    assert aligner.state.counts.duplicated == 1
-    assert aligner.state.counts.late == 0
+    assert aligner.memory.counts.duplicated == 1
+    assert aligner.memory.counts.late == 0
 
 
 def test_a_publisher_that_begins_again_begins_a_new_run() -> None:
@@ -129,15 +129,15 @@ def test_a_publisher_that_begins_again_begins_a_new_run() -> None:
     assert [row.time_ns for row in rows] == [10_000, 10_100, 10_200]
     assert rows[0].restarted
     assert not rows[1].restarted
-    assert aligner.state.counts.restarts == 1
-    assert aligner.state.counts.lost == 0
+    assert aligner.memory.counts.restarts == 1
+    assert aligner.memory.counts.lost == 0
 
 
 def test_a_publisher_may_begin_again_at_an_earlier_time() -> None:
     aligner = Aligner(SIGNALS, 2)
     feed(aligner, in_order(50))
     assert numbers(feed(aligner, in_order(3))) == [0, 1, 2]
-    assert aligner.state.counts.late == 0
+    assert aligner.memory.counts.late == 0
 
 
 def test_memory_is_bounded_whatever_comes() -> None:
@@ -145,8 +145,8 @@ def test_memory_is_bounded_whatever_comes() -> None:
     source = random.Random(3)
     for sequence in range(20_000):
         aligner.update("T", source.randrange(10**15), sequence, 1.0)
-        assert len(aligner.state.pending) <= 5 + 1
-        assert len(aligner.state.left) <= 4 * 5
+        assert len(aligner.memory.pending) <= 5 + 1
+        assert len(aligner.memory.emitted) <= 4 * 5
 
 
 def test_a_reordering_of_nothing_is_refused() -> None:

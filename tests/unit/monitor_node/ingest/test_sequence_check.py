@@ -48,6 +48,16 @@ def test_whatever_the_plant_does_none_of_its_samples_is_lost(more: list[HeldSamp
     assert taken(samples) == (samples, [])
 
 
+@pytest.mark.parametrize("off", [-50, -1, 1, 2, 50])
+def test_a_wrong_number_at_the_right_time_is_refused(off: int) -> None:
+    before, (true, *after) = regular(0, 100), regular(100, 20, 100 * PERIOD)
+    wrong = true._replace(number=true.number + off)
+    run = SequenceCheck()
+    taken(before, run)
+    assert not run.accept_next(wrong.number, wrong.time_ns)
+    assert taken([*before, wrong, *after]) == ([*before, *after], [wrong])
+
+
 def test_a_plant_of_irregular_times_loses_none() -> None:
     """Times between samples are exponential: a few are a hundredth of the usual, a few ten times as much."""
     draw = random.Random(3)

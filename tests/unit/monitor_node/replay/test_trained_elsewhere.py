@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from monitor_node.config import MonitorConfig
-from monitor_node.replay.backtest import Backtest, TrainedPlant, run, train
-from monitor_node.replay.row_log import RowLog, rows_of_file
+from monitor_node.replay.backtest import Backtest, RowLog, TrainedPlant, rows_of_file, run, train
 from reactorwatch.errors import InputError
 
 from ..samples import Rows, leaking_run, samples

@@ -2,9 +2,9 @@
 
 import json
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
-from queue import SimpleQueue
 
 import msgspec
 import pytest
@@ -14,19 +14,16 @@ from hypothesis import strategies as st
 from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.node import POLL_NS, FleetNode
-from monitor_node.storage import state_recovery
-from monitor_node.storage.alarm_file import SEAL
-from monitor_node.storage.fleet_states import FleetStates
-from monitor_node.storage.kept_aside import find_kept_aside, keep_aside
-from reactorwatch.contract.codec import Encoded, Publication
+from monitor_node.fleet.node import FleetNode
+from monitor_node.storage.state_files import CLAIM, StateFolder, find_kept_aside, keep_aside
+from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
 from reactorwatch.errors import InputError
 from tests.memory_bus import Exchange, MemoryBus
-from tests.running import WITHIN_S
 
 from ..fleets import of_plant
 from ..samples import leaking_run, samples
+from .restarts import start_node
 
 FOREIGN = {
     "settings.toml": b'[monitor]\nplant = "cstr"\n',
@@ -51,10 +48,11 @@ def config(folder: Path, **others: object) -> MonitorConfig:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    """Files of a folder by name, without claims."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if not path.name.endswith(CLAIM)}
 
 
-SETTINGS: list[dict[str, object]] = [{}, {"order": 2}, {"plant": "typo"}, {"isolation": False}]
+SETTINGS: list[dict[str, object]] = [{}, {"order": 2}, {"charts": ("ewma",)}, {"isolation": False}]
 
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -66,10 +64,10 @@ def test_settings_changed_and_changed_back_cost_no_row(
     folder = tmp_path_factory.mktemp("changed")
     learned = dict.fromkeys(range(len(SETTINGS)), 0)
     for number in starts:
-        node = MonitorNode(config(folder, **SETTINGS[number]), 0)
+        node = start_node(config(folder, **SETTINGS[number]), 0)
         assert node.rows == learned[number]
         first = 3 * learned[number]
-        for message in of_plant(str(SETTINGS[number].get("plant", "cstr")), rows[first : first + 15]):
+        for message in rows[first : first + 15]:
             node.on_message(message, 0)
         node.on_stop(0)
         learned[number] = node.rows
@@ -78,82 +76,101 @@ def test_settings_changed_and_changed_back_cost_no_row(
 
 def test_an_empty_state_is_not_written_over_one_that_was_kept(tmp_path: Path, rows: list[Encoded]) -> None:
     """The case of issue 23: two starts with other settings and no sample, then the old settings again."""
-    node = MonitorNode(config(tmp_path), 0)
+    node = start_node(config(tmp_path), 0)
     for message in rows:
         node.on_message(message, 0)
     node.on_stop(0)
     for order in (2, 4):
-        MonitorNode(config(tmp_path, order=order), 0)
-    assert MonitorNode(config(tmp_path), 0).rows == len(rows) // 3
+        start_node(config(tmp_path, order=order), 0)
+    assert start_node(config(tmp_path), 0).rows == len(rows) // 3
 
 
 def test_each_damaged_file_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, damaged = tmp_path / "monitor.state", list[bytes]()
     for number in range(4):
-        MonitorNode(config(tmp_path), 0)
+        start_node(config(tmp_path), 0)
         data = bytearray(path.read_bytes())
         data[-1 - number] ^= 1
         path.write_bytes(data)
         damaged.append(bytes(data))
-    MonitorNode(config(tmp_path), 0)
+    start_node(config(tmp_path), 0)
     kept = {name: data for name, data in files(tmp_path).items() if name != path.name}
     assert [kept[f"monitor.state.damaged{ending}"] for ending in ("", ".2", ".3", ".4")] == damaged
     assert "it is kept as monitor.state.damaged.4, and" in capsys.readouterr().out
 
 
 def test_every_flipped_bit_of_a_head_is_damage_and_no_foreign_file(tmp_path: Path) -> None:
-    MonitorNode(config(tmp_path), 0)
+    start_node(config(tmp_path), 0)
     path = tmp_path / "monitor.state"
     stored = path.read_bytes()
     for bit in range(0, 8 * 24, 5):
         data = bytearray(stored)
         data[bit // 8] ^= 1 << bit % 8
         path.write_bytes(data)
-        assert not MonitorNode(config(tmp_path), 0).resumed
+        assert not start_node(config(tmp_path), 0).resumed
     kept = find_kept_aside(tmp_path)["monitor.state"]
     assert len({aside.read_bytes() for aside in kept}) == len(range(0, 8 * 24, 5))
 
 
-@pytest.mark.parametrize("setting", ["state_file", "alarm_state_file"])
 @pytest.mark.parametrize("name", FOREIGN)
-def test_a_file_that_is_no_state_is_refused_and_left_alone(setting: str, name: str, tmp_path: Path) -> None:
-    """Also while the other file is a good one of a monitor that has learned something."""
+def test_a_file_that_is_no_state_is_refused_and_left_alone(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(FOREIGN[name])
-    good = {"state_file": str(tmp_path / "monitor.state"), "alarm_state_file": str(tmp_path / "alarms.state")}
-    MonitorNode(MonitorConfig(**good), 0)  # type: ignore[arg-type]
     before = files(tmp_path)
-    with pytest.raises(InputError, match=rf"^{setting} .*{name}: is no ") as refused:
-        MonitorNode(MonitorConfig(**(good | {setting: str(tmp_path / name)})), 0)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=rf"^state_file .*{name}: is no ") as refused:
+        start_node(MonitorConfig(state_file=str(tmp_path / name)), 0)
     assert "\n" not in str(refused.value)
     assert files(tmp_path) == before
 
 
-@pytest.mark.parametrize("setting", ["state_file", "alarm_state_file"])
-def test_what_is_no_regular_file_is_refused(setting: str, tmp_path: Path) -> None:
+DAMAGED: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda stored: b"",
+    "zeros": lambda stored: bytes(len(stored)),
+    "one zero": lambda stored: b"\0",
+    "part of its first word": lambda stored: stored[:7],
+    "its head alone": lambda stored: stored[:21],
+    "cut": lambda stored: stored[: len(stored) // 2],
+    "a byte too many": lambda stored: stored + b"\0",
+    "a wrong bit": lambda stored: flip_bit(stored, 8 * len(stored) - 3),
+    "of a later version": lambda stored: re.sub(rb"(?<=[rs])\0.", b"\0\xfe", stored, count=1),
+    "zeros at its end": lambda stored: stored[:30] + bytes(len(stored) - 30),
+}
+"""Remains of power failures, of failing disks and of other versions, from the bytes that were stored."""
+
+
+@pytest.mark.parametrize("kind", DAMAGED)
+def test_a_damaged_state_is_kept_aside_in_a_line(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A restart never ends at it."""
+    path = tmp_path / "a.state"
+    settings_ = MonitorConfig(state_file=str(path))
+    start_node(settings_, 0)
+    data = DAMAGED[kind](path.read_bytes())
+    path.write_bytes(data)
+    capsys.readouterr()
+    assert not start_node(settings_, 0).resumed
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "state_file" in line]
+    assert "it is kept as a.state.damaged, and" in line
+    assert (tmp_path / "a.state.damaged").read_bytes() == data
+    start_node(settings_, 0)
+    assert len(files(tmp_path)) == 2
+
+
+def test_what_is_no_regular_file_is_refused(tmp_path: Path) -> None:
     """A pipe would be waited for, a device replaced."""
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(InputError, match=rf"^{setting} .*pipe: is not a regular file; name one"):
-        MonitorNode(MonitorConfig(**{setting: str(tmp_path / "pipe")}), 0)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"^state_file .*pipe: is not a regular file; name one"):
+        start_node(MonitorConfig(state_file=str(tmp_path / "pipe")), 0)
     assert (tmp_path / "pipe").is_fifo()
 
 
-def test_one_file_for_both_is_refused(tmp_path: Path) -> None:
-    path = str(tmp_path / "both.state")
-    with pytest.raises(InputError, match=r"must be two files, got .*both.state for both"):
-        MonitorNode(MonitorConfig(state_file=path, alarm_state_file=path), 0)
-    assert files(tmp_path) == {}
-
-
 def test_a_typo_in_the_plant_s_name_changes_no_file(tmp_path: Path, rows: list[Encoded]) -> None:
-    """With both files, as `monitor --state` names them: the alarms are another plant's, so nothing is begun."""
-    both = config(tmp_path, alarm_state_file=str(tmp_path / "alarms.state"))
-    node = MonitorNode(both, 0)
+    """The state is another plant's, so nothing is started."""
+    node = start_node(config(tmp_path), 0)
     for message in rows:
         node.on_message(message, 0)
     node.on_stop(0)
     before = files(tmp_path)
-    with pytest.raises(InputError, match="is the alarm state of plant 'cstr', not of 'cst'; move it away"):
-        MonitorNode(msgspec.structs.replace(both, plant="cst"), 0)
+    with pytest.raises(InputError, match="is the state of plant 'cstr', not of 'cst'; it is left as it is"):
+        start_node(config(tmp_path, plant="cst"), 0)
     assert files(tmp_path) == before
 
 
@@ -191,24 +208,11 @@ WITH_ALARMS = MonitorConfig(training_min=60.0, diagnose_training=False)
 @pytest.fixture(scope="module")
 def in_alarm(leak: list[Encoded]) -> MonitorNode:
     """A monitor with alarms that stand."""
-    node = MonitorNode(WITH_ALARMS, 0)
+    node = start_node(WITH_ALARMS, 0)
     for message in leak:
         node.on_message(message, 0)
     assert any(stands(alarm) for alarm in node.alarms.all_alarms())
     return node
-
-
-@pytest.fixture
-def alarm_file(tmp_path: Path, in_alarm: MonitorNode) -> Path:
-    path = tmp_path / "alarms.state"
-    path.write_bytes(SEAL.close(in_alarm.alarms.to_bytes()))
-    return path
-
-
-def from_alarms(path: Path, **others: object) -> MonitorNode:
-    """A monitor that starts with a file of alarms."""
-    settings_ = {"alarm_state_file": str(path)} | others
-    return MonitorNode(msgspec.structs.replace(WITH_ALARMS, **settings_), 0)
 
 
 def flip_bit(stored: bytes, bit: int) -> bytes:
@@ -217,82 +221,57 @@ def flip_bit(stored: bytes, bit: int) -> bytes:
     return bytes(data)
 
 
-def is_refused(data: bytes) -> bool:
-    try:
-        SEAL.open(data)
-    except InputError:
-        return True
-    return False
+@pytest.fixture
+def stored(tmp_path: Path, in_alarm: MonitorNode) -> Path:
+    """Folder with the state of a monitor with alarms that stand."""
+    (tmp_path / "monitor.state").write_bytes(in_alarm.to_bytes())
+    return tmp_path
 
 
-def test_every_flipped_bit_of_the_alarms_is_refused(alarm_file: Path) -> None:
-    """One in a name would make a standing alarm normal. All are tried on the bytes, some on the file."""
-    stored = alarm_file.read_bytes()
-    assert [bit for bit in range(8 * len(stored)) if not is_refused(flip_bit(stored, bit))] == []
-    for bit in range(0, 8 * len(stored), 8 * len(stored) // 5):
-        alarm_file.write_bytes(flip_bit(stored, bit))
-        with pytest.raises(InputError, match=r"^alarm_state_file .*; move it away to begin"):
-            from_alarms(alarm_file)
-        assert alarm_file.read_bytes() == flip_bit(stored, bit)
+def with_alarms(folder: Path, **others: object) -> MonitorNode:
+    return start_node(config(folder, training_min=60.0, diagnose_training=False, **others), 0)
 
 
-def test_damaged_alarms_beside_a_good_state_are_kept_and_reported(
-    alarm_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], rows: list[Encoded]
-) -> None:
-    """The state has the alarms, too: the watch goes on with these."""
-    both, damaged = {"state_file": str(tmp_path / "monitor.state")}, flip_bit(alarm_file.read_bytes(), 5000)
-    node = from_alarms(alarm_file, **both)
-    for message in rows:
-        node.on_message(message, 0)
-    node.on_stop(0)
-    alarm_file.write_bytes(damaged)
-    capsys.readouterr()
-    again = from_alarms(alarm_file, **both)
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if "alarm_state_file" in line]
-    assert "is a damaged alarm state" in line
-    assert "it is kept as alarms.state.damaged, and the alarms are those of state_file" in line
-    assert (again.rows, stored_alarms(again)) == (node.rows, stored_alarms(node))
-    assert (tmp_path / "alarms.state.damaged").read_bytes() == damaged
-    assert not is_refused(alarm_file.read_bytes())
+def test_other_settings_start_a_training_and_cost_no_alarm(stored: Path, in_alarm: MonitorNode) -> None:
+    other = with_alarms(stored, order=2)
+    assert not other.resumed
+    assert stored_alarms(other) == stored_alarms(in_alarm)
 
 
-def test_alarms_of_a_version_without_a_digest_are_read(alarm_file: Path, in_alarm: MonitorNode) -> None:
-    alarm_file.write_bytes(in_alarm.alarms.to_bytes())
-    assert stored_alarms(from_alarms(alarm_file)) == stored_alarms(in_alarm)
-    assert not is_refused(alarm_file.read_bytes())
-
-
-def test_alarms_that_a_setting_leaves_out_come_back_with_it(alarm_file: Path, in_alarm: MonitorNode) -> None:
-    few = from_alarms(alarm_file, charts=("shewhart",))
+def test_alarms_that_a_setting_leaves_out_come_back_with_it(stored: Path, in_alarm: MonitorNode) -> None:
+    few = with_alarms(stored, charts=("shewhart",))
     assert len(stored_alarms(few)) < len(stored_alarms(in_alarm))
-    assert stored_alarms(from_alarms(alarm_file)) == stored_alarms(in_alarm)
+    assert stored_alarms(with_alarms(stored, order=2)) == stored_alarms(in_alarm)
 
 
-def test_alarms_are_not_older_than_their_file_after_a_state_was_aside(tmp_path: Path, leak: list[Encoded]) -> None:
+def test_alarms_are_not_older_than_those_of_other_settings_after_a_state_was_aside(
+    tmp_path: Path, leak: list[Encoded]
+) -> None:
     """A comment made while other settings were in force is kept."""
-    both = config(tmp_path, training_min=60.0, alarm_state_file=str(tmp_path / "alarms.state"))
-    node = MonitorNode(both, 0)
+    both = config(tmp_path, training_min=60.0)
+    node = start_node(both, 0)
     for message in leak:
         node.on_message(message, 0)
     node.on_stop(0)
     standing = next(alarm.alarm for alarm in node.alarms.all_alarms() if stands(alarm))
-    other = MonitorNode(msgspec.structs.replace(both, order=2), 0)
+    other = start_node(msgspec.structs.replace(both, order=2), 0)
     other.alarms.comment(standing, "Anna", "the valve is being repaired")
     other.on_tick(0)
-    again = MonitorNode(both, 0)
+    again = start_node(both, 0)
     assert again.rows == node.rows
     assert again.alarms.alarm(standing).comment == "the valve is being repaired"
 
 
 def test_a_silence_that_stood_ends_with_the_next_sample(tmp_path: Path, rows: list[Encoded]) -> None:
-    """Also when the monitor learns from scratch, and knows the silence from the file of the alarms alone."""
-    settings_ = MonitorConfig(alarm_state_file=str(tmp_path / "alarms.state"))
-    node = MonitorNode(settings_, 0)
+    """Also when the monitor learns from scratch with other settings, and knows the silence from the alarms alone."""
+    settings_ = config(tmp_path)
+    node = start_node(settings_, 0)
     for message in rows[:150]:
         node.on_message(message, 0)
-    node.silence.declare_timeout()
+    signals = node.pipeline.evaluation.signals
+    signals.publish(signals.silence, 0, signals.silence.declare_timeout())
     node.on_tick(0)
-    again = MonitorNode(settings_, 0)
+    again = start_node(config(tmp_path, order=2), 0)
     assert stands(again.alarms.alarm("silence/plant"))
     for message in rows[150:]:
         again.on_message(message, 0)
@@ -302,36 +281,24 @@ def test_a_silence_that_stood_ends_with_the_next_sample(tmp_path: Path, rows: li
 # --- fleets ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(autouse=True)
-def _no_settling(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(state_recovery, "HANDOVER_S", 0.0)
-
-
 def fleet_of(folder: Path, order: int, rows: list[Encoded]) -> FleetNode:
     """A fleet's monitor that watches the plants of its folder, and is stopped after some rows of plant `a`."""
     config_ = MonitorConfig(order=order, isolation=False)
-    node = FleetNode(config_, FleetConfig(plants="reactor/*"), MemoryBus(Exchange()), 0, FleetStates(folder))
-    calls: SimpleQueue[Callable[[int], list[Publication]]] = SimpleQueue()
-    for _ in node.subscriptions:
-        node.on_subscribed(calls.put)
+    node = FleetNode(config_, FleetConfig(plants="reactor/*"), MemoryBus(Exchange()), 0, StateFolder(folder))
+    node.on_history_end()
     if rows:
         node.on_alive("reactor/a/alive/plant", True, 0)
-    now_ns = 0
-    while node.is_pending("a"):
-        calls.get(timeout=WITHIN_S)(now_ns)
-        now_ns += POLL_NS
-        node.on_tick(now_ns)
-    node.on_messages(of_plant("a", rows), now_ns)
-    node.on_stop(now_ns)
+    node.on_messages(of_plant("a", rows), 0)
+    node.on_stop(0)
     return node
 
 
 def test_a_fleet_goes_on_from_what_it_kept_when_its_settings_are_back(tmp_path: Path, rows: list[Encoded]) -> None:
-    """With the other settings the plant is watched and in the folder from the start on, before it says anything."""
+    """With the other settings the plant is watched from the start on, before its first sample."""
     fleet_of(tmp_path, 3, rows[:30])
     other = fleet_of(tmp_path, 2, [])
     assert (other.plants, other.monitor("a").rows) == (["a"], 0)
-    assert sorted(files(tmp_path)) == ["a.state", "a.state.other-settings"]
+    assert sorted(files(tmp_path)) == ["a.state.other-settings"]
     assert fleet_of(tmp_path, 3, rows[30:60]).monitor("a").rows == 20
     assert fleet_of(tmp_path, 2, []).monitor("a").rows == 0
     assert fleet_of(tmp_path, 3, []).monitor("a").rows == 20
@@ -343,9 +310,10 @@ def test_a_fleet_s_unusable_state_is_reported_before_its_plant_says_anything(
     for data in (b"", b"reactorwatch monitor\x00\x01 and then no state"):
         (tmp_path / "a.state").write_bytes(data)
         assert fleet_of(tmp_path, 3, []).plants == ["a"]
-        assert "the plant is learned again, and the state kept as a.state.damaged" in capsys.readouterr().out
-    assert sorted(files(tmp_path)) == ["a.state", "a.state.damaged", "a.state.damaged.2"]
-    assert FleetStates(tmp_path).plants == ["a"]
+        assert "it is kept as a.state.damaged" in (line := capsys.readouterr().out)
+        assert "the monitor learns again" in line
+    assert sorted(files(tmp_path)) == ["a.state.damaged", "a.state.damaged.2"]
+    assert StateFolder(tmp_path).plants == ["a"]
 
 
 def test_a_plant_whose_state_could_only_be_kept_aside_is_watched_at_the_next_start(tmp_path: Path) -> None:
@@ -362,7 +330,7 @@ def test_a_fleet_leaves_a_file_alone_that_is_no_state(
     (tmp_path / "a.state").write_bytes(data)
     assert fleet_of(tmp_path, 3, rows[:30]).monitor("a").rows == 10
     assert files(tmp_path) == {"a.state": data}
-    assert "a.state is left as it is; nothing is stored of the plant" in capsys.readouterr().out
+    assert "it is left as it is, and nothing is stored of the plant" in capsys.readouterr().out
     (tmp_path / "a.state").rename(tmp_path / "mine")
     fleet_of(tmp_path, 3, rows[:30])
     assert fleet_of(tmp_path, 3, []).monitor("a").rows == 10
@@ -372,4 +340,4 @@ def test_a_fleet_s_state_that_cannot_be_read_is_not_overwritten(tmp_path: Path, 
     (tmp_path / "a.state").mkdir()
     (tmp_path / "a.state" / "file").touch()
     assert fleet_of(tmp_path, 3, rows[:30]).monitor("a").rows == 10
-    assert [path.name for path in tmp_path.rglob("*")] == ["a.state", "file"]
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [CLAIM, "a.state", "file"]

@@ -9,12 +9,14 @@ import pytest
 
 from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
+from monitor_node.storage.state_files import CLAIM
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode, encode_message
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, Health
 from reactorwatch.errors import InputError
 
 from ..samples import leaking_run, samples
+from .restarts import start_node
 
 SECOND = 1_000_000_000
 END_MIN = 70.0
@@ -41,13 +43,13 @@ def stored_rows(config: MonitorConfig) -> int:
     """Rows of the run that the file knows."""
     copy = Path(str(config.state_file)).with_name("copy.state")
     copy.write_bytes(Path(str(config.state_file)).read_bytes())
-    return MonitorNode(msgspec.structs.replace(config, state_file=str(copy)), 0).rows
+    return start_node(msgspec.structs.replace(config, state_file=str(copy)), 0).rows
 
 
 def test_it_is_stored_when_its_time_has_come_and_something_was_heard(
     config: MonitorConfig, leak: list[Encoded]
 ) -> None:
-    node = MonitorNode(config, 0)
+    node = start_node(config, 0)
     path = Path(str(config.state_file))
     for number, message in enumerate(leak[:60]):
         node.on_message(message, number * SECOND // 10)
@@ -61,7 +63,7 @@ def test_it_is_stored_when_its_time_has_come_and_something_was_heard(
 
 
 def test_a_change_of_an_alarm_is_stored_before_it_is_told(config: MonitorConfig, leak: list[Encoded]) -> None:
-    node = MonitorNode(config, 0)
+    node = start_node(config, 0)
     for message in leak:
         said = node.on_message(message, 0)
         if any("/alarm/" in item.key for item in said):
@@ -72,32 +74,32 @@ def test_a_change_of_an_alarm_is_stored_before_it_is_told(config: MonitorConfig,
 def test_messages_that_a_kill_kept_from_leaving_are_published_first_after_the_restart(
     config: MonitorConfig, leak: list[Encoded]
 ) -> None:
-    node = MonitorNode(config, 0)
+    node = start_node(config, 0)
     messages = iter(leak)
     for message in messages:
         said = node.on_message(message, 0)
         if any("/alarm/" in item.key for item in said):
             break
-    resumed = MonitorNode(config, 0)
+    resumed = start_node(config, 0)
     again = resumed.on_message(next(messages), 0)
     assert [encode(item) for item in again[: len(said)]] == [encode(item) for item in said]
     assert not any("/alarm/" in item.key for item in resumed.on_tick(0))
 
 
 def test_a_monitor_that_ended_publishes_nothing_again(config: MonitorConfig, leak: list[Encoded]) -> None:
-    node = MonitorNode(config, 0)
+    node = start_node(config, 0)
     for message in leak[:30]:
         node.on_message(message, 0)
     node.on_stop(0)
-    assert {type(item.message) for item in MonitorNode(config, 0).on_tick(0)} == {Health}
+    assert {type(item.message) for item in start_node(config, 0).on_tick(0)} == {Health}
 
 
 def test_at_its_end_it_is_stored(config: MonitorConfig, leak: list[Encoded]) -> None:
-    node = MonitorNode(config, 0)
+    node = start_node(config, 0)
     for message in leak[:30]:
         node.on_message(message, 0)
     node.on_stop(0)
-    assert MonitorNode(config, 0).rows == 10
+    assert start_node(config, 0).rows == 10
 
 
 @pytest.mark.parametrize("data", [b"", b"reactorw", b"reactorwatch monitor\x00\x01 and then no state"])
@@ -106,32 +108,32 @@ def test_a_damaged_file_is_kept_aside_and_told_in_one_line(
 ) -> None:
     path = Path(str(config.state_file))
     path.write_bytes(data)
-    node = MonitorNode(config, 0)
+    node = start_node(config, 0)
     assert (node.phase, node.resumed) == ("waiting", False)
     assert path.with_name("monitor.state.damaged").read_bytes() == data
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "monitor.state" in line]
     assert "it is kept as monitor.state.damaged, and the monitor learns again" in line
-    assert MonitorNode(config, 0).phase == "waiting"
+    assert start_node(config, 0).phase == "waiting"
 
 
 def test_what_was_learned_with_other_settings_is_kept_aside_and_the_setting_named(
     config: MonitorConfig, leak: list[Encoded], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    node = MonitorNode(config, 0)
+    node = start_node(config, 0)
     for message in leak[:30]:
         node.on_message(message, 0)
     node.on_stop(0)
-    other = MonitorNode(msgspec.structs.replace(config, order=2), 0)
+    other = start_node(msgspec.structs.replace(config, order=2), 0)
     assert other.rows == 0
     assert "was learned with other settings: order was 3 and is 2; it is kept as" in capsys.readouterr().out
     path = Path(str(config.state_file))
     path.with_name("monitor.state.other-settings").replace(path)
-    assert MonitorNode(config, 0).rows == 10
+    assert start_node(config, 0).rows == 10
 
 
 def test_a_file_in_no_folder_is_refused_at_the_start(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
-        MonitorNode(MonitorConfig(state_file=str(tmp_path / "none" / "monitor.state")), 0)
+        start_node(MonitorConfig(state_file=str(tmp_path / "none" / "monitor.state")), 0)
 
 
 def test_a_full_disk_is_told_once_counted_and_stops_no_watch(
@@ -145,7 +147,7 @@ def test_a_full_disk_is_told_once_counted_and_stops_no_watch(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", fsync)
-    node = MonitorNode(config, 0)
+    node = start_node(config, 0)
     for number, message in enumerate(leak[:300]):
         node.on_message(message, number * SECOND)
     count = health(node, 300 * SECOND).not_stored
@@ -153,7 +155,8 @@ def test_a_full_disk_is_told_once_counted_and_stops_no_watch(
     assert node.rows == 100
     said = [line for line in capsys.readouterr().out.splitlines() if "No space left" in line]
     assert len(said) == 2  # at the start, and then
-    assert list(Path(str(config.state_file)).parent.iterdir()) == []
+    path = Path(str(config.state_file))
+    assert [item.name for item in path.parent.iterdir()] == [f".{path.name}{CLAIM}"]
     full = False
     node.on_message(leak[300], 310 * SECOND)
     node.on_tick(320 * SECOND)
@@ -164,13 +167,13 @@ def test_a_full_disk_is_told_once_counted_and_stops_no_watch(
 def test_an_accepted_command_on_the_baseline_is_stored_before_the_reply(
     config: MonitorConfig, leak: list[Encoded]
 ) -> None:
-    node = MonitorNode(config, 0)
+    node = start_node(config, 0)
     for message in leak[:30]:
         node.on_message(message, 0)
     key = keys.key(config.plant, keys.COMMAND, "baseline")
     command = BaselineCommand(what="relearn", by="Anna", why="new pump")
     reply, _ = node.on_command(Encoded(key, *encode_message(command)), 0)
     assert reply.accepted
-    resumed = MonitorNode(config, 0)
+    resumed = start_node(config, 0)
     published = [item.message for message in leak[30:33] for item in resumed.on_message(message, 0)]
     assert [item.what for item in published if isinstance(item, Baseline)] == ["relearn"]

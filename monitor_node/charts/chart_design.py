@@ -1,0 +1,177 @@
+"""Design of a plant's charts: their alarms, those that its training allows, their rates, and their detectors."""
+
+from collections.abc import Iterable
+from itertools import compress
+
+import numpy as np
+
+from monitor_node.config import MonitorConfig
+from reactorwatch.arrays import Array
+from reactorwatch.contract import keys
+from reactorwatch.spc import false_alarm_budget
+from reactorwatch.spc.baseline import Baseline, complete_rows, memory_sds
+from reactorwatch.spc.charts.base import Chart, SignalChart
+from reactorwatch.spc.charts.catalogue import chart
+from reactorwatch.spc.detection import Detector
+from reactorwatch.spc.joint_chart import JointChart
+from reactorwatch.spc.m_of_n import false_alarm_rates
+from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.training_errors import TrainingErrors
+from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
+
+ALL = "all"
+"""Name in place of a signal for charts of all outputs together."""
+
+SUBSTITUTES = ("shewhart", "ewma")
+"""Charts of each output that are made where the settings have charts of values only, and none of them can be made."""
+
+
+def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
+    """(chart, signal or `ALL`) of every alarm that the charts of a plant can raise."""
+    names: list[tuple[str, str]] = []
+    for name in config.charts:
+        kind = chart(name)
+        if issubclass(kind, SignalChart):
+            names += [(name, signal) for signal in config.outputs]
+        elif issubclass(kind, ValueChart) or (issubclass(kind, JointChart) and len(config.outputs) > 1):
+            names.append((name, ALL))
+    if config.has_values_only:
+        names += [(name, signal) for name in SUBSTITUTES for signal in config.outputs]
+    return names
+
+
+def count_chance_alarms(config: MonitorConfig) -> int:
+    """Number of the charts' alarms that share the false alarms, with every signal monitored; see `ValueChart`."""
+    return _count_alarms(dict.fromkeys(config.charts), len(config.outputs), len(config.signals))
+
+
+def _count_alarms(names: Iterable[str], outputs: int, signals: int) -> int:
+    """Number of alarms of charts by name, of so many outputs, and of the signals of charts of values."""
+    kinds = [chart(name) for name in names]
+    joint = sum(issubclass(kind, JointChart) for kind in kinds) if outputs > 1 else 0
+    of_each = outputs * sum(issubclass(kind, SignalChart) for kind in kinds)
+    return joint + of_each + signals * sum(issubclass(kind, ValueChart) for kind in kinds)
+
+
+class ChartDesign:
+    """Design of the charts of one plant.
+
+    Args:
+        config: configuration of the monitor.
+
+    Attributes:
+        names: charts of the settings, and those that may take their place.
+        chosen: charts that are made, by name.
+        evaluated: for each output, True if it is evaluated.
+        signals: signals of the charts of values.
+    """
+
+    def __init__(self, config: MonitorConfig) -> None:
+        self._config = config
+        self.names = list[str](dict.fromkeys(name for name, _ in alarm_names(config)))
+        self.chosen: list[str] = []
+        self.evaluated: list[bool] = []
+        self.signals: tuple[str, ...] = ()
+
+    def choose(self, evaluated: list[bool], e: Array, values: Array) -> dict[str, str]:
+        """Choose the charts that can be made; returns the others, by alarm, each with the reason.
+
+        Args:
+            evaluated: for each output, True if it is evaluated.
+            e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
+            values: its measured values, shape (n, signals), the inputs first; NaN where missing, for each row of a
+                signal that is left out.
+        """
+        rows = complete_rows(e, np.flatnonzero(evaluated).tolist())
+        signals = list(compress(self._config.outputs, evaluated))
+        obstacles = {
+            name: why
+            for name in self.names
+            if issubclass(kind := chart(name), JointChart) and (why := kind.obstacle(rows, signals))
+        }
+        self.signals, complete = self._complete_values(values)
+        obstacles |= {
+            name: why
+            for name in self.names
+            if issubclass(kind := chart(name), ValueChart)
+            and (why := kind.obstacle(complete, self.signals, self._config.chart_signals))
+        }
+        charts = [name for name in dict.fromkeys(self._config.charts) if name in self.names and name not in obstacles]
+        self.evaluated, self.chosen = evaluated, charts or [name for name in self.names if name not in obstacles]
+        return {keys.chart_name(name, ALL): why for name, why in obstacles.items()}
+
+    @property
+    def chance_alarms(self) -> int:
+        """Number of alarms of the chosen charts that chance can raise."""
+        return _count_alarms(self.chosen, sum(self.evaluated), len(self.signals))
+
+    def _complete_values(self, values: Array) -> tuple[tuple[str, ...], Array]:
+        """Names of the signals with values that vary, and the rows in which none of them is missing."""
+        indices = np.flatnonzero(np.isfinite(values).any(axis=0))
+        complete = complete_rows(values, indices.tolist())
+        varies = np.ptp(complete, axis=0) > 0.0 if len(complete) else np.ones(indices.size, np.bool_)
+        names = tuple(self._config.signals[index] for index in indices[varies].tolist())
+        return names, complete[:, varies]
+
+    def baseline(self, learned: list[Prewhitening], e: Array, arl0: float) -> Baseline:
+        """Baseline of charts of residuals; arguments as for `relative_rates`."""
+        config = self._config
+        p = false_alarm_budget.point_probability(arl0, config.raise_count, config.window)
+        sds = memory_sds(e, config.chart_settings["ewma_weight"])
+        return Baseline(tuple(learned), e, sds, arl0, p, config.chart_settings)
+
+    def value_baseline(self, values: Array, arl0: float) -> ValueBaseline:
+        """Baseline of charts of values; arguments as for `relative_rates`."""
+        return ValueBaseline(
+            *self._complete_values(values), arl0, self._config.chart_settings, self._config.chart_signals
+        )
+
+    def relative_rates(
+        self, learned: list[Prewhitening], e: Array, values: Array, arl0: float, errors: TrainingErrors
+    ) -> Array:
+        """Rate of false alarms of all charts by the errors of the training, in shares of one alarm, shape (draws,).
+
+        Args:
+            learned: prewhitening of each output.
+            e: prewhitened residuals of the training, shape (n, outputs); NaN where there is none.
+            values: measured values of the training, see `choose`.
+            arl0: run length of each alarm without a fault, in rows.
+            errors: errors of all outputs.
+        """
+        baseline = self.baseline(learned, e, arl0)
+        total = np.zeros(len(errors.mean))
+        for name in self.chosen:
+            kind = chart(name)
+            if issubclass(kind, ValueChart):
+                total += kind.relative_rates(self.value_baseline(values, arl0))
+                continue
+            assert issubclass(kind, SignalChart | JointChart)
+            for group in self._groups(kind):
+                rates = kind.relative_rates(baseline.of(group), errors.of(group))
+                total += rates if kind.has_memory else self._rule_rates(baseline, rates)
+        return total
+
+    def detectors(self, learned: list[Prewhitening], e: Array, arl0: float) -> list[Detector]:
+        """The charts as moving averages, as far as they are; arguments as for `relative_rates`."""
+        baseline, found = self.baseline(learned, e, arl0), []
+        for name in self.chosen:
+            kind = chart(name)
+            for group in self._groups(kind):
+                average = kind.detector(baseline.of(group))
+                if average is not None:
+                    weight, level, matrix = average
+                    rule = (1, 1) if kind.has_memory else (self._config.raise_count, self._config.window)
+                    found.append(Detector(tuple(group), matrix, weight, level, rule))
+        return found
+
+    def _groups(self, kind: type[Chart]) -> list[list[int]]:
+        """Indices of the outputs of each chart of a kind."""
+        evaluated: list[int] = np.flatnonzero(self.evaluated).tolist()
+        return [[index] for index in evaluated] if issubclass(kind, SignalChart) else [evaluated]
+
+    def _rule_rates(self, baseline: Baseline, rates: Array) -> Array:
+        """Relative rate of an alarm that takes several points, from that of single points."""
+        count, window, p = self._config.raise_count, self._config.window, baseline.point_probability
+        nodes = np.geomspace(0.1 * p, 1.0, 40)  # rates of far rarer points are rounding errors, and nothing
+        of_rule = np.maximum(false_alarm_rates(count, window, nodes) * baseline.arl0, 1e-9)
+        return np.asarray(np.exp(np.interp(np.log(np.maximum(rates * p, nodes[0])), np.log(nodes), np.log(of_rule))))

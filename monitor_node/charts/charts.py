@@ -1,0 +1,460 @@
+"""All the charts of one plant: built from its training and its budget of false alarms, fed row by row.
+
+What comes in is one prewhitened residual an output, in standard deviations, and the measured values. Which charts look
+at them is a setting; the charts there are: `reactorwatch.spc.charts.catalogue`. A chart is restarted when its alarm is
+cleared, so that false alarms do not come in clusters.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence, Sized
+from dataclasses import dataclass
+from itertools import compress, islice
+from math import nan
+from typing import Any, NamedTuple, TypeAlias
+
+import msgspec
+import numpy as np
+
+from monitor_node.alarms.alarms import AlarmChange, ChartAlarm, Explanation, SuspectedCause
+from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.charts.chart_design import ALL, ChartDesign, alarm_names
+from monitor_node.config import MonitorConfig, PriorityName
+from monitor_node.ingest.alignment import MeasuredRow
+from reactorwatch.arrays import Array
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import ChartPoint
+from reactorwatch.spc.charts.base import Chart, Judgement, Shown, SignalChart
+from reactorwatch.spc.charts.catalogue import chart
+from reactorwatch.spc.charts.shewhart import designed_width
+from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalMemory
+from reactorwatch.spc.joint_chart import JointChart
+from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.value_chart import ValueChart
+from reactorwatch.stored_state import Memory, read_memory
+
+SD = "sd"
+"""The unit of what charts show: standard deviations of the residual."""
+
+MOST_ENTRIES = 3
+"""Signals that an alarm names as possible entries of a disturbance."""
+
+
+class ChartsMemory(Memory):
+    """Memory of the charts of a plant.
+
+    Attributes:
+        charts: memory of each chart by name, of a chart of each output without a kernel a list of them; as it was read,
+            until the charts go on from it.
+        widths: Shewhart limits, one an output, in standard deviations; they are shown about the predictions.
+        passed: for each output, the part of a lasting shift that its prewhitened residual shows.
+    """
+
+    charts: dict[str, Any] = msgspec.field(default_factory=dict)
+    widths: list[float] = msgspec.field(default_factory=list)
+    passed: list[float] = msgspec.field(default_factory=list)
+
+
+_Judgements: TypeAlias = list[Judgement | None] | None
+
+
+def _without(known: list[bool], withheld: tuple[bool, ...]) -> list[bool]:
+    return [here and not outlier for here, outlier in zip(known, withheld, strict=True)]
+
+
+class _ChartRow(NamedTuple):
+    """A row as charts take it.
+
+    Attributes:
+        e: prewhitened residual of each output; NaN where there is none.
+        known: for each output, True if it has one.
+        withheld: outputs whose value may be an outlier and must not enter a memory yet.
+        inputs: one value an input; NaN where missing.
+        values: one value an output; NaN where missing.
+    """
+
+    e: list[float]
+    known: list[bool]
+    withheld: tuple[bool, ...]
+    inputs: Sequence[float]
+    values: Sequence[float]
+
+
+class _Charts(ABC):
+    """Charts of one name.
+
+    Attributes:
+        memory: memory of these charts, see `ChartsMemory`.
+        locates: True if the first signals of an explanation are those at which a disturbance may enter.
+        judges_unpredicted: True if rows that are not predicted are judged.
+    """
+
+    locates = judges_unpredicted = False
+
+    def __init__(self, memory: Any) -> None:
+        self.memory = memory
+
+    @abstractmethod
+    def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
+        """Judge a row: None for a chart without a value; None in place of all if no chart is out, unless `always`."""
+
+    @abstractmethod
+    def restart(self, index: int) -> None:
+        """Forget the rows seen, in the chart of an alarm."""
+
+    @abstractmethod
+    def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
+        """The text of an alarm, and each signal's share of it; arguments as for `SignalChart.explain`."""
+
+
+class _Banked(_Charts):
+    """Compiled charts, one an output."""
+
+    def __init__(self, bank: Bank[CompiledChart], kind: type[CompiledChart]) -> None:
+        super().__init__(bank.memory)
+        self._bank, self._kind, self._has_memory = bank, kind, kind.has_memory
+
+    def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
+        known, withheld = row.known, row.withheld
+        present = _without(known, withheld) if True in withheld and self._has_memory else known
+        return self._bank.judge(row.e, present, always=always)
+
+    def restart(self, index: int) -> None:
+        self._bank.restart(index)
+
+    def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
+        return self._kind.explain(judgement, signals[index])
+
+
+class _OfEach(_Charts):
+    """Charts without a compiled kernel, one an output."""
+
+    def __init__(self, charts: Sequence[SignalChart]) -> None:
+        super().__init__([item.memory for item in charts])
+        self._charts = charts
+
+    def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
+        known = row.known
+        if True in row.withheld and self._charts[0].has_memory:
+            known = _without(known, row.withheld)
+        judgements = [
+            item.update(value) if here else None for item, value, here in zip(self._charts, row.e, known, strict=True)
+        ]
+        is_out = any(judgement is not None and judgement.out for judgement in judgements)
+        return judgements if is_out or always else None
+
+    def restart(self, index: int) -> None:
+        self._charts[index].restart()
+
+    def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
+        return self._charts[index].explain(judgement, signals[index])
+
+
+class _OfAll(_Charts):
+    """A chart of all outputs together.
+
+    Args:
+        joint: the chart.
+        evaluated: for each output, True if the chart uses it.
+    """
+
+    def __init__(self, joint: JointChart, evaluated: list[bool]) -> None:
+        super().__init__(joint.memory)
+        self._chart = joint
+        self._evaluated, self._all = evaluated, all(evaluated)
+        self._last: list[float] = []
+
+    def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
+        """Update with a row; a row with a missing output is skipped."""
+        e, known, withheld = row.e, row.known, row.withheld
+        if not self._all:
+            e, known = list(compress(e, self._evaluated)), list(compress(known, self._evaluated))
+        if False in known or True in withheld:
+            return None
+        self._last = e
+        judgement = self._chart.update(e)
+        return [judgement] if judgement.out or always else None
+
+    def restart(self, index: int) -> None:
+        self._chart.restart()
+
+    def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
+        return self._chart.explain(self._last, list(compress(signals, self._evaluated)))
+
+
+class _OfValues(_Charts):
+    """A chart of the measured values of all signals.
+
+    Args:
+        values: the chart.
+        config: configuration of the monitor.
+    """
+
+    def __init__(self, values: ValueChart, config: MonitorConfig) -> None:
+        super().__init__(values.memory)
+        self._chart, self.locates, self.judges_unpredicted = values, values.locates, not config.inputs
+        self._indices = [config.signals.index(name) for name in values.names]
+
+    def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
+        """Update with a row; one that is not predicted at all is skipped, since inputs may be beyond the training."""
+        if True not in row.known and not self.judges_unpredicted:
+            return None
+        outputs: Sequence[float] = row.values
+        if True in row.withheld:
+            outputs = [nan if is_withheld else y for y, is_withheld in zip(outputs, row.withheld, strict=True)]
+        x = self._chart.fill(np.array([*row.inputs, *outputs])[self._indices])
+        if x is None:
+            return None
+        judgement = self._chart.update(x)
+        return [judgement] if judgement.out or always else None
+
+    def restart(self, index: int) -> None:
+        self._chart.restart()
+
+    def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
+        return self._chart.explain()
+
+
+@dataclass
+class _Watched:
+    """Charts, with the alarm and the key of each."""
+
+    charts: _Charts
+    alarms: list[ChartAlarm]
+    keys: list[str]
+    at_rest: bool = True
+
+
+class ChartWatch:
+    """The charts of one plant.
+
+    Args:
+        config: configuration of the monitor.
+        board: the alarms of the plant; those of the charts are declared here.
+
+    Attributes:
+        design: design of the charts; choose the charts by it before `start`.
+        memory: memory of the charts: what runs, and what is stored. Their alarms belong to the board.
+    """
+
+    def __init__(self, config: MonitorConfig, board: Annunciator) -> None:
+        self._config, self._board, self.design = config, board, ChartDesign(config)
+        self._alarms = {
+            pair: board.declare(*pair, without_on_delay=chart(pair[0]).has_memory, priority=self._priority(pair[1]))
+            for pair in alarm_names(config)
+        }
+        self._watched: dict[str, _Watched] = {}
+        self.memory = ChartsMemory()
+
+    def _priority(self, signal: str) -> PriorityName | None:
+        if signal != ALL:
+            return None
+        ranks: tuple[PriorityName, ...] = ("low", "medium", "high", "critical")
+        return max((self._config.priorities.get(name, "medium") for name in self._config.outputs), key=ranks.index)
+
+    @property
+    def is_ordinary(self) -> bool:
+        """True if all charts are made, and at most their alarms remember points."""
+        return list(self._watched) == self.design.names and self._board.is_at_rest(self._alarms.values())
+
+    @property
+    def reads_values(self) -> bool:
+        """True if a chart judges the values of rows that are not predicted."""
+        return any(item.charts.judges_unpredicted for item in self._watched.values())
+
+    def load(self, p: np.void) -> None:
+        """Fill the numbers of a plant, see `row_frame.FrameTypes`, from the charts and their alarms."""
+        for name, memory in self.memory.charts.items():
+            p[name] = memory.numbers
+        for delay, alarm in zip(p["delays"], self._alarms.values(), strict=False):
+            rule = alarm.memory.rule
+            delay["recent"], delay["in_a_row"], delay["above"] = rule.recent, rule.in_a_row, alarm.memory.above
+
+    def store(self, p: np.void) -> None:
+        """Take over into the charts what compiled steps have written into the numbers of a plant."""
+        for name, memory in self.memory.charts.items():
+            memory.numbers[:] = p[name]
+
+    def store_delays(self, p: np.void) -> None:
+        """Take over into the alarms what compiled steps have written into the numbers of a plant."""
+        for (recent, in_a_row, _), alarm in zip(p["delays"].tolist(), self._alarms.values(), strict=False):
+            rule = alarm.memory.rule
+            rule.recent, rule.in_a_row = recent, in_a_row
+        for watched in self._watched.values():
+            watched.at_rest = all(alarm.is_idle for alarm in watched.alarms)
+
+    def points(self, time_ns: int, points: Array) -> list[Publication]:
+        """Publications of points of all charts.
+
+        Args:
+            time_ns: time of the row.
+            points: numbers of a `Judgement` in each row, one row an alarm; shape (at least the number of alarms, 5).
+        """
+        paths = [path for watched in self._watched.values() for path in watched.keys]
+        judgements = [
+            Judgement(statistic, centre, lower, upper, out > 0.0)
+            for statistic, centre, lower, upper, out in points.tolist()
+        ]
+        return [
+            Publication(path, chart_point(time_ns, judgement))
+            for path, judgement in zip(paths, judgements, strict=False)
+        ]
+
+    def start(self, learned: list[Prewhitening], e: Array, values: Array, arl0: float) -> None:
+        """Make the charts that the design has chosen.
+
+        Args:
+            learned: from the training, one an output.
+            e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
+            values: measured values of the training, see `ChartDesign.choose`.
+            arl0: run length of each alarm without a fault, in rows.
+        """
+        design, baseline = self.design, self.design.baseline(learned, e, arl0)
+        p = baseline.point_probability
+        widths, passed = [designed_width(p, item) for item in learned], [item.shift_gain for item in learned]
+        self.memory = ChartsMemory({}, widths, passed)
+
+        def design_charts(kind: type[Chart]) -> _Charts:
+            if issubclass(kind, SignalChart):
+                return _of_each(kind, [kind.design(baseline.of([index])) for index in range(len(learned))])
+            if issubclass(kind, ValueChart):
+                return _OfValues(kind.design(design.value_baseline(values, arl0)), self._config)
+            assert issubclass(kind, JointChart)
+            return _OfAll(kind.design(baseline.of(np.flatnonzero(design.evaluated).tolist())), design.evaluated)
+
+        self._watch(design_charts)
+
+    def resume(self, memory: ChartsMemory, evaluated: list[bool]) -> None:
+        """Go on, bit for bit, from the memory of charts with the same settings; after the board.
+
+        Args:
+            memory: memory of the other charts, as it was read.
+            evaluated: for each output, True if it is evaluated.
+
+        Raises:
+            ValueError: the memory is damaged.
+        """
+        design, names, stored = self.design, self.design.names, memory.charts
+        self.memory = memory
+        design.evaluated, design.chosen = evaluated, [name for name in names if name in stored]
+        outputs = len(self._config.outputs)
+        each = {name for name in names if issubclass(chart(name), SignalChart)}
+        if self._config.has_values_only and not each & set(stored):
+            each = set()
+        if not each <= set(stored) <= set(names) or not len(memory.widths) == len(memory.passed) == outputs:
+            raise ValueError(f"there must be the charts {', '.join(names)}, got {', '.join(stored)}")
+
+        def resume_charts(kind: type[Chart]) -> _Charts:
+            data = stored[kind.name]
+            if issubclass(kind, SignalChart) and not issubclass(kind, CompiledChart):
+                return _OfEach(
+                    [kind.resume(read_memory(item, kind.memory_type)) for item in _check_count(data, outputs)]
+                )
+            if issubclass(kind, CompiledChart):
+                bank = Bank.resume(kind, read_memory(data, SignalMemory))
+                _check_count(bank.numbers.T, outputs)
+                return _Banked(bank, kind)
+            made = kind.resume(read_memory(data, kind.memory_type))
+            if isinstance(made, ValueChart):
+                design.signals = made.names
+                return _OfValues(made, self._config)
+            assert isinstance(made, JointChart)
+            return _OfAll(made, design.evaluated)
+
+        self._watch(resume_charts)
+
+    def restart(self) -> None:
+        """Forget the rows seen, in all charts."""
+        for watched in self._watched.values():
+            for index in range(len(watched.alarms)):
+                watched.charts.restart(index)
+
+    def _watch(self, made: Callable[[type[Chart]], _Charts]) -> None:
+        """Give the charts of each name their alarms and keys."""
+        self._watched, self.memory.charts = {}, {}
+        for name in self.design.chosen:
+            pairs = [pair for pair in self._alarms if pair[0] == name]
+            alarms = [self._alarms[pair] for pair in pairs]
+            paths = [keys.key(self._config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
+            self._watched[name] = _Watched(made(chart(name)), alarms, paths, all(alarm.is_idle for alarm in alarms))
+            self.memory.charts[name] = self._watched[name].charts.memory
+
+    def update(
+        self, row: MeasuredRow, e: list[float], withheld: tuple[bool, ...], scales: list[float], *, points: bool
+    ) -> list[AlarmChange]:
+        """Evaluate a row; returns the changes of alarms.
+
+        Args:
+            row: the row; points are added to its publications.
+            e: prewhitened residuals; NaN where there is none.
+            withheld: outputs whose value may be an outlier and must not enter a memory yet.
+            scales: one standard deviation of each, in the outputs' units.
+            points: True to publish the charts' points.
+        """
+        changes: list[AlarmChange] = []
+        known = [size == size for size in e]  # NaN is not equal to itself
+        seen = _ChartRow(e, known, withheld, row.inputs, row.values)
+        for watched in self._watched.values():
+            judgements = watched.charts.update(seen, always=points or not watched.at_rest)
+            if judgements is None:
+                continue
+            for index, (alarm, judgement) in enumerate(zip(watched.alarms, judgements, strict=True)):
+                if judgement is None:
+                    continue
+                if points:
+                    row.publications.append(Publication(watched.keys[index], chart_point(row.time_ns, judgement)))
+                rule = alarm.memory.rule
+                if not (judgement.out or rule.standing or rule.recent):
+                    continue
+                raised = alarm.update(judgement)
+                if raised is None:
+                    continue
+                explanation = self._explain(watched.charts, index, judgement, scales, row.units) if raised else None
+                if explanation is not None and watched.charts.locates:
+                    explanation = explanation._replace(entries=_entries(explanation.contributions))
+                changes.append(AlarmChange(alarm, judgement, SD, explanation))
+                if not raised:
+                    watched.charts.restart(index)
+            rules = [alarm.memory.rule for alarm in watched.alarms]
+            watched.at_rest = not any(rule.standing or rule.recent for rule in rules)
+        return changes
+
+    def _explain(
+        self, charts: _Charts, index: int, judgement: Judgement, scales: list[float], units: list[str]
+    ) -> Explanation:
+        signals = [Shown(*item) for item in zip(self._config.outputs, units, scales, self.memory.passed, strict=True)]
+        return Explanation(*charts.explain(index, judgement, signals))
+
+
+def _entries(shares: Mapping[str, float]) -> list[SuspectedCause]:
+    """Signals at which a disturbance may enter, the likeliest first."""
+    return [
+        SuspectedCause(name, share, kind="process", text=f"the disturbance enters at {name}")
+        for name, share in islice(shares.items(), MOST_ENTRIES)
+    ]
+
+
+def _of_each(kind: type[SignalChart], charts: list[SignalChart]) -> _Charts:
+    """One chart an output, as a bank where there is a kernel."""
+    if issubclass(kind, CompiledChart):
+        return _Banked(Bank([item for item in charts if isinstance(item, kind)]), kind)
+    return _OfEach(charts)
+
+
+def _check_count(charts: Sized, count: int) -> Any:
+    """Charts of one name, of which there must be as many as outputs."""
+    if len(charts) != count:
+        raise ValueError(f"there must be {count} charts, got {len(charts)}")
+    return charts
+
+
+def chart_point(time_ns: int, judgement: Judgement) -> ChartPoint:
+    """Message of a point on a chart."""
+    return ChartPoint(
+        time_ns=time_ns,
+        statistic=judgement.statistic,
+        centre=judgement.centre,
+        lower_limit=judgement.lower_limit,
+        upper_limit=judgement.upper_limit,
+        out=judgement.out,
+    )

@@ -1,0 +1,119 @@
+"""Lasting steps of measurements that a reference follows, and so hardly shows in its residuals afterwards.
+
+Where a reference predicts an output from its last values, as the ARX models and the black box do, a lasting step is in
+the residual for a few rows only. The test (`reactorwatch.spc.step_test`) finds it by the form of these rows and tells
+it from an outlier. The equations follow no measurement against their balances: with them there is no such test, and no
+share of the promised false alarms.
+
+Rows in which the reference extrapolates are tested all the same: a step in them would not be seen afterwards, as the
+reference follows it, or learns it.
+"""
+
+from math import isfinite, nan
+
+from monitor_node.alarms.alarms import AlarmChange, Explanation
+from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.charts.charts import chart_point
+from monitor_node.config import MonitorConfig
+from monitor_node.ingest.alignment import MeasuredRow
+from reactorwatch.arrays import Array
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Publication
+from reactorwatch.spc.charts.base import Judgement, format_quantity
+from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.step_test import ONSETS, STEP_TEST, StepTests
+from reactorwatch.stored_state import pack_records, unpack_records
+
+NAME = "shift"
+"""Name of the chart."""
+
+
+class ShiftWatch:
+    """Tests the outputs of a plant for lasting steps.
+
+    Args:
+        config: settings of the monitor.
+        board: alarms of the plant; those of the tests are declared here.
+    """
+
+    def __init__(self, config: MonitorConfig, board: Annunciator) -> None:
+        self._outputs, self._board = config.outputs, board
+        self._alarms = [board.declare(NAME, signal, without_on_delay=True) for signal in self._outputs]
+        self._keys = [keys.key(config.plant, keys.CHART, keys.chart_name(NAME, item)) for item in self._outputs]
+        self._tests: StepTests | None = None
+        self._none = [nan] * len(self._outputs)
+        self.is_active = False
+        """True if there are tests, which share the promised false alarms."""
+
+    def start(self, responses: Array | None, z: Array, learned: list[Prewhitening], arl0: float) -> None:
+        """Learn the tests from a training.
+
+        Args:
+            responses: response of each output's residual to a lasting step of one unit, shape (outputs, rows); NaN for
+                an output without one; None: the reference does not follow a step.
+            z: residuals of the training, shape (rows, outputs); NaN where there is none.
+            learned: prewhitening of each residual.
+            arl0: run length of each alarm without a fault, in rows.
+        """
+        self._tests = None if responses is None else StepTests.learn(responses, z, learned, arl0)
+        self.is_active = self._tests is not None
+
+    @property
+    def memory(self) -> bytes:
+        """Numbers of the tests; empty without tests. The alarms belong to the board."""
+        return b"" if self._tests is None else pack_records(self._tests.numbers)
+
+    def resume(self, memory: bytes) -> None:
+        """Go on from a memory; after the board.
+
+        Raises:
+            ValueError: the memory is of other outputs.
+        """
+        self._tests = StepTests(unpack_records(memory, STEP_TEST, len(self._outputs))) if memory else None
+        self.is_active = self._tests is not None
+
+    @property
+    def sensitivities(self) -> list[tuple[float, float]]:
+        """Statistic of each output's test after a lasting step of one unit, and its limit; empty without tests."""
+        tests = self._tests
+        return [] if tests is None else [(tests.sensitivity(i), tests.limit(i)) for i in range(len(self._outputs))]
+
+    def restart(self) -> None:
+        """Forget the rows seen, after a gap."""
+        if self._tests is not None:
+            self._tests.restart()
+
+    def update(self, row: MeasuredRow, z: list[float], *, points: bool) -> list[AlarmChange]:
+        """Test a row; returns the changes of alarms.
+
+        Args:
+            row: the row; points are added to its publications.
+            z: residual of each output, normalised by the reference; NaN where there is none.
+            points: True to publish the points.
+        """
+        changes: list[AlarmChange] = []
+        if self._tests is None:
+            return changes
+        for _ in range(min(row.interval.missing, ONSETS)):
+            self._tests.update(self._none)
+        is_out = self._tests.update(z)
+        if not (is_out or points or any(not alarm.is_idle for alarm in self._alarms)):
+            return changes
+        for i, alarm in enumerate(self._alarms):
+            point = self._tests.point(i)
+            if not isfinite(point.statistic):
+                continue
+            judgement = Judgement(point.statistic, 0.0, -point.limit, point.limit, abs(point.statistic) > point.limit)
+            if points:
+                row.publications.append(Publication(self._keys[i], chart_point(row.time_ns, judgement)))
+            if (raised := alarm.update(judgement)) is None:
+                continue
+            explanation = self._explain(i, point.size, point.rows, row.units[i]) if raised else None
+            changes.append(AlarmChange(alarm, judgement, "sd", explanation))
+        return changes
+
+    def _explain(self, output: int, size: float, rows: int, unit: str) -> Explanation:
+        name = self._outputs[output]
+        step = format_quantity(size, unit, "+.3g")
+        text = f"{name} moved by {step} {rows} rows before and stayed there, which the model follows from then on"
+        return Explanation(text, {name: 1.0})

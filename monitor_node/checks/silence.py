@@ -1,0 +1,144 @@
+"""Silence: a plant, or one of its signals, has stopped sending; the method is `spc.silence`."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from msgspec import field
+
+from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.checks.base import PLANT, Finding, SignalCheck
+from monitor_node.config import MonitorConfig
+from monitor_node.ingest.samples import UnusableSamples
+from monitor_node.learn.signal_range import SignalRange
+from reactorwatch.spc.charts.base import Judgement
+from reactorwatch.spc.silence import NO_CHANGE, Change, DataTimeout, Spacing, no_timeouts
+from reactorwatch.stored_state import Memory, Records, place_records
+
+UNUSABLE = 32
+"""Samples in a row that cannot be used before a plant without usual spacing has a timeout: as many as it is learned
+from."""
+
+SILENT, RECEIVED = Judgement(1.0, 0.0, 0.0, 0.0, True), Judgement(0.0, 0.0, 0.0, 0.0, False)
+
+
+class Silences(Memory):
+    """Memory of the check.
+
+    Attributes:
+        numbers: timeouts of the plant, of each input and of each output, in sample time.
+        receipts: usual spacing of the plant's samples in receive time.
+    """
+
+    numbers: Records
+    receipts: Spacing = field(default_factory=Spacing)
+
+
+class SilenceCheck(SignalCheck):
+    """Raises an alarm when the plant, or one of its signals, is silent, or sends nothing that can be used.
+
+    Attributes:
+        unusable: samples of the plant that were refused since the newest usable one; the monitor counts them.
+    """
+
+    name = cause = "silence"
+    options: ClassVar = {"without_off_delay": True, "priority": "high"}
+    memory: Silences
+
+    def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
+        super().__init__(config, board, ranges, (PLANT, *config.signals))
+        self.unusable = UnusableSamples()
+        self.memory = Silences(no_timeouts(len(self.signals)))
+        self._timeouts = [DataTimeout(config.silence_periods) for _ in self.signals]
+        self._share()
+
+    def _share(self) -> None:
+        for i, timeout in enumerate(self._timeouts):
+            timeout.numbers = self.memory.numbers[i : i + 1]
+        self.of_plant.receipts = self.memory.receipts
+
+    def use_numbers(self, numbers: np.void) -> None:
+        """See `SignalCheck`."""
+        self.memory.numbers = place_records(self.memory.numbers, numbers["timeouts"])
+        self._share()
+
+    @property
+    def of_plant(self) -> DataTimeout:
+        """The timeout of all signals together."""
+        return self._timeouts[0]
+
+    @property
+    def silent(self) -> list[bool]:
+        """Flags of the signals without data, the inputs first."""
+        return [timeout.is_active for timeout in self._timeouts[1:]]
+
+    @property
+    def is_ordinary(self) -> bool:
+        """See `SignalCheck`: the newest row has all signals, and no timeout is active."""
+        times_ns = self.memory.numbers["last_ns"]
+        return not self.memory.numbers["is_active"].any() and bool((times_ns == times_ns[0]).all())
+
+    def follow_alarms(self) -> None:
+        """Take as silent what the alarms say is silent: the next sample ends it."""
+        for timeout, alarm in zip(self._timeouts, self.alarms, strict=True):
+            timeout.is_active = alarm.memory.rule.standing
+
+    def on_row(self, time_ns: int, values: tuple[float, ...]) -> list[Finding]:
+        """See `SignalCheck`."""
+        plant, *timeouts = self._timeouts
+        change = plant.update(time_ns, present=True)
+        findings = self._findings(0, change)
+        if change is not NO_CHANGE:
+            for timeout in timeouts:
+                timeout.suppress_until(time_ns)
+        is_complete = all(value == value for value in values)  # NaN is not equal to itself
+        unknown_ns = None if is_complete else plant.fallback_allowed_ns()
+        for index, (timeout, value) in enumerate(zip(timeouts, values, strict=True), start=1):
+            change = timeout.update(time_ns, present=value == value, fallback_allowed_ns=unknown_ns)
+            if change is not NO_CHANGE:
+                findings += self._findings(index, change)
+        return findings
+
+    def postpone(self, now_ns: int) -> None:
+        """Restart an expired timer of the plant: a monitor with messages to process cannot say what has not come."""
+        due_ns = self.of_plant.due_ns()
+        if due_ns is not None and now_ns >= due_ns:
+            self.of_plant.arm(now_ns)
+
+    @property
+    def is_unusable(self) -> bool:
+        """True if samples come and none was usable, of a plant whose usual spacing is therefore unknown."""
+        plant = self.of_plant
+        return self.unusable.in_a_row >= UNUSABLE and plant.deadline_ns() is None and not plant.is_active
+
+    def check(self, now_ns: int) -> list[Finding]:
+        """Check the plant's timeout in receive time."""
+        if self.is_unusable:
+            return self.declare_unusable(now_ns)
+        return self._findings(0, self.of_plant.check(now_ns))
+
+    def declare_unusable(self, time_ns: int) -> list[Finding]:
+        """Declare a timeout of a plant without a usable sample, at a receive time."""
+        self.of_plant.is_active = True
+        return self._findings(0, Change(time_ns, None))
+
+    def declare_timeout(self) -> list[Finding]:
+        """Declare a timeout of the plant that was recorded, where the receive time expired it."""
+        return self._findings(0, self.of_plant.declare_timeout())
+
+    def _findings(self, index: int, change: Change) -> list[Finding]:
+        """The timeout of the plant (index 0) or of a signal, if it changes."""
+        findings: list[Finding] = []
+        if change.raised_ns is not None:
+            findings.append(Finding(index, SILENT, text=self._text(index), time_ns=change.raised_ns))
+        if change.cleared_ns is not None:
+            findings.append(Finding(index, RECEIVED, time_ns=change.cleared_ns))
+        return findings
+
+    def _text(self, index: int) -> str:
+        name, reasons = self.signals[index], self.unusable.reasons
+        if index == 0 and self.unusable.in_a_row:
+            return f"no usable sample of the plant comes: {'; '.join(reasons.values())}"
+        if name in reasons:
+            return f"no usable sample of {name} comes: {reasons[name]}"
+        return "the plant is silent: no sample of it comes" if index == 0 else f"{name} is silent: the others go on"

@@ -1,1 +1,0 @@
-"""Health of a monitor: its message, contained errors, other monitors of its plants."""

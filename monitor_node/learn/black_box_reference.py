@@ -1,0 +1,300 @@
+"""Black box as reference: a state map learned from the training, for plants without equations.
+
+It goes on learning while nothing is wrong: `BlackBoxFilter` forgets a row after about `MEMORY` others. While alarms are
+active it learns nothing, and what it learned shortly before is taken back: its parameters become those of a copy that
+is `COPY_ROWS` to twice as many rows old, so a fault that was not noticed at once is not part of them.
+"""
+
+from collections.abc import Iterator, Sequence
+from math import inf, nan
+
+import msgspec
+import numpy as np
+
+from monitor_node.ingest.sampling import TOLERANCE, regular_intervals
+from monitor_node.learn.references import GATE, FilterReference, RowFilter, RowPrediction
+from reactorwatch.arrays import Array
+from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
+from reactorwatch.errors import InputError
+from reactorwatch.identification.black_box.filter import MEMORY, BlackBoxFilter, BlackBoxFilterMemory
+from reactorwatch.identification.black_box.fit import fit_black_box
+from reactorwatch.identification.black_box.model import BlackBoxModel
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.stored_state import Memory, copy_of
+
+SETTLING_ROWS = 50
+"""Rows at the means before a step response."""
+
+COPY_ROWS = 250
+"""Rows between two copies of the parameters."""
+
+UNCERTAIN = 0.2
+"""Standard deviation of a coefficient of the dynamics above which the training did not determine them."""
+
+
+class BlackBoxMemory(Memory, tag="black-box"):
+    """Memory of a `BlackBoxReference`.
+
+    Attributes:
+        model: the fitted state map.
+        outputs: index of each output of the model among the monitored ones.
+        count: number of monitored outputs.
+        period_min: sampling period of the training.
+        typical_sd: median standard deviation of each residual in the training, in the outputs' units; 1 if unknown.
+        filter: memory of the filter; None: a new one.
+        time_min: time of the newest row; None before the first.
+        last_inputs: inputs of that row.
+        rows: number of rows since the training.
+        unfamiliar_rows: number of these in which the model knew too little of the point of operation.
+        copies: the older and the newer copy of the parameters, each with its covariance below it, row by row.
+    """
+
+    model: BlackBoxModel
+    outputs: list[int]
+    count: int
+    period_min: float
+    typical_sd: list[float]
+    filter: BlackBoxFilterMemory | None = None
+    time_min: float | None = None
+    last_inputs: tuple[float, ...] = ()
+    rows: int = 0
+    unfamiliar_rows: int = 0
+    copies: list[Array] = msgspec.field(default_factory=list)
+
+    def reference(self, equations: ProcessModel | None, outputs: tuple[str, ...]) -> "BlackBoxReference":
+        """Reference that resumes from this memory, bit for bit.
+
+        Raises:
+            ValueError: the memory is damaged.
+        """
+        return BlackBoxReference(copy_of(self))
+
+
+class BlackBoxReference(FilterReference):
+    """Filter of a state map whose parameters are learned; see `references.Reference`.
+
+    Args:
+        memory: the fitted state map, and where its filter stands.
+
+    Attributes:
+        model: the fitted state map.
+    """
+
+    kind = "black-box"
+
+    def __init__(self, memory: BlackBoxMemory) -> None:
+        self._memory, self.model = memory, memory.model
+        self._filter = BlackBoxFilter(memory.model, memory.filter)
+        memory.filter = self._filter.memory
+        self._outputs, self._count, self.period_min = memory.outputs, memory.count, memory.period_min
+        if not memory.copies:
+            memory.copies = [self._parameters()] * 2
+
+    def _parameters(self) -> Array:
+        """A copy of the parameters with their covariance below them, row by row."""
+        theta, covariance = self._filter.parameters
+        return np.vstack([theta[None], covariance]).ravel()
+
+    @classmethod
+    def learn(
+        cls, time_min: Array, inputs: Array, measured: Array, evaluated: Array, smallest_sd: list[float], delay: int
+    ) -> tuple["BlackBoxReference", Array]:
+        """Learn a black box from a training.
+
+        Args:
+            time_min: times of the rows in minutes, shape (n,).
+            inputs: shape (n, inputs).
+            measured: outputs that are fitted, shape (n, outputs); NaN if missing, disturbed or left out.
+            evaluated: outputs that are predicted; same shape as `measured`.
+            smallest_sd: smallest standard deviation of each output.
+            delay: delay of the inputs in rows.
+
+        Returns:
+            The reference, and the normalised residuals, scaled to the size of out-of-sample residuals; NaN if missing.
+
+        Raises:
+            InputError: there are too few rows or too many signals, or no output varies.
+        """
+        outputs = np.flatnonzero(np.isfinite(measured).any(axis=0)).tolist()
+        if not outputs:
+            raise InputError("outputs must vary in the training, none does")
+        follows = np.concatenate([[False], regular_intervals(time_min)])
+        smallest = np.array(smallest_sd)[outputs]
+        model = fit_black_box(inputs, measured[:, outputs], follows, smallest, delay)
+        period_min, count = float(np.median(np.diff(time_min))), measured.shape[1]
+        reference = cls(BlackBoxMemory(model, outputs, count, period_min, [1.0] * count))
+        residuals, sds = reference._filter.run(inputs, evaluated[:, outputs], follows)
+        for output, column in zip(outputs, sds.T, strict=True):
+            if np.isfinite(column).any():
+                reference.typical_sd[output] = float(np.nanmedian(column))
+        reference._memory.time_min, reference._memory.last_inputs = float(time_min[-1]), tuple(inputs[-1].tolist())
+        z = np.full(measured.shape, nan)
+        z[:, outputs] = residuals / sds * model.out_of_sample
+        return reference, z
+
+    @property
+    def memory(self) -> BlackBoxMemory:
+        """See `Reference`."""
+        return self._memory
+
+    @property
+    def unfamiliar_rows(self) -> int:
+        """Number of rows in which the model knew too little of the point of operation."""
+        return self._memory.unfamiliar_rows
+
+    @property
+    def parameters(self) -> tuple[Array, Array]:
+        """Copies of the parameters and their covariance, of scaled signals."""
+        return self._filter.parameters
+
+    def snapshot(self, output: int, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> ModelSnapshot | None:
+        """Snapshot of the model of an output, of scaled signals; None if the output is not predicted.
+
+        Args:
+            output: index of the output among the monitored ones.
+            inputs: names of the inputs.
+            outputs: names of the monitored outputs.
+        """
+        if output not in self._outputs:
+            return None
+        shape, (theta, covariance) = self.model.shape, self._filter.parameters
+        names = [f"{outputs[i]}{lag}" for lag in range(1, shape.lags + 1) for i in self._outputs]
+        names += [f"{name}{lag + shape.delay}" for lag in range(shape.lags) for name in inputs]
+        first = self._outputs.index(output) * shape.terms
+        terms = ["*".join(names[i] for i in product if i >= 0) or "1" for product in shape.products().tolist()]
+        values = theta[first : first + shape.terms].tolist()
+        sds = np.sqrt(np.diag(covariance)[first : first + shape.terms]).tolist()
+        return ModelSnapshot(
+            structure=self.kind,
+            order=shape.lags,
+            delay=shape.delay,
+            parameters=[
+                Parameter(name=name, value=value, sd=sd) for name, value, sd in zip(terms, values, sds, strict=True)
+            ],
+            rows=self.model.rows + self._memory.rows,
+            forgetting=1.0 - 1.0 / MEMORY,
+            reference=True,
+            held=not self._filter.learning,
+        )
+
+    def normalised_residuals(self, time_min: Array, inputs: Array, outputs: Array) -> Array:
+        """See `Reference`; by the model as fitted."""
+        follows = np.concatenate([[False], regular_intervals(time_min)])
+        residuals, sds = BlackBoxFilter(self.model).run(inputs, outputs[:, self._outputs], follows)
+        z = np.full(outputs.shape, nan)
+        z[:, self._outputs] = residuals / sds * self.model.out_of_sample
+        return z
+
+    @property
+    def weakness(self) -> str:
+        """Reason why the promise may not hold at set points that the training has not seen; empty if it does."""
+        if self.model.dynamics_sd <= UNCERTAIN:
+            return ""
+        return (
+            "the training moved the plant too little to determine its dynamics: at new set points false alarms may be "
+            "more than promised; train over more set points"
+        )
+
+    def obstacles(self, inputs: Sequence[str]) -> Iterator[tuple[str, str]]:
+        """See `Reference`."""
+        if self.unfamiliar_rows:
+            text = "rows are not judged while inputs have values that the black box has not learned, and teach it"
+            yield self.kind, text
+
+    def row_filter(self, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> RowFilter:
+        """See `Reference`."""
+        belief, constants = self.numbers
+        shortest, longest = ((1.0 + sign * TOLERANCE) * self.period_min for sign in (-1.0, 1.0))
+        return RowFilter(None, np.empty(0), (belief.size, constants.size), (shortest, longest))
+
+    def set_learning(self, learning: bool) -> None:
+        """Learn from the rows to come or not; the end of learning takes back what was learned last."""
+        if learning == self._filter.learning:
+            return
+        self._filter.learning = learning
+        if not learning:
+            numbers = self._memory.copies[0].reshape(-1, self.model.shape.parameters)
+            self._filter.reset_parameters((numbers[0], numbers[1:]))
+        self._memory.copies = [self._parameters()] * 2
+
+    def update(
+        self,
+        time_ns: int,
+        inputs: Sequence[float],
+        values: list[float],
+        accept: tuple[bool, ...],
+        missing: int = 0,
+        *,
+        follows: bool = True,
+    ) -> RowPrediction:
+        """See `Reference`. There is no prediction just after a missing row."""
+        time_min, before = time_ns / MINUTE_NS, self._memory.time_min
+        if before is None or abs(time_min - before - self.period_min) > TOLERANCE * self.period_min:
+            self._filter.restart()
+        measured = [values[i] for i in self._outputs]
+        limits = [inf if accept[i] else GATE for i in self._outputs]
+        predicted = self._filter.update(inputs, measured, limits)
+        self.accept_row(time_min, tuple(inputs))
+        prediction, sd = [nan] * self._count, [1.0] * self._count
+        if predicted is None:
+            return RowPrediction(prediction, sd)
+        for i, output in enumerate(self._outputs):
+            prediction[output], sd[output] = predicted.prediction[i], predicted.sd[i]
+        if predicted.judged:
+            return RowPrediction(prediction, sd)
+        self._memory.unfamiliar_rows += 1
+        return RowPrediction([nan] * self._count, sd, (prediction, sd))
+
+    def step_responses(self, rows: int) -> Array:
+        """Response of each output's normalised residual to a lasting step of one unit, shape (outputs, rows).
+
+        The difference of two runs of the filter from its present state, with the inputs and outputs at their means.
+        NaN for an output that is not predicted.
+
+        Args:
+            rows: number of rows from the onset on.
+        """
+        responses = np.full((self._count, rows), nan)
+        centres = np.array(self.model.centres)
+        steps = self.model.error_sd
+        without = self._normalised_residuals(np.tile(centres, (rows, 1)))
+        for i, output in enumerate(self._outputs):
+            stepped = np.tile(centres, (rows, 1))
+            stepped[:, i] += steps[i]
+            responses[output] = (self._normalised_residuals(stepped) - without)[:, i] / steps[i]
+        return responses
+
+    def _normalised_residuals(self, values: Array) -> Array:
+        """Normalised residuals of rows (outputs, then inputs) that follow some at the means, shape (rows, outputs)."""
+        model, p = self.model, len(self._outputs)
+        copy = BlackBoxFilter(model, copy_of(self._filter.memory))
+        limits, residuals = [inf] * p, []
+        for row in [*[list(model.centres)] * SETTLING_ROWS, *values.tolist()]:
+            predicted = copy.update(row[p:], row[:p], limits)
+            residuals.append(
+                np.full(p, nan) if predicted is None else np.subtract(row[:p], predicted.prediction) / predicted.sd
+            )
+        return np.array(residuals[SETTLING_ROWS:])
+
+    def restart(self) -> None:
+        """See `Reference`."""
+        self._filter.restart()
+
+    def is_ordinary(self, time_min: float) -> bool:
+        """True if a compiled step may take the row after the one of this time."""
+        is_whole = len(self._outputs) == self._count
+        return is_whole and self._filter.memory.started and self._filter.learning and self._memory.time_min == time_min
+
+    @property
+    def numbers(self) -> tuple[Array, Array]:
+        """Belief and constants of the filter: its own numbers, see `BlackBoxFilter`."""
+        return self._filter.belief, self._filter.constants
+
+    def accept_row(self, time_min: float, inputs: tuple[float, ...]) -> None:
+        """Note a row that was filtered in `numbers`."""
+        memory = self._memory
+        memory.time_min, memory.last_inputs = time_min, inputs
+        memory.rows += 1
+        if memory.rows % COPY_ROWS == 0 and self._filter.learning:
+            memory.copies = [memory.copies[1], self._parameters()]

@@ -1,0 +1,226 @@
+"""References: models that predict the rows of a plant; residuals are taken against the predictions.
+
+There are three: the extended Kalman filter of a process model (`process_reference`), a black box of few signals
+(`black_box_reference`), and the recursive ARX models (`arx_reference`).
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+from monitor_node.learn.identified_models import IdentifiedModels
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import CompiledFunction
+from reactorwatch.contract.messages_pb2 import ModelSnapshot
+from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.process.model import ProcessModel
+
+GATE = 6.0
+"""Standard deviations beyond which a residual does not correct the filter until the next one confirms it."""
+
+
+class RowPrediction(NamedTuple):
+    """One-step-ahead prediction of a row.
+
+    Attributes:
+        prediction: predicted outputs in their units; NaN where there is none.
+        sd: standard deviations of the residuals in the same units; 1 if unknown.
+        extrapolation: for tests that need every row, predictions with their standard deviations that include those
+            where the reference knows too little of the point of operation for charts; None: they are the same.
+    """
+
+    prediction: Sequence[float]
+    sd: Sequence[float]
+    extrapolation: tuple[Sequence[float], Sequence[float]] | None = None
+
+
+class RowFilter(NamedTuple):
+    """A reference's filter of a row as machine code, for the compiled step of ordinary rows.
+
+    Attributes:
+        code: machine code of the filter; None: `black_box.filter.filter_row`.
+        parameters: parameters of the equations; none for a black box, whose constants are those of a plant.
+        sizes: sizes of the two arrays of `FilterReference.numbers`.
+        spacing_min: shortest and longest time between two rows, in minutes.
+    """
+
+    code: CompiledFunction | None
+    parameters: Array
+    sizes: tuple[int, int]
+    spacing_min: tuple[float, float]
+
+
+class PlantEquations(NamedTuple):
+    """Equations of a plant, with the noise of a filter of the equations alone.
+
+    Attributes:
+        equations: the process model.
+        plant_noise: noise of the plant and its sensors.
+    """
+
+    equations: ProcessModel
+    plant_noise: NoiseLevels
+
+
+class Reference(ABC):
+    """Predicts rows.
+
+    Attributes:
+        kind: `equations`, `black-box` or `arx`, as published.
+        is_identified: True if the identified models predict, which are then not updated beside it.
+    """
+
+    kind: ClassVar[str]
+    is_identified: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def memory(self) -> Any:
+        """The memory, without the equations; its `reference` makes a reference that resumes from a copy of it."""
+
+    @property
+    @abstractmethod
+    def typical_sd(self) -> list[float]:
+        """Median standard deviation of each residual, in the outputs' units; 1 if unknown."""
+
+    @property
+    def filter(self) -> "FilterReference | None":
+        """The reference itself, if it is a filter whose rows the compiled step can take."""
+        return None
+
+    @property
+    def unfamiliar_rows(self) -> int:
+        """Number of rows in which the reference knew too little of the point of operation."""
+        return 0
+
+    # --- rows ------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def update(
+        self,
+        time_ns: int,
+        inputs: Sequence[float],
+        values: list[float],
+        accept: tuple[bool, ...],
+        missing: int = 0,
+        *,
+        follows: bool = True,
+    ) -> RowPrediction:
+        """Predict a row, then update with it.
+
+        Args:
+            time_ns: time of the row.
+            inputs: one value an input; NaN if missing.
+            values: outputs; NaN if missing.
+            accept: outputs that correct the reference whatever their residual.
+            missing: number of rows missing just before this one.
+            follows: True if the row before was one period ago.
+        """
+
+    @abstractmethod
+    def restart(self) -> None:
+        """Restart with the next row: the plant's clock was set, or there was a gap."""
+
+    def set_learning(self, learning: bool) -> None:  # noqa: B027 # without memory of the plant there is nothing to do
+        """Learn from the rows to come, or not: while nothing is wrong, or a fault would be learned as ordinary."""
+
+    def use_models(self, models: IdentifiedModels) -> None:  # noqa: B027 # only identified models judge by them
+        """Take the identified models of the plant, if they judge."""
+
+    def obstacles(self, inputs: Sequence[str]) -> Iterator[tuple[str, str]]:
+        """Reasons why rows are not judged now, each with what it is about.
+
+        Args:
+            inputs: names of the inputs.
+        """
+        yield from ()
+
+    # --- what is known of the plant --------------------------------------------------------------------------
+
+    @property
+    def plant(self) -> PlantEquations | None:
+        """Equations of the plant; None if it is not judged by equations."""
+        return None
+
+    @property
+    def follows_equations(self) -> bool:
+        """True if the plant is judged by equations."""
+        return self.plant is not None
+
+    @property
+    def known_plant(self) -> tuple[ProcessModel, NoiseLevels] | None:
+        """Model and noise as if the constants were known; None without equations."""
+        return None
+
+    @property
+    def noise_levels(self) -> dict[str, dict[str, float]] | None:
+        """Standard deviations of the sensors and the states by name; None without equations."""
+        return None
+
+    def snapshot(self, output: int, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> ModelSnapshot | None:
+        """Snapshot of the model of an output; None if the reference has no model of its own for it.
+
+        Args:
+            output: index of the output among the monitored ones.
+            inputs: names of the inputs.
+            outputs: names of the monitored outputs.
+        """
+        return None
+
+    def step_responses(self, rows: int) -> Array | None:
+        """Response of each normalised residual to a lasting step of one unit of its output, shape (outputs, rows).
+
+        NaN where there is no model; None with equations.
+
+        Args:
+            rows: number of rows from the onset on.
+        """
+        return None
+
+    def normalised_residuals(self, time_min: Array, inputs: Array, outputs: Array) -> Array | None:
+        """Normalised residuals of other rows, shape (n, outputs); None: `step_responses` states them for a bias.
+
+        Args:
+            time_min: times in minutes, shape (n,).
+            inputs: shape (n, inputs).
+            outputs: monitored outputs, shape (n, outputs).
+        """
+        return None
+
+
+class FilterReference(Reference):
+    """Reference by a filter, whose ordinary rows the compiled step takes."""
+
+    @property
+    def typical_sd(self) -> list[float]:
+        """See `Reference`."""
+        sds: list[float] = self.memory.typical_sd
+        return sds
+
+    @property
+    def filter(self) -> "FilterReference":
+        """See `Reference`."""
+        return self
+
+    @property
+    def last_inputs(self) -> tuple[float, ...]:
+        """The newest value of each input that was not missing."""
+        inputs: tuple[float, ...] = self.memory.last_inputs
+        return inputs
+
+    @abstractmethod
+    def row_filter(self, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> RowFilter | None:
+        """The filter as machine code; None if the compiled step cannot take the rows of such signals."""
+
+    @property
+    @abstractmethod
+    def numbers(self) -> tuple[Array, Array]:
+        """Belief of the filter and its constants: its own numbers, which the compiled step updates."""
+
+    @abstractmethod
+    def is_ordinary(self, time_min: float) -> bool:
+        """True if the compiled step may take the row after the one of this time."""
+
+    @abstractmethod
+    def accept_row(self, time_min: float, inputs: tuple[float, ...]) -> None:
+        """Note a row that the compiled step has filtered in `numbers`."""

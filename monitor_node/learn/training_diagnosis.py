@@ -1,0 +1,364 @@
+"""Diagnosis of a plant's training: deviations from the equations that the plant had from the start. Pure.
+
+A plant whose feed has always been a little warmer than in the simulation is sound. Its training is diagnosed like any
+record (`reactorwatch.diagnosis`), and the plant is then judged by the equations with these deviations in them. A
+diagnosis takes far longer than a row, so a job and its finding are values, and another process can do the work between
+them.
+
+`find_uncertain` finds what a filter should estimate beside the states of the equations:
+
+- Where the rows say that the plant is not quite the equations, or leave open how it follows a move of an input, its
+  constants are uncertain (`kalman.uncertain_model`), and so are predictions until rows have taught them.
+- Where the innovations are coloured even so, the plant has disturbances that wander, or its sensors noise with memory.
+
+A plant that equals the equations, and that the training has moved enough, needs neither.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from math import nan
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from monitor_node.learn.process_reference import fit_training_noise, output_indices
+from monitor_node.learn.references import GATE
+from monitor_node.learn.training_rows import TrainingRows, screen_baseline
+from reactorwatch.arrays import Array
+from reactorwatch.contract.messages_pb2 import Baseline
+from reactorwatch.diagnosis.extended import extended_model
+from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
+from reactorwatch.diagnosis.whiteness import minus_log10_p
+from reactorwatch.errors import InputError
+from reactorwatch.kalman.ekf import LONGEST_GAP_MIN, Filter, FilterState
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
+from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.noise_estimation import NoiseFit
+from reactorwatch.kalman.uncertain_model import (
+    CONSTANT,
+    NOISE,
+    WANDER,
+    is_disturbance,
+    learned_parameters,
+    select_effects,
+    widen_model,
+)
+from reactorwatch.process import EFFECTS_OF, effects_of
+from reactorwatch.process.extended_model import ExtendedModel, extended_model_of, is_complete, parse_extended_model
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import FREE_NAME
+from reactorwatch.records.record import GAP_ROWS, MINUTE_NS, Record
+
+DIAGNOSED = "diagnosed"
+"""`Baseline.what` of a change after a diagnosis of the training."""
+
+FAILED = "failed"
+"""Verdict of a diagnosis that could not be made."""
+
+
+class Uncertain(NamedTuple):
+    """Additional states of a filter.
+
+    Attributes:
+        names: texts of the states, see `kalman.uncertain_model`.
+        learned: values of their `learned_parameters`.
+    """
+
+    names: tuple[str, ...] = ()
+    learned: tuple[float, ...] = ()
+
+    def add_disturbances(self, model: ProcessModel) -> ProcessModel:
+        """Add the disturbances and the coloured noise to a model, not the constants."""
+        return widen_model(model, tuple(filter(is_disturbance, self.names)), self.learned)
+
+
+class DiagnosisJob(NamedTuple):
+    """A training to be diagnosed.
+
+    Attributes:
+        rows: the rows of the training.
+        signals: names of the signals in a row, the input first.
+        equations: the model as JSON (`ExtendedModel.to_object`), times in minutes since 1970-01-01 UTC.
+    """
+
+    rows: TrainingRows
+    signals: tuple[str, ...]
+    equations: str
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the first row, which identifies the training."""
+        return self.rows.times_ns[0]
+
+
+class Finding(NamedTuple):
+    """Result of a job.
+
+    Attributes:
+        first_ns: time of the first row of the training.
+        verdict: verdict of the diagnosis, or `FAILED`.
+        why: what was found, or why nothing could be, as a sentence without its full stop.
+        equations: the extended model as JSON, with its own zero; empty: the equations stay as they are.
+    """
+
+    first_ns: int
+    verdict: str
+    why: str
+    equations: str = ""
+
+    @property
+    def baseline(self) -> Baseline:
+        """The change of the baseline that follows, without its time and number."""
+        return Baseline(what=DIAGNOSED, by="monitor", why=self.why, model=self.equations)
+
+
+def diagnose_training(job: DiagnosisJob) -> Finding:
+    """Diagnose a training, and find what a filter should estimate beside the states of the equations.
+
+    Where the rows cannot rank the explanations, the best of them is taken. Of its causes those are taken that last: a
+    curve (profile `free`), such as a disturbance, predicts no other rows.
+
+    Raises:
+        InputError: the rows cannot be diagnosed: too few, or without movement of the input.
+    """
+    times_ns, columns = np.array(job.rows.times_ns), np.column_stack([job.rows.inputs, job.rows.outputs]).T
+    time_min = _shorten_gaps((times_ns - job.first_ns) / MINUTE_NS)
+    record = Record(time_min, dict(zip(job.signals, columns, strict=True)), "training", zero_ns=job.first_ns)
+    given = parse_extended_model(job.equations)
+    effects = tuple(item.shift(-job.first_ns / MINUTE_NS) for item in given.effects)
+    model = replace(given, effects=effects).build()
+    outputs = job.signals[len(model.inputs) :]
+    measured = columns[len(model.inputs) :].T
+    rows = time_min, columns[: len(model.inputs)].T, measured
+    uncertain = find_uncertain(model, outputs, *rows)
+    verdict, why, extended = _diagnose(record, model, uncertain)
+    if extended is not None:
+        uncertain = find_uncertain(extended.build(), outputs, *rows)
+    if uncertain.names:
+        why = f"{why}; {describe_uncertain(uncertain.names)}"
+    result = replace(extended or given, uncertain=uncertain.names)
+    return Finding(job.first_ns, verdict, why, _json(result.to_object()) if extended or uncertain.names else "")
+
+
+def _shorten_gaps(time_min: Array) -> Array:
+    """Times in which the rows before a long gap come later, so that a jump of the clock does not last for years.
+
+    The filter restarts after the gap in any case, and the rows after the last one keep their times.
+    """
+    spacings = np.diff(time_min)
+    excess = np.maximum(spacings - max(2.0 * LONGEST_GAP_MIN, GAP_ROWS * float(np.median(spacings))), 0.0)
+    return np.asarray(time_min + np.append(np.cumsum(excess[::-1])[::-1], 0.0))
+
+
+def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tuple[str, str, ExtendedModel | None]:
+    """Verdict of the diagnosis, the reason, and the model with the causes that last; None: there are none.
+
+    Args:
+        record: the training.
+        model: equations of the plant.
+        uncertain: what its filter estimates beside the states, see `find_uncertain`.
+    """
+    from reactorwatch.diagnosis.diagnose import diagnose  # a quarter of a second, which no other row needs
+
+    try:
+        found = diagnose(record, uncertain.add_disturbances(model))
+    except InputError as error:
+        if not uncertain.names:
+            raise
+        return FAILED, f"not diagnosed: {error}", None
+    lasting = [cause for cause in found.causes if cause.profile != FREE_NAME]
+    if not lasting:
+        return found.verdict, _reason(found), None
+    extended = extended_model(model, effects_of(model), lasting, record.zero_ns)
+    return found.verdict, _reason(found), parse_extended_model(_json(extended))
+
+
+def equations_text(model: ProcessModel | None) -> str:
+    """JSON of a model as `diagnose` writes it; empty if the catalogue does not have the model, or no causes for it."""
+    if model is None or model.name not in EFFECTS_OF:
+        return ""
+    extended = extended_model_of(model)
+    if not is_complete(extended, model):
+        return ""
+    return msgspec.json.encode(extended.to_object()).decode()
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def read_equations(text: str) -> ProcessModel:
+    """The model in `Baseline.model`, its clock that of samples on the bus: minutes since 1970-01-01 UTC.
+
+    It is the same object for the same text: what is prepared for one is prepared for all.
+
+    Raises:
+        InputError: it is no model of this software.
+    """
+    try:
+        return parse_extended_model(text).rebase(0).build()
+    except InputError as error:
+        raise InputError(f"the model of the baseline {error}") from error
+
+
+def _reason(found: Diagnosis) -> str:
+    if found.verdict == NOMINAL:
+        return "the training agrees with the equations"
+    if not found.causes:
+        return f"the training deviates from the equations ({found.location}), and no cause of the catalogue explains it"
+    text = f"the training deviates from the equations by {' and '.join(map(_text, found.causes))}"
+    others = [" and ".join(map(_text, item.explanation)) for item in found.alternatives]
+    return f"{text}; its rows do not rule out {', or '.join(others)}" if found.verdict == AMBIGUOUS else text
+
+
+def _text(cause: Cause) -> str:
+    size = cause.parameters["size"]
+    if cause.profile == FREE_NAME:
+        return f"{cause.label} ({cause.cause}) in the course of a curve, which predicts no other rows"
+    unit = "" if size.unit == "1" else f" {size.unit}"
+    return f"{cause.label} ({cause.cause}, {cause.profile}) of {size.value:+.3g}{unit}"
+
+
+def _json(extended: dict[str, Any]) -> str:
+    return msgspec.json.encode(extended).decode()
+
+
+LEAST_ROWS = 100
+"""Number of values of each output below which nothing is sought."""
+
+LEAST_GAIN = 8.0
+"""Gain of log likelihood beyond which something is taken for a part of the plant."""
+
+COLOURED = 3.0
+"""Minus the decimal logarithm of the p-value beyond which innovations are not white, and disturbances are sought."""
+
+MOST_DISTURBANCES = 2
+
+MOVE_ROWS = 60
+"""Number of rows after a move of an input that are predicted."""
+
+SMALLEST_SD = 1e-6
+"""Least standard deviation of a sensor."""
+
+UNCERTAIN = 1.25
+"""Ratio of standard deviations after a move, uncertain to certain constants, beyond which the training leaves open how
+the plant follows."""
+
+
+def find_uncertain(
+    model: ProcessModel, outputs: tuple[str, ...], time_min: Array, inputs: Array, measured: Array
+) -> Uncertain:
+    """Find additional states that a filter of the model needs; empty: none.
+
+    Args:
+        model: equations of the plant.
+        outputs: names of the outputs.
+        time_min: times of the training in minutes, shape (n,).
+        inputs: input values, shape (n, inputs).
+        measured: output values, shape (n, outputs); NaN if missing or left out.
+    """
+    if np.min(np.count_nonzero(np.isfinite(measured), axis=0), initial=LEAST_ROWS) < LEAST_ROWS:
+        return Uncertain()
+    rows = _Rows(model, outputs, time_min, inputs, measured)
+    plain = rows.fit(())
+    if rows.drop_disturbances(plain):
+        plain = rows.fit(())
+    x = np.nanmedian(rows.filter(plain).x, axis=0)
+    constants = tuple(f"{CONSTANT} {name}" for name in select_effects(model, x, np.nanmedian(inputs, axis=0)))
+    best = rows.fit(constants)
+    candidates = [f"{WANDER} {item.name}" for item in model.states if item.name not in model.at_rest]
+    candidates += [f"{NOISE} {name}" for name in outputs]
+    while len(best.uncertain) < len(constants) + MOST_DISTURBANCES and rows.are_coloured(best):
+        fits = (rows.fit((*best.uncertain, item)) for item in candidates if item not in best.uncertain)
+        found = min(fits, key=lambda item: item.noise.loss)
+        if found.noise.loss > best.noise.loss - LEAST_GAIN:
+            break
+        best = found
+    if best.uncertain != constants or plain.noise.loss - best.noise.loss > LEAST_GAIN:
+        learned = (best.noise.parameters[name] for name in learned_parameters(best.uncertain))
+        return Uncertain(best.uncertain, tuple(learned))
+    certain, uncertain = rows.sds_after_moves(plain), rows.sds_after_moves(best)
+    return Uncertain(constants) if np.any(uncertain > UNCERTAIN * certain) else Uncertain()
+
+
+def describe_uncertain(uncertain: Sequence[str]) -> str:
+    """Describe the additional states of a filter in words."""
+    parts = {
+        WANDER: [item.split(" ", 1)[1] for item in uncertain if item.startswith(f"{WANDER} ")],
+        NOISE: [item.split(" ", 1)[1] for item in uncertain if item.startswith(f"{NOISE} ")],
+    }
+    words = [f"a disturbance of the balance of {name} wanders" for name in parts[WANDER]]
+    words += [f"the noise of {name} has memory" for name in parts[NOISE]]
+    if any(not is_disturbance(item) for item in uncertain):
+        words.append("limits allow for what the training leaves open of the constants")
+    return ", ".join(words)
+
+
+class _Fit(NamedTuple):
+    """Noise of the model with some uncertain parts, and its filter."""
+
+    uncertain: tuple[str, ...]
+    noise: NoiseFit
+    filter: Filter
+
+
+class _Rows:
+    """Rows of a training; arguments as for `find_uncertain`."""
+
+    def __init__(
+        self, model: ProcessModel, outputs: tuple[str, ...], time_min: Array, inputs: Array, measured: Array
+    ) -> None:
+        self._model, self._outputs = model, outputs
+        self._time_min, self._inputs, self._measured = time_min, inputs, measured
+
+    def fit(self, uncertain: tuple[str, ...]) -> _Fit:
+        """Fit the noise of the model with uncertain parts."""
+        model, smallest = self._model, [SMALLEST_SD] * len(self._outputs)
+        rows = (self._time_min, self._inputs, self._measured)
+        found = fit_training_noise(model, self._outputs, *rows, smallest, uncertain)
+        return _Fit(uncertain, found, Filter(widen_model(model, uncertain), found.levels, found.parameters))
+
+    def drop_disturbances(self, item: _Fit) -> bool:
+        """Leave out disturbed intervals and outliers, as a training does; returns true if there are any."""
+        run, indices = self.filter(item), output_indices(self._model, self._outputs)
+        screenings = [screen_baseline(column) for column in (run.residual / run.sd)[:, indices].T]
+        if any(item.refused for item in screenings):
+            return False
+        usable = np.column_stack([item.usable for item in screenings]) | ~np.isfinite(run.residual[:, indices])
+        self._measured = np.where(usable, self._measured, nan)
+        return not usable.all()
+
+    def filter(self, item: _Fit) -> FilterResult:
+        """Filter the rows; the filter then stands at the last."""
+        columns = np.full((self._time_min.size, len(self._model.outputs)), nan)
+        columns[:, output_indices(self._model, self._outputs)] = self._measured
+        return item.filter.run(FilterRecord(self._time_min, self._inputs, columns, GATE))
+
+    def are_coloured(self, item: _Fit) -> bool:
+        """True if the innovations are not white."""
+        w = np.where(item.noise.w != 0.0, item.noise.w, nan)
+        return bool(np.max(minus_log10_p(w, self._inputs[len(self._inputs) - len(w) :])) >= COLOURED)
+
+    def sds_after_moves(self, item: _Fit) -> Array:
+        """Standard deviations of predictions after a move of each input up and down, shape (moves, rows, n_y)."""
+        self.filter(item)
+        start, middle = item.filter.state, np.nanmedian(self._inputs, axis=0)
+        period_min = float(np.median(np.diff(self._time_min)))
+        result = []
+        for index, variable in enumerate(self._model.inputs):
+            for step in (-variable.scale, variable.scale):
+                inputs = middle.copy()
+                inputs[index] = min(max(middle[index] + step, variable.lower), variable.upper)
+                result.append(_sds_at(item.filter, start, inputs.tolist(), period_min))
+        return np.array(result)
+
+
+def _sds_at(kalman: Filter, start: FilterState, inputs: list[float], period_min: float) -> Array:
+    """Standard deviations of the predictions of `MOVE_ROWS` rows with these inputs, shape (rows, n_y)."""
+    if start.time_min is None:
+        return np.full((MOVE_ROWS, len(kalman.model.outputs)), nan)
+    times = [start.time_min + period_min * (row + 1) for row in range(MOVE_ROWS)]
+    kalman.state, nothing = start, [nan] * len(kalman.model.outputs)
+    expected = [kalman.update(time, inputs, nothing).prediction for time in times]
+    kalman.state = start
+    return np.array([kalman.update(time, inputs, values).sd for time, values in zip(times, expected, strict=True)])

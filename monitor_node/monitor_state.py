@@ -1,0 +1,218 @@
+"""Serialised state of a monitor.
+
+The bytes are MessagePack behind a seal: a magic word, a version and a digest. Without it a wrong bit in a covariance,
+or in the name of an alarm, would stay unnoticed for months; the magic word distinguishes a state from a user's file. A
+state learned with other settings, or with another model of the plant, is refused as well, and the difference is named.
+"""
+
+from hashlib import blake2b
+from typing import Any, NamedTuple
+
+import msgspec
+
+from monitor_node.alarms.annunciator import AnnunciatorMemory
+from monitor_node.config import MonitorConfig
+from monitor_node.ingest.alignment import AlignmentMemory
+from monitor_node.ingest.samples import UnusableSamples
+from monitor_node.ingest.sequence_check import SequenceCheck
+from monitor_node.watch.pipeline_state import PipelineState
+from reactorwatch.errors import InputError
+from reactorwatch.process.fingerprint import fingerprint
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.spc.charts.catalogue import CHARTS
+from reactorwatch.spc.value_chart import ValueChart
+from reactorwatch.stored_state import Memory
+from reactorwatch.version import this_build
+
+DIGEST_BYTES = 16
+_VERSION_BYTES = 2
+
+
+class ForeignFileError(InputError):
+    """The bytes are no stored state, not even a damaged one: the software must not rename or overwrite the file."""
+
+
+class Seal(NamedTuple):
+    """Header of one kind of stored state.
+
+    Attributes:
+        word: magic word, the first bytes.
+        version: version of the layout that is written.
+        name: name of the kind, for messages.
+    """
+
+    word: bytes
+    version: int
+    name: str
+
+    def close(self, body: bytes) -> bytes:
+        """Seal a body: word, version, digest and body."""
+        return self.word + self.version.to_bytes(_VERSION_BYTES, "big") + _digest(body) + body
+
+    def open(self, data: bytes) -> bytes:
+        """Body of sealed bytes.
+
+        Raises:
+            ForeignFileError: the bytes are not a state of this kind.
+            InputError: the state is truncated, damaged or of another version.
+        """
+        head_bytes = len(self.word) + _VERSION_BYTES
+        head, body = data[:head_bytes], data[head_bytes + DIGEST_BYTES :]
+        is_intact = data[head_bytes : head_bytes + DIGEST_BYTES] == _digest(body)
+        if not head.startswith(self.word) or len(head) < head_bytes:
+            text = f"is no {self.name}: {len(data)} bytes that do not begin like one"
+            # A damaged or truncated header before an intact body, or the remains of a power failure: nothing or zeros.
+            is_ours = self.word.startswith(head[: len(self.word)]) or is_intact or not data.strip(b"\0")
+            raise InputError(text) if is_ours else ForeignFileError(text)
+        version = int.from_bytes(head[len(self.word) :], "big")
+        if version != self.version:
+            raise InputError(f"is the {self.name} in version {version}, this software reads {self.version}")
+        if not is_intact:
+            raise InputError(f"is a damaged {self.name}: its digest is another")
+        return body
+
+
+def _digest(body: bytes) -> bytes:
+    return blake2b(body, digest_size=DIGEST_BYTES).digest()
+
+
+MAGIC = b"reactorwatch monitor"
+SEAL = Seal(MAGIC, 5, "state of a monitor")
+
+NOT_LEARNED_BY = frozenset({"process", "state_file", "state_every_s", "health_period_s", "diagnose_training"})
+"""Settings that do not change what was learned; the model is identified by its equations, not by its file."""
+
+TRAINING = ("training_min", "training_rows")
+"""Settings that are compared only where they are stated."""
+
+
+ROLES = ("setpoints", "modes", "startup_modes", "labels", "bounds", "resolution")
+"""Settings of signals that a state has only where there are any; earlier versions had none."""
+
+
+class OtherSettingsError(InputError):
+    """The state is intact, but was learned with other settings; its alarms can be used.
+
+    Args:
+        text: the difference.
+        alarms: memory of the alarms.
+    """
+
+    def __init__(self, text: str, alarms: AnnunciatorMemory) -> None:
+        super().__init__(text)
+        self.alarms = alarms
+
+
+class MonitorMemory(Memory, kw_only=True):
+    """Memory of a monitor beside its parts, while it runs and in its stored state.
+
+    Attributes:
+        runs: sequence checks of the signals, the inputs first.
+        units: newest unit by signal.
+        heard_from_ns: time of the first accepted sample by signal.
+        first_ns: time of the first row; None before it.
+        last_ns: time of the last row; None before the first.
+        watching_since_ns: time of the first evaluated row; None before it.
+        snapshot_due_ns: plant time of the next model snapshots; None before the first row.
+        received: number of messages received.
+        published: number of messages published.
+        refused: number of rejected messages by reason.
+        failures: number of contained errors of this software by stage.
+        unusable: samples refused since the newest usable one.
+    """
+
+    runs: list[SequenceCheck]
+    units: dict[str, str]
+    heard_from_ns: dict[str, int] = msgspec.field(default_factory=dict)
+    first_ns: int | None = None
+    last_ns: int | None = None
+    watching_since_ns: int | None = None
+    snapshot_due_ns: int | None = None
+    received: int = 0
+    published: int = 0
+    refused: dict[str, int] = msgspec.field(default_factory=dict)
+    failures: dict[str, int] = msgspec.field(default_factory=dict)
+    unusable: UnusableSamples = msgspec.field(default_factory=UnusableSamples)
+
+
+class MonitorState(MonitorMemory, kw_only=True):
+    """State of a monitor: its memory and its parts.
+
+    Attributes:
+        settings: settings of the training, see `learning_settings`.
+        alignment: state of the alignment.
+        board: memory of the alarms.
+        watch: state of the pipeline.
+        unconfirmed: the newest publications, which may not have left the process; empty if they have.
+        build: build of the software that stored it, see `reactorwatch.version`; empty before version 0.3.
+    """
+
+    settings: dict[str, Any]
+    alignment: AlignmentMemory
+    board: AnnunciatorMemory
+    watch: PipelineState
+    unconfirmed: list[tuple[str, bytes, str]] = msgspec.field(default_factory=list)  # key, payload and encoding
+    build: str = ""
+
+
+def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, points: bool) -> dict[str, Any]:
+    """Settings that must be equal to resume from a state.
+
+    Args:
+        config: settings of the monitor.
+        model: process model.
+        points: see `Monitor`.
+    """
+    fields = {field: value for field, value in msgspec.structs.asdict(config).items() if field not in NOT_LEARNED_BY}
+    for name in TRAINING:
+        if fields[name] is None:
+            del fields[name]
+    for name in ROLES:
+        if not fields[name]:
+            del fields[name]
+    for kind in CHARTS:
+        if issubclass(kind, ValueChart) and kind.name not in config.charts:  # earlier versions had none
+            for setting in kind.settings:
+                del fields[setting.key]
+    if model is not None:
+        del fields["units"]  # the equations have their own
+    fields |= {"points": points, "equations": "" if model is None else fingerprint(model)}
+    settings: dict[str, Any] = msgspec.msgpack.decode(msgspec.msgpack.encode(fields))  # as they are read back
+    return settings
+
+
+def seal_state(state: MonitorState, settings: dict[str, Any]) -> bytes:
+    """Serialise and seal a state, with the settings of its training (see `learning_settings`)."""
+    return SEAL.close(msgspec.structs.replace(state, settings=settings, build=this_build()).to_bytes())
+
+
+def open_state(data: bytes, settings: dict[str, Any]) -> MonitorState:
+    """Open a sealed state.
+
+    Args:
+        data: bytes from `seal_state`.
+        settings: see `learning_settings`.
+
+    Raises:
+        ForeignFileError: the bytes were never a state, or are one of another plant.
+        InputError: the state is damaged, or of another version.
+        OtherSettingsError: the state was learned with other settings.
+    """
+    body = SEAL.open(data)
+    try:
+        state = MonitorState.from_bytes(body)
+    except ValueError as error:
+        raise InputError(f"is no state of this software's monitor: {error}") from error
+    by = f" by {state.build}" if state.build not in ("", this_build()) else ""
+    stored = {name: value for name, value in state.settings.items() if name in settings or name not in TRAINING}
+    if stored.get("plant") != settings["plant"]:
+        raise ForeignFileError(f"is the state of plant {stored.get('plant')!r}, not of {settings['plant']!r}")
+    if stored != settings:
+        text = f"was learned{by} with other settings: {_difference(stored, settings)}"
+        raise OtherSettingsError(text, state.board)
+    return state
+
+
+def _difference(before: dict[str, Any], now: dict[str, Any]) -> str:
+    names = [name for name in sorted(before | now) if before.get(name) != now.get(name)]
+    return ", ".join(f"{name} was {before.get(name)!r} and is {now.get(name)!r}" for name in names)

@@ -1,1 +1,0 @@
-"""State of a monitor as one structure, and its seal."""

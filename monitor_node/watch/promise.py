@@ -1,0 +1,367 @@
+"""Promise of false alarms of one plant: on average, for this plant, and as its training and the watch bear it out.
+
+Limits aim at the configured rate always. On average over trainings they keep it. Of one plant an upper bound at 90 %
+is stated, because its limits were estimated (`reactorwatch.spc.training_errors`). Both take the plant to go on as in
+its training. Whether it does is checked twice: the second half of the training is judged by the first
+(`training_check`), and the alarms that come while the plant is watched are compared with those promised.
+"""
+
+from collections.abc import Callable
+from math import log
+from typing import TypeAlias
+
+import numpy as np
+from msgspec.structs import replace
+from scipy.special import pdtrc
+
+from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.charts.chart_design import alarm_names
+from monitor_node.charts.shift import NAME as SHIFT
+from monitor_node.checks.stage import SignalChecks
+from monitor_node.config import MonitorConfig
+from monitor_node.health import NODE, Failures
+from monitor_node.learn.training_rows import TrainingRows
+from monitor_node.watch.power import Watch, state_power
+from reactorwatch.arrays import Array
+from reactorwatch.contract import keys
+from reactorwatch.contract.alarm_states import Event
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Alarm, Promise
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.spc import false_alarm_budget
+from reactorwatch.spc.false_alarm_budget import DAYS, DAYS_MIN
+from reactorwatch.spc.training_errors import CONFIDENCE, QUANTILE
+from reactorwatch.stored_state import Memory, StoredState
+
+UNLIKELY = 0.003
+"""Probability of so many alarms by chance below which the promise is not kept."""
+
+FEWEST_EVENTS = 3
+"""Least number of separate events of a plant that is called drifted: one or two may be faults."""
+
+SAME_EVENT_ROWS = 20
+"""Rows within which alarms are of the same event."""
+
+REMEDY = "train longer, or over more set points"
+
+
+class TrainingCheck(StoredState, frozen=True):
+    """The second half of a training, judged by the first.
+
+    Attributes:
+        rows: number of rows judged; 0: the training was too short.
+        found: number of alarms, with limits for the promised rate.
+        expected: number promised.
+        excess: times as many false alarms as promised that the plant has by this check; 0: no more than promised.
+    """
+
+    rows: int = 0
+    found: int = 0
+    expected: float = 0.0
+    excess: float = 0.0
+
+
+class PlantPromise(Memory):
+    """Promise of one plant. The object is its own memory.
+
+    Attributes:
+        per_30_days: false alarms promised in 30 days, on average.
+        upper_per_30_days: upper bound of that for this plant, at 90 %.
+        rows_in_30_days: number of rows in 30 days.
+        check: the training, judged by itself.
+        found: number of alarms that chance can raise, since the training.
+        events: number of separate events among them.
+        last_row: row of the newest of them, counted from the training.
+        power: deviations that would be seen, a serialized `Promise`; empty: not stated.
+    """
+
+    per_30_days: float
+    upper_per_30_days: float
+    rows_in_30_days: float
+    check: TrainingCheck = TrainingCheck()
+    found: int = 0
+    events: int = 0
+    last_row: int = 0
+    power: bytes = b""
+
+    def count_alarms(self, count: int, row: int) -> tuple[bool, bool]:
+        """Count alarms that chance can raise; returns whether the plant had drifted before, and has now.
+
+        Args:
+            count: number of alarms of a row.
+            row: number of rows judged since the training.
+        """
+        had_drifted = self.has_drifted(row)
+        self.events += not self.found or row - self.last_row > SAME_EVENT_ROWS
+        self.found, self.last_row = self.found + count, row
+        return had_drifted, self.has_drifted(row)
+
+    def mean_count(self, rows: int) -> float:
+        """False alarms promised in a number of rows, on average."""
+        return self.per_30_days * rows / self.rows_in_30_days
+
+    def upper_count(self, rows: int) -> float:
+        """Upper bound at 90 % of the false alarms of this plant in a number of rows."""
+        return self.upper_per_30_days * rows / self.rows_in_30_days
+
+    def has_drifted(self, rows: int) -> bool:
+        """True if more events raised alarms in a number of rows than chance explains, by all that is known."""
+        upper = max(self.check.excess * self.mean_count(rows), self.upper_count(rows))
+        return self.events >= FEWEST_EVENTS and float(pdtrc(self.events - 1, upper)) < UNLIKELY
+
+    @property
+    def is_kept(self) -> bool:
+        """True if the training bears the promise out."""
+        return not self.check.excess
+
+    @property
+    def can_keep_per_30_days(self) -> float:
+        """False alarms in 30 days that can be promised: the configured rate, or what the training shows."""
+        return self.per_30_days * max(self.check.excess, 1.0)
+
+    @property
+    def warning(self) -> str:
+        """Words for the text of an alarm where the promise is not kept; empty where it is."""
+        if self.is_kept:
+            return ""
+        return f"by its training, false alarms of this plant may come {describe_rate(self.can_keep_per_30_days)}"
+
+    def text(self, rows: int) -> str:
+        """One sentence for people, after a number of rows."""
+        check = self.check
+        if self.is_kept:
+            parts = [
+                f"false alarms in {DAYS} days: {self.per_30_days:.2g} on average, at most "
+                f"{self.upper_per_30_days:.2g} for this plant with {100 * CONFIDENCE:.0f} % confidence"
+            ]
+            parts.append(
+                f"in the second half of its training, judged by the first, {_count(check.found)}, "
+                f"{check.expected:.2g} promised"
+                if check.rows
+                else "the training was too short to be judged by itself"
+            )
+        else:
+            found = f"{_count(check.found)}, {check.expected:.2g} promised"
+            parts = [
+                (f"in the second half of its training, judged by the first, {found}: " if check.found else "")
+                + "this plant wanders, its model errs after moves of the inputs, or its training has not seen enough of"
+                f" it; from this training {describe_rate(self.can_keep_per_30_days)} can be promised; {REMEDY}"
+            ]
+        if self.found:
+            parts.append(f"{_count(self.found)} since, {self.mean_count(rows):.2g} promised")
+        if self.has_drifted(rows):
+            parts.append("if nothing is wrong, the plant has drifted from its training: train it again")
+        return "; ".join(parts)
+
+    def message(self, time_ns: int, rows: int) -> Promise:
+        """The message on the bus.
+
+        Args:
+            time_ns: time of the newest row.
+            rows: number of rows judged since the training.
+        """
+        return Promise(
+            time_ns=time_ns,
+            expected=self.per_30_days,
+            expected_90=self.upper_per_30_days,
+            checked_rows=self.check.rows,
+            found_in_training=self.check.found,
+            expected_in_training=self.check.expected,
+            kept=self.is_kept,
+            can_keep_per_30_days=self.can_keep_per_30_days,
+            text=self.text(rows),
+            rows=rows,
+            found=self.found,
+            expected_so_far=self.mean_count(rows),
+            drifted=self.has_drifted(rows),
+            power=Promise.FromString(self.power).power,
+        )
+
+
+def _count(alarms: int) -> str:
+    return "1 alarm came" if alarms == 1 else f"{alarms or 'no'} alarms came"
+
+
+def describe_rate(per_30_days: float) -> str:
+    """A rate of alarms in words.
+
+    >>> describe_rate(1080.0), describe_rate(40.0), describe_rate(2.0)
+    ('1 in 40 min', '1 in 18 h', '1 in 15 days')
+    """
+    minutes = DAYS_MIN / per_30_days
+    for unit, size in (("min", 1.0), ("h", 60.0)):
+        if minutes < 100.0 * size:
+            return f"1 in {minutes / size:.2g} {unit}"
+    return f"1 in {minutes / 1440.0:.2g} days"
+
+
+def probability_of(found: int, expected: Array) -> float:
+    """Probability of at least so many alarms by chance.
+
+    Args:
+        found: number of alarms.
+        expected: mean number for each of the errors that the training may have made.
+    """
+    return float(np.mean(pdtrc(found - 1, expected))) if found else 1.0
+
+
+def extrapolate_count(found: int, arl0: float, opportunities: float, wanted_arl0: float) -> float:
+    """False alarms in as many opportunities with other limits, from those with limits for one run length.
+
+    Residuals larger than in the training by a factor have the logarithms of their run lengths divided by its square,
+    because tails fall as exp(-L^2 / 2): a run length A that was intended becomes A^g, with g from the alarms found.
+
+    >>> round(extrapolate_count(3, 1500.0, 4500.0, 1e6), 4)  # as many as intended
+    0.0045
+
+    Args:
+        found: number of alarms, at least 1.
+        arl0: run length for which the limits were.
+        opportunities: rows times alarms.
+        wanted_arl0: run length of the other limits.
+    """
+    exponent = min(max(log(opportunities / found), 0.0) / log(arl0), 1.0)
+    return float(opportunities / wanted_arl0**exponent)
+
+
+RAISED = Event.RAISED.value
+
+LEAST_EXCESS = 1.5
+"""Times as many false alarms as promised from which the promise is not kept."""
+
+CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, TrainingRows, str], TrainingCheck]
+"""Judges a training by itself, see `training_check`."""
+
+
+class PromiseStage:
+    """The promise of one plant.
+
+    Args:
+        config: settings of the monitor.
+        board: alarms of the plant, whose texts warn of a promise that is not kept.
+        failures: counter of errors, which leave the promise without what they concern.
+        check: judges the training by itself; None: that is not done.
+        states_power: True to state the deviations that would be seen.
+        points: True to publish each promise; False: only one that is not kept or no longer holds.
+
+    Attributes:
+        alarm_rates: false alarms a row by the errors that the training may have made, shape (draws,), after its end.
+    """
+
+    def __init__(
+        self,
+        config: MonitorConfig,
+        board: Annunciator,
+        failures: Failures,
+        *,
+        check: CheckTraining | None = None,
+        states_power: bool = False,
+        points: bool = True,
+    ) -> None:
+        self.states_power = states_power
+        self._config, self._board, self._failures, self._check, self._points = config, board, failures, check, points
+        self._watch: Watch | None = None
+        self._published: Promise | None = None
+        self._key = keys.key(config.plant, keys.PROMISE, NODE)
+        charts = {name for name, _ in alarm_names(config)}
+        self._names = {*charts, *config.charts, SHIFT, *SignalChecks.CHANCE_NAMES}
+        self.alarm_rates = np.zeros(0)
+        self.promise = None
+
+    @property
+    def promise(self) -> PlantPromise | None:
+        """The promise; None before the end of the training. The texts of alarms warn of one that is not kept."""
+        return self._promise
+
+    @promise.setter
+    def promise(self, promise: PlantPromise | None) -> None:
+        self._promise = promise
+        self._board.warning = "" if promise is None else promise.warning
+
+    def start(self, rates: Array, mean_rate: float, period_min: float, excess: float, watch: Watch | None) -> None:
+        """State the promise after a training; alarms so far go on to count.
+
+        Args:
+            rates: see `alarm_rates`.
+            mean_rate: false alarms a row, on average over trainings.
+            period_min: sampling period.
+            excess: times as many false alarms as promised that residuals after moves of the inputs raise.
+            watch: the plant as it is watched, to state its power by; None: that is not stated.
+        """
+        self.alarm_rates, self._watch = rates, watch
+        rows = false_alarm_budget.DAYS_MIN / period_min
+        mean, upper = rows * mean_rate, rows * float(np.quantile(rates, QUANTILE))
+        check = TrainingCheck(excess=excess if excess > LEAST_EXCESS else 0.0)
+        before = self.promise
+        counts = (0, 0, 0) if before is None else (before.found, before.events, before.last_row)
+        self.promise = PlantPromise(mean, max(mean, upper), rows, check, *counts)
+
+    def check(self, rows: TrainingRows, model: ProcessModel | None, kind: str, rows_watched: int) -> str:
+        """Judge the training by itself, and state the power; an error there leaves the promise without them.
+
+        Args:
+            rows: rows of the training.
+            model: equations that judge; None: none do.
+            kind: kind of the reference.
+            rows_watched: number of rows evaluated since.
+
+        Returns:
+            A note if the promise is not kept, else empty.
+        """
+        if self.promise is None:
+            return ""
+        if self._watch is not None:
+            watch, self._watch = self._watch, None
+            try:
+                self.promise.power = Promise(power=state_power(watch, rows)).SerializeToString()
+            except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
+                self._failures.add("power", error, "the deviations that would be seen are not stated")
+        if self._check is not None:
+            try:
+                check = self._check(self._config, model, rows, kind)
+            except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
+                self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
+            else:
+                self.promise.check = replace(check, excess=max(check.excess, self.promise.check.excess))
+                self._board.warning = self.promise.warning
+        return "" if self.promise.is_kept else self._note(rows_watched)
+
+    def messages(self, time_ns: int, rows: int) -> list[Publication]:
+        """The promise after a number of rows, if it is to be published and has changed."""
+        promise = self.promise
+        if promise is None or not (self._points or not promise.is_kept or promise.has_drifted(rows)):
+            return []
+        return self._publish(promise.message(time_ns, rows))
+
+    def _publish(self, message: Promise) -> list[Publication]:
+        if message == self._published:  # it was published for another reason in this row
+            return []
+        self._published = message
+        return [Publication(self._key, message)]
+
+    def count_alarms(self, time_ns: int, rows: int, alarms: list[Alarm], publications: list[Publication]) -> str:
+        """Count the alarms of a row that chance can raise.
+
+        Args:
+            time_ns: time of the row.
+            rows: number of rows judged since the training.
+            alarms: alarms of the row.
+            publications: publications of the row, to which the promise is added if its counts have changed.
+
+        Returns:
+            A note if the plant has drifted from its training by this row, else empty.
+        """
+        if self.promise is None:
+            return ""
+        raised = [alarm for alarm in alarms if alarm.event == RAISED]
+        count = sum(alarm.alarm.partition("/")[0] in self._names for alarm in raised)
+        if not count:
+            return ""
+        had_drifted, has_drifted = self.promise.count_alarms(count, rows)
+        if self._points or self._board.warning or has_drifted:
+            publications.extend(self._publish(self.promise.message(time_ns, rows)))
+        return self._note(rows) if has_drifted and not had_drifted else ""
+
+    def _note(self, rows: int) -> str:
+        assert self.promise is not None
+        return f"promise: {self.promise.text(rows)}"

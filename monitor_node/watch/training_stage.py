@@ -1,0 +1,124 @@
+"""Training of one plant, row by row, until there are rows enough to learn from."""
+
+from collections.abc import Sequence
+from itertools import compress
+from operator import not_
+
+from monitor_node.config import MonitorConfig
+from monitor_node.ingest.alignment import MeasuredRow
+from monitor_node.learn.identified_models import IdentifiedModels
+from monitor_node.learn.training import MOST_REFUSALS, Training, TrainingResult
+from monitor_node.learn.training_rows import TrainingRows
+from monitor_node.watch.estimates import estimate_keys, estimates
+from reactorwatch.errors import UnfitRecordError
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import MINUTE_NS
+
+TIMES_FEWEST = 2
+"""Times the fewest rows of a training that a part of it needs to judge the rest: with fewer it is too rough."""
+
+
+class TrainingStage:
+    """The training of one plant.
+
+    Args:
+        config: settings of the monitor.
+        model: process model of the plant; None if there is none.
+        models: identified models, which start again with each training.
+
+    Attributes:
+        rows: the rows so far.
+        began_ns: start of the present or last training; None before its first row.
+        refusals: number of refused trainings.
+        refused: reason of the last refusal; empty before one.
+        trained_rows: number of rows of the training, after its end.
+        is_open: True to train until the caller ends it.
+    """
+
+    def __init__(self, config: MonitorConfig, model: ProcessModel | None, models: IdentifiedModels) -> None:
+        self._config, self._model, self._models = config, model, models
+        self._paths = estimate_keys(config)
+        self.refusals = self.trained_rows = 0
+        self.is_open, self.refused = False, ""
+        self.restart(None)
+
+    def restart(self, time_ns: int | None) -> None:
+        """Start again without a row."""
+        self._models.restart()
+        self._training = Training(self._config, self._model, self._models.predictors)
+        self.rows = TrainingRows([0] * len(self._config.outputs))
+        self.began_ns = time_ns
+
+    def take_over(self, rows: TrainingRows) -> None:
+        """Train on with the rows of an incident, by which the identified models are updated."""
+        self.rows, self.began_ns = rows, rows.times_ns[0]
+        self._models.learn_again(rows)
+
+    def open(self) -> None:
+        """Train until the caller ends it, on all rows until then."""
+        self.is_open = True
+        self.rows.keeps_all = True
+
+    def is_enough(self, timed_out: Sequence[bool] = ()) -> bool:
+        """True if there are enough rows with a value of each output.
+
+        Args:
+            timed_out: one flag an output: its data timeout is active, so it is disregarded; empty: none is.
+        """
+        counts = list(compress(self.rows.counts, map(not_, timed_out))) if timed_out else self.rows.counts
+        return min(counts, default=0) >= self._training.fewest_rows
+
+    def start_clock(self, time_ns: int) -> None:
+        """Count time from a row, unless an earlier one was first."""
+        if self.began_ns is None or time_ns < self.began_ns:
+            self.began_ns = time_ns
+
+    def share(self, period_ns: float, rows_before: int = 0) -> float:
+        """Share of the training that is done, at most 1.
+
+        Args:
+            period_ns: sampling period; 0: not known.
+            rows_before: number of rows in other modes, which count as well.
+        """
+        if not period_ns:
+            return 0.0
+        rows = self._config.training_length.count_rows(period_ns / MINUTE_NS)
+        return min((self.rows.dropped + len(self.rows.times) + rows_before) / rows, 1.0)
+
+    def add(self, row: MeasuredRow) -> None:
+        """Add a row, and update the identified models with it."""
+        self.rows.add(row.time_ns, row.inputs, row.values)
+        if predictions := self._models.update(row):
+            row.publications.extend(estimates(row, self._paths, predictions))
+
+    def finish(self, *, last_chance: bool | None = None) -> tuple[TrainingRows, TrainingResult]:
+        """Learn from the rows; returns them and the result.
+
+        Args:
+            last_chance: True to use the training even if it is disturbed; None: after some refusals.
+        """
+        rows, self.rows = self.rows, TrainingRows([0] * len(self._config.outputs))
+        is_last = self.refusals >= MOST_REFUSALS if last_chance is None else last_chance
+        result = self._training.learn(rows, last_chance=is_last)
+        self.trained_rows = len(rows.times)
+        return rows, result
+
+    def finish_early(self, *, times: int = 1) -> tuple[TrainingRows, TrainingResult]:
+        """Learn from the rows so far; returns them and the result.
+
+        Args:
+            times: times the fewest rows that a training needs, for which this one must do.
+
+        Raises:
+            InputError: there are too few rows to learn from, or no output can be watched.
+        """
+        fewest = times * self._training.fewest_rows
+        if len(self.rows.times) < fewest or not self.is_enough():
+            raise UnfitRecordError(
+                f"must have at least {fewest} rows with a value of each output to learn from, got "
+                f"{len(self.rows.times)} rows"
+            )
+        rows, result = self.finish(last_chance=True)
+        if result.refused:
+            raise UnfitRecordError(f"there is no output to watch: {result.refused}")
+        return rows, result

@@ -1,0 +1,1 @@
+"""MCAP files: their writer, their reader, recovery after a crash, metadata records and ages."""

@@ -1,0 +1,299 @@
+"""Writer of recordings: the library's MCAP writer on a file that buffers.
+
+A schema or channel is in the chunk of its first message, as the library writes it, and outside of it, so that a
+damaged chunk does not leave later messages without a channel.
+"""
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from mcap.data_stream import RecordBuilder
+from mcap.records import Attachment, Channel, Schema
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import Writer
+
+from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.codec import encoding_of, message_type, read_sequence
+from reactorwatch.errors import InputError
+from reactorwatch.version import build_metadata, this_build
+from recorder import RecordedMessage
+from recorder.files.metadata import METADATA
+from recorder.files.part_file import PART, PartFile, is_locked
+from recorder.files.reader import LATCHED, StoredChannel, StoredMessage
+from recorder.keep import MAX_CHANNELS
+
+MAX_SEQUENCE = 2**32 - 1
+"""Largest sequence number in MCAP; larger ones wrap around to 0."""
+
+_SAMPLE = encoding_of(messages.Sample)
+
+
+class WriteError(InputError):
+    """A file cannot be written; `reason` is the message of the operating system."""
+
+    def __init__(self, text: str, reason: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+class RecordingWriter:
+    """Writes a recording to `path + ".part"`, renamed to `path` by `close`.
+
+    Args:
+        path: the file; it must not exist, complete or not.
+        metadata: metadata of the file, beside the version of this software.
+        open_part: opens the file that is written to.
+        profile: MCAP profile of the file.
+
+    Raises:
+        InputError: the file exists or cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        metadata: Mapping[str, str],
+        open_part: Callable[[Path], PartFile] = PartFile,
+        profile: str = "",
+    ) -> None:
+        self.path = path
+        self._part = part_of(path)
+        self._channels: dict[tuple[str, str, bool, bool], int] = {}
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._copied: dict[int, tuple[StoredChannel, int]] = {}  # by identity, stable as the channel is held here
+        self._copies: dict[tuple[object, ...], int] = {}
+        self._channel_count = 0
+        self._in_chunk = 0  # messages in the current chunk
+        self._chunk_end = 0
+        self._undrained: list[tuple[int, int]] = []  # end and messages of each chunk since the last flush
+        check_free(path)
+        with self._write_errors():
+            self._stream = open_part(self._part)
+        self._writer = Writer(self._stream)  # type: ignore[arg-type]
+        self._writer.start(profile, f"reactorwatch {this_build()}")
+        build = {} if "version" in metadata else build_metadata()  # a copy keeps that of its source
+        self._writer.add_metadata(METADATA, {**build, **metadata})
+        try:
+            self._stream.drain()
+        except OSError as error:
+            self._stream.abandon()
+            self._part.unlink(missing_ok=True)  # nothing is in it
+            raise self._write_error(error) from error
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes written, without the current chunk."""
+        return self._stream.tell()
+
+    def write(self, message: RecordedMessage, *, readable: bool = True, sequence: int | None = None) -> None:
+        """Append a message; the sequence number of a sample becomes that of the MCAP message.
+
+        Args:
+            message: the message.
+            readable: False writes the payload without the schema that its encoding names.
+            sequence: sequence number of a sample, else 0, where it is known; None: it is read from the payload.
+
+        Raises:
+            WriteError: the file cannot be written, for example because the disk is full.
+        """
+        key, payload, encoding, log_time_ns, publish_time_ns, latched = message
+        name = (key, encoding, readable, latched)
+        channel = self._channels.get(name)
+        if channel is None:
+            channel = self._channels[name] = self._register(message, readable=readable)
+        if sequence is None:
+            sequence = read_sequence(payload) if readable and encoding == _SAMPLE else 0
+        self._append(channel, log_time_ns, payload, publish_time_ns, sequence & MAX_SEQUENCE)
+
+    def copy(self, stored: StoredMessage) -> None:
+        """Append a message of another file unchanged, with its channel.
+
+        Raises:
+            WriteError: as `write`.
+        """
+        channel, sequence, log_time_ns, publish_time_ns, payload = stored
+        copied = self._copied.get(id(channel))
+        if copied is None:
+            copied = self._copied[id(channel)] = channel, self._copy_channel(channel)
+        self._append(copied[1], log_time_ns, payload, publish_time_ns, sequence)
+
+    def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
+        """Append a metadata record, outside of any chunk.
+
+        Raises:
+            WriteError: as `write`.
+        """
+        self.flush()
+        self._writer.add_metadata(name, metadata)
+
+    def add_attachment(self, item: Attachment) -> None:
+        """Append an attachment, outside of any chunk.
+
+        Raises:
+            WriteError: as `write`.
+        """
+        self.flush()
+        self._writer.add_attachment(item.create_time, item.log_time, item.name, item.media_type, item.data)
+
+    def flush(self) -> None:
+        """End the chunk and hand all bytes to the operating system; after an error it may be called again.
+
+        Raises:
+            WriteError: the file cannot be written.
+        """
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._note_chunk()
+        with self._write_errors():
+            self._stream.drain()
+        self._undrained.clear()
+
+    def sync(self) -> None:
+        """Wait until flushed bytes are on the disk.
+
+        Raises:
+            WriteError: the file cannot be written.
+        """
+        with self._write_errors():
+            self._stream.sync()
+
+    def close(self) -> None:
+        """Complete and rename the file; a second call does nothing.
+
+        Raises:
+            WriteError: the file cannot be written; flushed bytes stay in the `.part` file.
+        """
+        if self._stream.closed:
+            return
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._note_chunk()
+            with self._write_errors():
+                self._stream.finish(self.path)
+        finally:
+            self._stream.abandon()
+
+    def abandon(self) -> int:
+        """Leave the file as it is, to be recovered; after `close` it does nothing.
+
+        Returns:
+            Count of the messages since the last flush that a recovery will find, because their chunks were written
+            before the disk was full.
+        """
+        self._stream.abandon()
+        return sum(messages for end, messages in self._undrained if end <= self._stream.drained)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _append(self, channel: int, log_time_ns: int, payload: bytes, publish_time_ns: int, sequence: int) -> None:
+        self._writer.add_message(channel, log_time_ns, payload, publish_time_ns, sequence)
+        self._in_chunk += 1
+        if self._stream.chunk_end != self._chunk_end:  # the chunk was full
+            self._note_chunk()
+            with self._write_errors():
+                self._stream.drain()
+
+    def _note_chunk(self) -> None:
+        """Note the end of a chunk and its messages, if it has ended."""
+        if self._stream.chunk_end != self._chunk_end:
+            self._chunk_end = self._stream.chunk_end
+            self._undrained.append((self._chunk_end, self._in_chunk))
+            self._in_chunk = 0
+
+    def _register(self, message: RecordedMessage, *, readable: bool) -> int:
+        metadata = {LATCHED: "true"} if message.latched else {}
+        kind = message_type(message.encoding) if readable else None
+        if kind is None:
+            return self._add_channel(message.key, message.encoding, 0, metadata)
+        schema = self._schema(kind.DESCRIPTOR.full_name, SchemaEncoding.Protobuf, _descriptors())
+        return self._add_channel(message.key, MessageEncoding.Protobuf, schema, metadata)
+
+    def _add_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
+        """Add a channel, unless the format has no number left."""
+        if self._channel_count >= MAX_CHANNELS:
+            reason = f"a file has room for {MAX_CHANNELS} keys, and {topic!r} is one more"
+            raise WriteError(f"recording {self.path}: {reason}", reason)
+        self._channel_count += 1
+        number = self._writer.register_channel(topic, encoding, schema, metadata)
+        self._write_outside(Channel(number, topic, encoding, metadata, schema))
+        return number
+
+    def _copy_channel(self, channel: StoredChannel) -> int:
+        record, schema = channel.record, channel.schema
+        number = self._schema(schema.name, schema.encoding, schema.data) if schema else 0
+        name = (record.topic, record.message_encoding, number, *sorted(record.metadata.items()))
+        if name not in self._copies:
+            self._copies[name] = self._add_channel(record.topic, record.message_encoding, number, record.metadata)
+        return self._copies[name]
+
+    def _schema(self, name: str, encoding: str, data: bytes) -> int:
+        described = (name, encoding, data)
+        number = self._schemas.get(described)
+        if number is None:
+            number = self._schemas[described] = self._writer.register_schema(name, encoding, data)
+            self._write_outside(Schema(data=data, encoding=encoding, id=number, name=name))
+        return number
+
+    def _write_outside(self, record: Channel | Schema) -> None:
+        self._note_chunk()  # the record may have filled it
+        builder = RecordBuilder()
+        record.write(builder)
+        self._stream.write(builder.end())  # type: ignore[no-untyped-call]
+
+    @contextmanager
+    def _write_errors(self) -> Iterator[None]:
+        """Raise errors of the operating system as `WriteError`."""
+        try:
+            yield
+        except OSError as error:
+            raise self._write_error(error) from error
+
+    def _write_error(self, error: OSError) -> WriteError:
+        kept = f"; what was written is in {self._part}" if self._part.exists() else ""
+        reason = error.strerror or type(error).__name__
+        return WriteError(f"recording {self.path}: cannot be written: {reason}{kept}", reason)
+
+
+def part_of(path: Path) -> Path:
+    """Name of a recording until it is complete."""
+    return path.with_name(path.name + PART)
+
+
+def check_free(path: Path) -> None:
+    """Check that a recording of that name can be started.
+
+    Raises:
+        InputError: it exists, complete or not, or its folder does not exist.
+    """
+    part = part_of(path)
+    if not path.parent.is_dir():
+        raise InputError(f"recording {path}: the folder {path.parent} does not exist")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError(f"recording {path}: the folder {path.parent} cannot be written to")
+    if path.exists():
+        raise InputError(f"recording {path}: exists already and is not overwritten; choose another name")
+    if is_locked(part):
+        raise InputError(f"recording {path}: {part} is being written by another recorder; choose another name")
+    if part.exists():
+        raise InputError(
+            f"recording {path}: {part} was left by a recorder that was killed; "
+            f"`reactorwatch recover {part}` saves what is whole in it"
+        )
+
+
+@cache
+def _descriptors() -> bytes:
+    proto = FileDescriptorProto()
+    messages.DESCRIPTOR.CopyToProto(proto)
+    return FileDescriptorSet(file=[proto]).SerializeToString()

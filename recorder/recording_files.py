@@ -1,0 +1,397 @@
+"""Files of a recorder: the one being written, complete ones, and those left by a crashed recorder.
+
+The decisions when to flush, rotate, copy and delete are made in `recorder.keep`; this module carries them out.
+"""
+
+import contextlib
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from queue import SimpleQueue
+from types import TracebackType
+from typing import Self
+
+import structlog
+
+from reactorwatch.contract import keys
+from reactorwatch.description.process import Process
+from reactorwatch.errors import InputError
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from recorder import RecordedMessage
+from recorder.columns.samples import content_of
+from recorder.core import ReceivedMessage, fingerprint
+from recorder.files.ages import Ages, BootClock, read_boot_clock
+from recorder.files.copies import cut, find_orphans, list_damaged, receipt_window, repair
+from recorder.files.index import read_summary, span_ns
+from recorder.files.metadata import FILE_INDEX, GAP, PROCESS, gap_metadata, process_metadata
+from recorder.files.part_file import PART, PartFile, is_locked
+from recorder.files.reader import Reader, StoredMessage, Wanted
+from recorder.files.writer import RecordingWriter, check_free, part_of
+from recorder.keep import ENDING, AlarmInterval, BlackBox, CompleteRecording, FileNames, Limits, select_deletions
+
+log = structlog.get_logger()
+
+BLACK_BOX = "black-box"
+"""Folder of the copied intervals, beside the recordings."""
+
+
+class RecordingFiles:
+    """Files that `RecorderNode` writes to; as a context manager, it is closed in every case.
+
+    Args:
+        names: names of the files.
+        metadata: metadata of each file.
+        limits: limits of retention.
+        synced: True to sync each file when it is completed.
+        open_part: opens the file that is written to.
+        read_clock: reads the time since boot, which ages the recordings.
+        find_process: returns the process of a plant, which each file with its samples describes; None: unknown.
+
+    Raises:
+        InputError: the folder does not exist, or the named file exists or is being written.
+    """
+
+    def __init__(
+        self,
+        names: FileNames,
+        metadata: Mapping[str, str],
+        limits: Limits = Limits(),  # noqa: B008 (it is frozen)
+        *,
+        synced: bool = False,
+        open_part: Callable[[Path], PartFile] = PartFile,
+        read_clock: Callable[[], BootClock] = read_boot_clock,
+        find_process: Callable[[str], Process | None] = lambda _: None,
+    ) -> None:
+        self._find_process = find_process
+        self._keys: set[str] = set()  # in the current file
+        self._plants: set[str] = set()  # with samples in the current file
+        self._names = names
+        self._metadata = metadata
+        self._limits = limits
+        self._synced = synced
+        self._open_part = open_part
+        self._writer: RecordingWriter | None = None
+        self._black_boxes = BlackBoxFiles(names)
+        self._tasks = BackgroundTasks()
+        self._file_count = 0
+        self._previous = ""
+        self._last_ns = 0
+        self._abandoned: list[Path] = []
+        first = names.first(datetime.now(UTC))
+        self._orphans = [] if not names.folder.is_dir() else find_orphans(names)
+        for copy in self._black_boxes.partial_copies():
+            copy.unlink(missing_ok=True)
+        if not self._orphans:
+            check_free(first)
+        self._ages = Ages(names.folder / f".{names.stem}.ages", read_clock)
+        self._ages.update((path.name, path.stat().st_mtime_ns) for path in self._deletable())
+
+    @property
+    def path(self) -> Path | None:
+        """Final name of the file being written; None if there is none."""
+        return self._writer.path if self._writer is not None else None
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the file being written; 0 if there is none."""
+        return self._writer.size_bytes if self._writer is not None else 0
+
+    def recover_orphans(self) -> None:
+        """Repair files of a crashed recorder in the background."""
+        for part in self._orphans:
+            self._tasks.submit(f"recovering {part}", partial(repair, part))
+        self._orphans = []
+
+    def start_file(self, latched: Iterable[RecordedMessage], now_ns: int) -> Path:
+        """Complete the current file and start the next one.
+
+        Args:
+            latched: messages to repeat at its start.
+            now_ns: start time, for its name.
+
+        Raises:
+            InputError: a file cannot be written; see `abandon`.
+        """
+        self.complete()
+        folder = self._names.folder
+        try:
+            if self._file_count:
+                folder.mkdir(parents=True, exist_ok=True)  # it may have been deleted since
+            existing = {path.name.removesuffix(PART) for path in folder.iterdir()}
+        except OSError as error:
+            raise InputError(f"folder {folder}: cannot be written to: {error.strerror}") from error
+        path = self._names.next(now_ns, existing)
+        started = datetime.fromtimestamp(now_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+        metadata = {**self._metadata, "started": started, FILE_INDEX: str(self._file_count + 1)}
+        if self._previous:
+            metadata["after"] = self._previous
+        self._writer = RecordingWriter(path, metadata, self._open_part)
+        self._keys, self._plants = set(), set()
+        self._file_count += 1
+        self._previous = path.name
+        for entry in latched:
+            self._writer.write(entry)
+        log.info("recording", file=str(path))
+        for part in self._abandoned:
+            self._tasks.submit(f"recovering {part}", partial(repair, part))
+        self._abandoned = []
+        return path
+
+    def write(self, received: ReceivedMessage) -> None:
+        """Append a message.
+
+        Raises:
+            WriteError: the file cannot be written; see `abandon`.
+        """
+        assert self._writer is not None, "a file was started"
+        recorded = received.recorded
+        if recorded.key not in self._keys:
+            self._describe_plant(recorded.key)
+        self._writer.write(recorded, readable=received.message is not None, sequence=received.sequence)
+        self._last_ns = recorded.log_time_ns
+
+    def _describe_plant(self, key: str) -> None:
+        """Describe the process of a plant at the first of its samples in the file."""
+        self._keys.add(key)
+        topic = keys.parse(key)
+        if topic is None or topic.kind != keys.SAMPLE or topic.plant in self._plants:
+            return
+        self._plants.add(topic.plant)
+        process = self._find_process(topic.plant)
+        if process is not None and self._writer is not None:
+            self._writer.add_metadata(PROCESS, process_metadata(topic.plant, process))
+
+    def write_gap(self, gap: Gap) -> None:
+        """Record a gap in the messages of the bus.
+
+        Raises:
+            WriteError: the file cannot be written; see `abandon`.
+        """
+        assert self._writer is not None, "a file was started"
+        self._writer.add_metadata(GAP, gap_metadata(gap))
+        log.warning("lost on the way", stream=gap.stream, messages=gap.messages)
+
+    def fingerprints_since(self, from_ns: int) -> set[int]:
+        """Fingerprints of messages received since `from_ns`, in complete and in orphaned files."""
+        return {fingerprint(stored.channel.key, stored.payload) for stored in self._messages_since(from_ns)}
+
+    def find_missed_intervals(self, black_box: BlackBox, now_ns: int) -> list[AlarmInterval]:
+        """Restore a black box from recorded alarms, before orphans are recovered.
+
+        Returns:
+            The intervals that have ended and were never copied.
+        """
+        saved = self._black_boxes.spans()
+        ended = []
+        for stored in self._messages_since(now_ns - black_box.longest_ns, is_alarm) if black_box.longest_ns else ():
+            at_ns = stored.log_time_ns
+            if any(first_ns <= at_ns <= last_ns for first_ns, last_ns in saved):
+                continue
+            if (content := content_of(stored.recorded_message)) is not None:
+                ended.append(black_box.on_message(content, at_ns))
+        ended.append(black_box.pop_ended(now_ns))
+        return [interval for interval in ended if interval is not None]
+
+    def _messages_since(self, from_ns: int, wanted: Wanted | None = None) -> Iterator[StoredMessage]:
+        """Messages received since `from_ns`, file by file, the oldest first."""
+        files = [(path.stat().st_mtime_ns, path) for path in (*self._complete_files(), *self._orphans)]
+        for _, path in sorted(item for item in files if item[0] >= from_ns):
+            try:
+                reader = Reader(path, from_ns=from_ns, wanted=wanted, tolerant=True)
+            except InputError:
+                continue  # it is empty
+            yield from (stored for stored in reader if stored.log_time_ns >= from_ns and not stored.channel.latched)
+
+    def flush(self) -> None:
+        """Flush the file; see `RecordingWriter.flush`."""
+        if self._writer is not None:
+            self._writer.flush()
+
+    def sync(self) -> None:
+        """Sync the file; see `RecordingWriter.sync`."""
+        if self._writer is not None:
+            self._writer.sync()
+
+    def complete(self) -> None:
+        """Complete the file being written.
+
+        Raises:
+            WriteError: it cannot be written; see `abandon`.
+        """
+        if self._writer is None:
+            return
+        if self._synced:
+            self._writer.flush()
+            self._writer.sync()
+        self._writer.close()
+        with contextlib.suppress(FileNotFoundError):  # it was deleted at once
+            if self._last_ns:
+                os.utime(self._writer.path, ns=(self._last_ns, self._last_ns))
+            self._ages.add(self._writer.path.name, self._writer.path.stat().st_mtime_ns)
+        log.info("recorded", file=str(self._writer.path))
+        self._writer = None
+
+    def abandon(self) -> int:
+        """Leave the file as it is; it is recovered after the next one is started.
+
+        Returns:
+            Count of the messages since the last flush that the recovery will find.
+        """
+        if self._writer is None:
+            return 0
+        saved = self._writer.abandon()
+        part = part_of(self._writer.path)
+        if part.exists():
+            self._abandoned.append(part)
+        self._writer = None
+        return saved
+
+    def save_black_box(self, interval: AlarmInterval) -> None:
+        """Copy an interval into a file of its own, in the background; flush before."""
+        self._tasks.submit(f"the black box of {interval.alarm}", lambda: self._copy_black_box(interval))
+
+    def delete_oldest(self, protected_ns: int | None) -> None:
+        """Delete recordings beyond the limits, in the background.
+
+        Args:
+            protected_ns: recordings that ended within this time stay; None protects none.
+        """
+        if self._limits != Limits():
+            now_ns = self._ages.now_ns()
+            self._tasks.submit("deleting old recordings", lambda: self._delete_oldest(now_ns, protected_ns))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            self.complete()
+        finally:
+            self._tasks.finish()
+
+    def _complete_files(self) -> list[Path]:
+        if not self._names.folder.is_dir():
+            return []
+        return [path for path in self._names.folder.iterdir() if self._names.owns(path.name) and path.is_file()]
+
+    def _deletable(self) -> list[Path]:
+        """Files that the limits apply to: complete recordings and damaged orphans."""
+        return [*self._complete_files(), *list_damaged(self._names)]
+
+    def _copy_black_box(self, interval: AlarmInterval) -> None:
+        path = self._black_boxes.new(interval)
+        raised = datetime.fromtimestamp(interval.raised_ns / 1e9, UTC)
+        metadata = {**self._metadata, "alarm": interval.alarm, "raised": raised.isoformat(timespec="milliseconds")}
+        window = receipt_window(interval.from_ns, interval.to_ns)
+        while True:
+            writing = self.path
+            sources = [source for source in self._complete_files() if source.stat().st_mtime_ns >= interval.from_ns]
+            if writing is not None and writing not in sources:
+                sources.append(part_of(writing))
+            try:
+                count = cut(sources, path, window, metadata, tolerant=True)
+                break
+            except InputError:
+                if all(source.exists() for source in sources):
+                    raise  # else the file being written was completed meanwhile
+        log.info("black box", file=str(path), alarm=interval.alarm, messages=count)
+
+    def _delete_oldest(self, now_ns: int, protected_ns: int | None) -> None:
+        writer = self._writer  # before the others are listed: its file may become one of them
+        paths = [path for path in self._deletable() if writer is None or path != writer.path]
+        stats = [(path, path.stat()) for path in paths]
+        seen_ns = self._ages.update((path.name, stat.st_mtime_ns) for path, stat in stats)
+        complete = [CompleteRecording(path, stat.st_size, seen_ns[path.name], stat.st_mtime_ns) for path, stat in stats]
+        writing_bytes = writer.size_bytes if writer is not None else None
+        protected_since_ns = None if protected_ns is None else now_ns - protected_ns
+        for path in select_deletions(complete, writing_bytes, self._limits, now_ns, protected_since_ns):
+            path.unlink()
+            log.info("deleted", file=str(path), why="the limits of what is kept")
+        self._ages.store()
+
+
+def free_bytes(folder: Path) -> int:
+    """Free space on the disk of a folder, which may have been deleted."""
+    folder = folder.absolute()
+    return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.is_dir())).free
+
+
+def is_alarm(topic: str) -> bool:
+    """True for the topic of an alarm."""
+    parsed = keys.parse(topic)
+    return parsed is not None and parsed.kind == keys.ALARM
+
+
+class BlackBoxFiles:
+    """Folder of one recorder's black box.
+
+    A killed recorder may leave an interval that was never copied. The next start finds it: its alarms are in the
+    recordings and in no file of the black box.
+
+    Args:
+        names: names of its recordings.
+    """
+
+    def __init__(self, names: FileNames) -> None:
+        self._folder = names.folder / BLACK_BOX
+        self._stem = names.stem
+
+    def new(self, interval: AlarmInterval) -> Path:
+        """Unused path for an interval; its folder is created."""
+        self._folder.mkdir(exist_ok=True)
+        raised = datetime.fromtimestamp(interval.raised_ns / 1e9, UTC)
+        name = f"{self._stem}-{raised:%Y%m%dT%H%M%SZ}-{interval.alarm.replace('/', '-')}"
+        path, count = self._folder / f"{name}{ENDING}", 1
+        while path.exists():
+            count += 1
+            path = self._folder / f"{name}-{count}{ENDING}"
+        return path
+
+    def spans(self) -> list[tuple[int, int]]:
+        """First and last time of receipt of each file; damaged files are skipped."""
+        spans = []
+        for path in self._folder.glob(f"{self._stem}-*{ENDING}"):
+            try:
+                spans.append(span_ns(read_summary(path)))
+            except InputError:
+                continue
+        return spans
+
+    def partial_copies(self) -> list[Path]:
+        """Unfinished copies of a killed recorder."""
+        return [copy for copy in self._folder.glob(f".{self._stem}-*.tmp{PART}") if not is_locked(copy)]
+
+
+class BackgroundTasks:
+    """Background thread for slow work on files; a failed task is logged and never ends the recording."""
+
+    def __init__(self) -> None:
+        self._queue: SimpleQueue[tuple[str, Callable[[], None]] | None] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+
+    def submit(self, name: str, task: Callable[[], None]) -> None:
+        """Queue a task; `name` describes it in the log."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._work, name="background tasks", daemon=True)
+            self._thread.start()
+        self._queue.put((name, task))
+
+    def finish(self) -> None:
+        """Wait until all tasks are done; none may be submitted afterwards."""
+        if self._thread is not None:
+            self._queue.put(None)
+            self._thread.join()
+
+    def _work(self) -> None:
+        while (item := self._queue.get()) is not None:
+            name, task = item
+            try:
+                task()
+            except (InputError, OSError) as error:
+                log.warning(f"{name} failed", why=str(error))

@@ -1,1 +1,0 @@
-"""Recordings on disk: MCAP files, their parts, their repair."""

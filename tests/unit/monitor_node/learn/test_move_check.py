@@ -1,0 +1,62 @@
+"""A model that errs after moves of the inputs does not keep its promise, and says so."""
+
+import numpy as np
+import pytest
+
+from benchmarks.promise.black_box import TRAINING_MIN, sound_record, without_equations
+from monitor_node.core import Monitor
+from monitor_node.ingest.alignment import Row
+from monitor_node.learn.training_rows import AfterMoves, after_largest_moves, compare_after_moves
+from reactorwatch.arrays import Array
+from reactorwatch.contract.messages_pb2 import Promise
+from reactorwatch.records.record import MINUTE_NS
+
+
+def promise_after(time_min: Array, rows: Array) -> Promise:
+    """Promise of the ARX models after a training on rows of qc, C and T."""
+    monitor = Monitor(without_equations("arx"), 0, points=False)
+    for minute, row in zip(time_min.tolist(), rows.tolist(), strict=True):
+        monitor.on_rows([Row(round(minute * MINUTE_NS), tuple(row), False)])
+    promise = monitor.promise
+    assert promise is not None
+    return promise
+
+
+@pytest.mark.parametrize("inputs", ["wide", "mid"])
+def test_a_linear_model_of_the_curved_reactor_is_said_to_err(inputs: str) -> None:
+    """Without noise its residuals are all errors of the model."""
+    record = sound_record(inputs, "none", 11, TRAINING_MIN + 1.0)
+    promise = promise_after(record.time_min, np.column_stack([record.columns[name] for name in ("qc", "C", "T")]))
+    assert not promise.kept
+    assert promise.can_keep_per_30_days > 1.5 * promise.expected
+    assert "errs after moves of the inputs" in promise.text
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_linear_model_of_a_linear_plant_is_not(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = round(10 * TRAINING_MIN) + 10
+    flows, states = np.repeat(rng.uniform(90.0, 111.0, count // 10), 10), np.zeros((count, 2))
+    for k in range(1, count):
+        states[k] = np.array([[0.9, 0.05], [-0.1, 0.8]]) @ states[k - 1] + np.array([0.01, -0.2]) * (
+            flows[k - 1] - 100.0
+        )
+    outputs = states + rng.normal(size=states.shape) * [0.01, 0.3]
+    assert promise_after(np.arange(count) / 10.0, np.column_stack([flows, outputs])).kept
+
+
+def test_outliers_count_where_they_come_after_moves_and_not_elsewhere() -> None:
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.normal(size=(60, 1)), 20, axis=0)
+    moved = np.flatnonzero(after_largest_moves(u))
+    assert 0.05 < len(moved) / len(u) <= 0.1
+    for rows, errs in ((moved[::3], True), (rng.permutation(len(u))[: len(moved) // 3], False)):
+        e = rng.normal(size=(len(u), 1))
+        e[rows] = np.inf
+        assert (compare_after_moves(e, u) != AfterMoves()) == errs
+
+
+def test_inputs_that_never_move_or_move_in_every_row_show_nothing() -> None:
+    e = np.random.default_rng(3).normal(size=(500, 2))
+    for u in (np.zeros((500, 1)), np.zeros((500, 0)), np.full((500, 1), np.nan), np.tile([[0.0], [1.0]], (250, 1))):
+        assert compare_after_moves(e, u) == AfterMoves()

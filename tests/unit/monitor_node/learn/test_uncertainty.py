@@ -1,0 +1,124 @@
+"""A training shows what a filter has to estimate beside the states of the equations."""
+
+from collections.abc import Callable
+from dataclasses import replace as replace_model
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from monitor_node.learn.process_reference import ProcessMemory, ProcessReference
+from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding, Uncertain, describe_uncertain, find_uncertain
+from monitor_node.replay import backtest
+from reactorwatch.contract.codec import Encoded
+from reactorwatch.diagnosis.result import NOMINAL
+from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.uncertain_model import is_disturbance
+from reactorwatch.process.extended_model import ExtendedModel
+from reactorwatch.process.library.cstr.model import cstr
+
+from ..samples import samples
+from ..warm_plant import changes, publish
+
+WIDE, RARE, LITTLE = INPUTS.values()
+KIND = {item.name: item for item in KINDS}
+EXACT = Kind("as the model")
+TRAINING_MIN = 60.0
+
+
+@cache
+def uncertain(kind: Kind, moves: int, seed: int = 11) -> tuple[str, ...]:
+    record = simulate(kind, (WIDE, RARE, LITTLE)[moves], seed)
+    rows = record.time_min < TRAINING_MIN
+    measured = np.column_stack([record.columns[name][rows] for name in ("C", "T")])
+    return find_uncertain(cstr(), ("C", "T"), record.time_min[rows], record.columns["qc"][rows, None], measured).names
+
+
+def disturbances(kind: Kind, moves: int) -> set[str]:
+    return {item for item in uncertain(kind, moves) if is_disturbance(item)}
+
+
+def test_a_plant_as_the_model_whose_input_moved_over_its_range_needs_nothing() -> None:
+    assert uncertain(EXACT, 0) == ()
+
+
+@pytest.mark.parametrize("moves", [1, 2])
+def test_a_training_with_few_or_small_moves_leaves_constants_open(moves: int) -> None:
+    found = uncertain(EXACT, moves)
+    assert "constant valve_lag" in found
+    assert not any(map(is_disturbance, found))
+
+
+def test_a_feed_that_wanders_is_a_disturbance_that_wanders() -> None:
+    assert disturbances(KIND["feed that wanders"], 0) == {"wander T"}
+
+
+@pytest.mark.parametrize("memory", [(0.9, 0.15), (0.7, 0.2)])
+def test_noise_with_memory_is_coloured_noise(memory: tuple[float, float]) -> None:
+    assert disturbances(Kind("noise with memory", noise_memory=memory), 0) == {"noise T"}
+
+
+def test_a_training_of_few_rows_is_left_as_it_is() -> None:
+    nothing = np.zeros((20, 1))
+    assert find_uncertain(cstr(), ("C", "T"), np.arange(20.0), nothing, np.zeros((20, 2))) == Uncertain()
+
+
+def test_what_is_uncertain_is_said_in_words() -> None:
+    assert describe_uncertain(("constant volume", "wander T", "noise C")) == (
+        "a disturbance of the balance of T wanders, the noise of C has memory, limits allow for what the training "
+        "leaves open of the constants"
+    )
+
+
+UNCERTAIN = ("constant temperature_bias", "constant volume", "constant valve_lag")
+QUICK = MonitorConfig(training_min=20.0, isolation=False)
+
+
+def messages_of(kind: Kind, moves: int, seed: int, span_min: float) -> list[Encoded]:
+    """Messages of the first minutes of a plant."""
+    record = simulate(kind, (WIDE, RARE, LITTLE)[moves], seed)
+    rows = record.time_min < span_min
+    return list(samples(record.time_min[rows], {name: item[rows] for name, item in record.columns.items()}))
+
+
+def find(uncertain: tuple[str, ...]) -> Callable[[DiagnosisJob], Finding]:
+    """Diagnosis that finds these additional states."""
+    model = msgspec.json.encode(ExtendedModel("cstr", uncertain=uncertain).to_object()).decode()
+    return lambda job: Finding(job.first_ns, NOMINAL, "limits allow for it", model)
+
+
+def test_a_valve_lag_that_the_training_could_not_show_raises_no_alarm() -> None:
+    """The first move is at 75 min."""
+    messages, raised = messages_of(KIND["valve lag of 0.12 min"], 1, 111, 160.0), []
+    for model in (replace_model(cstr(), uncertain=UNCERTAIN), cstr()):
+        found = backtest.run(messages, replace(QUICK, diagnose_training=False), model=model)
+        raised.append(len(found.raised_alarms))
+    assert raised[0] == 0
+    assert raised[1] >= 1
+
+
+@pytest.mark.parametrize("uncertain", [UNCERTAIN, ("wander T", "noise C")])
+def test_a_monitor_with_additional_states_resumes_bit_for_bit(uncertain: tuple[str, ...]) -> None:
+    messages, monitor = messages_of(EXACT, 2, 12, 40.0), Monitor(QUICK, 0)
+    first = publish(monitor, messages[: 3 * 202])
+    assert monitor.diagnosis_job is not None
+    monitor.on_finding(find(uncertain)(monitor.diagnosis_job))
+    first += publish(monitor, messages[3 * 202 : 3 * 300])
+    (change,) = changes(first)
+    assert all(item in change.model for item in uncertain)
+    resumed = Monitor(QUICK, 0)
+    resumed.from_bytes(monitor.to_bytes())
+    assert publish(resumed, messages[3 * 300 :]) == publish(monitor, messages[3 * 300 :])
+
+
+def test_the_power_is_stated_for_constants_that_rows_have_taught() -> None:
+    noise = NoiseLevels((0.002, 0.3), (0.1, 0.2, 0.0, 0.0, 0.0, 0.0, 0.4))
+    model = replace_model(cstr(), uncertain=(*UNCERTAIN, "wander T"))
+    known, levels = ProcessReference(model, ("C", "T"), ProcessMemory(noise)).known_plant
+    assert known.state_names == ("C", "T", "T.wander")
+    assert levels == NoiseLevels((0.002, 0.3), (0.1, 0.2, 0.4))

@@ -1,0 +1,270 @@
+"""A plant or a sensor that has gone silent is noticed, at the same sample time in a live run and in a replay."""
+
+from math import nan
+
+import numpy as np
+import pytest
+
+from reactorwatch.errors import InputError
+from reactorwatch.spc.silence import NO_CHANGE, Change, DataTimeout
+from reactorwatch.stored_state import copy_of
+
+PERIOD = 6_000_000_000  # ns of the plant's time
+LEAST_S = 1.0
+
+
+def heard(rows: int, period_ns: int = PERIOD, speed: float = 1.0) -> DataTimeout:
+    """One that has heard a regular plant, received at `speed` times the plant's time from 0 on."""
+    silence = DataTimeout(limit=5.0, least_s=LEAST_S)
+    for row in range(rows):
+        silence.on_receipt(int(row * period_ns / speed))
+        silence.update(row * period_ns, present=True)
+    return silence
+
+
+def resume(stopped: DataTimeout) -> DataTimeout:
+    """Another one with a copy of the memory, as after a restart."""
+    return DataTimeout(least_s=LEAST_S, numbers=stopped.numbers.copy(), receipts=copy_of(stopped.receipts))
+
+
+# --- in the time of the samples ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("missing", [0, 1, 4])
+def test_up_to_four_missing_rows_are_no_silence(missing: int) -> None:
+    assert heard(100).update((100 + missing) * PERIOD, present=True) == NO_CHANGE
+
+
+@pytest.mark.parametrize("missing", [5, 6, 1000])
+def test_a_longer_gap_is_a_silence_from_five_periods_after_the_last_row_until_the_next(missing: int) -> None:
+    silence = heard(100)
+    change = silence.update((100 + missing) * PERIOD, present=True)
+    assert change == Change(raised_ns=104 * PERIOD, cleared_ns=(100 + missing) * PERIOD)
+    assert not silence.is_active
+
+
+def test_a_sensor_without_values_is_silent_while_the_rows_go_on() -> None:
+    silence = heard(100)
+    changes = [silence.update(row * PERIOD, present=False) for row in range(100, 120)]
+    assert [(row, change) for row, change in enumerate(changes, 100) if change != NO_CHANGE] == [
+        (105, Change(raised_ns=104 * PERIOD, cleared_ns=None))
+    ]
+    assert silence.update(120 * PERIOD, present=True) == Change(raised_ns=None, cleared_ns=120 * PERIOD)
+
+
+def test_a_slow_sensor_is_measured_by_its_own_period() -> None:
+    """An analyser with a value in every tenth row."""
+    silence = DataTimeout(limit=5.0)
+    changes = [silence.update(row * PERIOD, present=row % 10 == 0) for row in range(500)]
+    changes += [silence.update(row * PERIOD, present=False) for row in range(500, 600)]
+    assert [change for change in changes if change != NO_CHANGE] == [Change((490 + 50) * PERIOD, None)]
+
+
+def test_a_gap_in_all_rows_is_no_fault_of_a_sensor() -> None:
+    sensor = heard(100)
+    sensor.suppress_until(200 * PERIOD)
+    assert sensor.update(200 * PERIOD, present=False) == NO_CHANGE
+    assert [sensor.update(row * PERIOD, present=False) for row in range(201, 206)] == [NO_CHANGE] * 5
+    assert sensor.update(206 * PERIOD, present=False) == Change(205 * PERIOD, None)
+
+
+def test_a_sensor_that_is_silent_already_stays_so_through_a_gap_in_all_rows() -> None:
+    sensor = heard(100)
+    sensor.update(110 * PERIOD, present=False)
+    sensor.suppress_until(200 * PERIOD)
+    assert sensor.is_active
+    assert sensor.update(200 * PERIOD, present=True) == Change(None, 200 * PERIOD)
+
+
+def test_a_clock_that_is_set_back_is_no_silence_and_is_followed_from_there() -> None:
+    silence = heard(100)
+    assert silence.update(-50 * PERIOD, present=True) == NO_CHANGE
+    assert silence.update(-49 * PERIOD, present=True) == NO_CHANGE
+    assert silence.update(-40 * PERIOD, present=True) == Change(-44 * PERIOD, -40 * PERIOD)
+
+
+def test_a_silent_sensor_stays_so_when_the_clock_is_set_back_and_it_still_has_no_value() -> None:
+    sensor = heard(100)
+    sensor.update(110 * PERIOD, present=False)
+    assert sensor.update(20 * PERIOD, present=False) == NO_CHANGE
+    assert sensor.is_active
+
+
+def test_after_a_long_silence_the_next_is_noticed_nearly_as_soon() -> None:
+    silence = heard(100)
+    silence.on_receipt(1100 * PERIOD)
+    silence.update(1100 * PERIOD, present=True)
+    due_ns = silence.due_ns()
+    assert due_ns is not None
+    assert 1105 * PERIOD < due_ns < 1110 * PERIOD
+    assert silence.update(1111 * PERIOD, present=True).raised_ns is not None
+
+
+def test_irregular_rows_are_no_silence() -> None:
+    """Exponential spacings: allowed are 5 (1 + 2 * 2/e) = 12.4 means, which 4 in a million are longer than."""
+    times = np.cumsum(np.random.default_rng(1).exponential(PERIOD, 20_000)).astype(int)
+    silence = DataTimeout(limit=5.0)
+    assert all(silence.update(time_ns, present=True) == NO_CHANGE for time_ns in times.tolist())
+
+
+def test_rows_that_get_lost_singly_are_no_silence() -> None:
+    kept = np.flatnonzero(np.random.default_rng(2).random(20_000) > 0.05)
+    silence = DataTimeout(limit=5.0)
+    assert all(silence.update(int(row) * PERIOD, present=True) == NO_CHANGE for row in kept)
+
+
+def test_a_plant_that_goes_on_ten_times_slower_is_taken_as_it_is_after_a_few_rows() -> None:
+    silence = heard(100)
+    changes = [silence.update((99 + 10 * row) * PERIOD, present=True) for row in range(1, 100)]
+    silent = [row for row, change in enumerate(changes) if change != NO_CHANGE]
+    assert silent == list(range(len(silent)))
+    assert 1 <= len(silent) <= 4
+
+
+def test_nothing_is_silent_before_the_usual_spacing_is_known() -> None:
+    assert heard(20).update(10_000 * PERIOD, present=True) == NO_CHANGE
+    assert heard(20).due_ns() is None
+    assert DataTimeout().due_ns() is None
+
+
+def test_when_nothing_happens_it_is_nothing_itself_that_is_returned() -> None:
+    """Whoever asks for it by identity is right."""
+    silence = heard(100)
+    assert silence.update(100 * PERIOD, present=True) is NO_CHANGE
+    assert silence.update(101 * PERIOD, present=False) is NO_CHANGE
+    assert silence.update(0, present=True) is NO_CHANGE
+    assert silence.check(0) is NO_CHANGE
+
+
+# --- in the time of receipt ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.5])
+def test_a_plant_from_which_nothing_comes_is_silent_after_five_periods_of_receipt_time(speed: float) -> None:
+    silence = heard(100, speed=speed)
+    due_ns = silence.due_ns()
+    assert due_ns == 104 * PERIOD / speed
+    assert silence.check(due_ns - 1) == NO_CHANGE
+    assert silence.check(due_ns) == Change(raised_ns=104 * PERIOD, cleared_ns=None)
+
+
+def test_a_plant_that_runs_fast_is_given_the_least_time() -> None:
+    silence = heard(100, speed=600.0)  # a row every 10 ms
+    assert silence.due_ns() == 99 * PERIOD / 600 + LEAST_S * 1e9
+
+
+def test_a_silence_is_asked_for_once_and_then_waited_out() -> None:
+    """`on_tick` is called when something is due: after the alarm nothing may be, or the loop would spin."""
+    silence = heard(100)
+    due_ns = silence.due_ns()
+    assert due_ns is not None
+    silence.check(due_ns)
+    assert silence.due_ns() is None
+    assert silence.check(10**16) == NO_CHANGE
+
+
+def test_a_live_run_and_a_replay_tell_of_a_silence_with_the_same_times() -> None:
+    live, replay = heard(100), heard(100, speed=1e6)
+    said = [live.check(150 * PERIOD)]
+    live.on_receipt(200 * PERIOD)
+    said.append(live.update(200 * PERIOD, present=True))
+    at_once = replay.update(200 * PERIOD, present=True)
+    assert [change.raised_ns for change in said if change.raised_ns is not None] == [at_once.raised_ns]
+    assert [change.cleared_ns for change in said if change.cleared_ns is not None] == [at_once.cleared_ns]
+
+
+def test_rows_that_the_transport_held_up_end_the_silence_and_leave_none_in_a_replay() -> None:
+    live, replay = heard(100), heard(100, speed=1e6)
+    raised_ns = live.check(150 * PERIOD).raised_ns
+    assert live.update(100 * PERIOD, present=True) == Change(None, raised_ns)
+    assert [live.update(row * PERIOD, present=True) for row in range(101, 150)] == [NO_CHANGE] * 49
+    assert [replay.update(row * PERIOD, present=True) for row in range(100, 150)] == [NO_CHANGE] * 50
+
+
+def test_samples_that_arrive_in_bursts_are_waited_for_between_them() -> None:
+    """Ten rows every ten periods: the plant is not silent in between."""
+    silence = DataTimeout(limit=5.0, least_s=LEAST_S)
+    for burst in range(100):
+        now_ns = 10 * burst * PERIOD
+        due_ns = silence.due_ns()
+        assert burst < 5 or (due_ns is not None and now_ns < due_ns)
+        for row in range(10 * burst, 10 * burst + 10):
+            silence.on_receipt(now_ns)
+            silence.update(row * PERIOD, present=True)
+
+
+def test_a_receipt_clock_that_is_set_back_is_followed_from_there() -> None:
+    silence = heard(100)
+    silence.on_receipt(-(10**15))
+    assert silence.due_ns() == -(10**15) + 5 * PERIOD
+
+
+# --- state ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cut", [0, 1, 7, 30, 52, 75])
+def test_it_goes_on_from_its_stored_state_as_if_it_had_never_stopped(cut: int) -> None:
+    rows = [*range(50), *range(70, 100)]
+
+    def step(silence: DataTimeout, row: int) -> Change:
+        silence.on_receipt(row * PERIOD)
+        return silence.update(row * PERIOD, present=row % 7 != 0)
+
+    through, stopped = DataTimeout(least_s=LEAST_S), DataTimeout(least_s=LEAST_S)
+    expected = [step(through, row) for row in rows]
+    said = [step(stopped, row) for row in rows[:cut]]
+    resumed = resume(stopped)
+    assert said + [step(resumed, row) for row in rows[cut:]] == expected
+
+
+def test_a_monitor_that_was_down_does_not_call_the_plant_silent_for_it() -> None:
+    resumed = resume(heard(100))
+    assert resumed.due_ns() is None
+    resumed.on_receipt(10**15)
+    assert resumed.due_ns() == 10**15 + 5 * PERIOD
+
+
+@pytest.mark.parametrize(
+    ("limit", "least_s", "text"),
+    [
+        (1.0, 1.0, "limit must be a number of periods above 1, got 1"),
+        (nan, 1.0, "limit must be a number of periods above 1, got nan"),
+        (5.0, 0.0, "least_s must be a positive number, got 0"),
+    ],
+)
+def test_settings_that_make_no_rule_are_refused(limit: float, least_s: float, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        DataTimeout(limit, least_s)
+
+
+def test_what_comes_in_a_burst_after_a_cut_shortens_no_patience() -> None:
+    """A minute of rows that were held up comes within a tenth of a second."""
+    silence, plain = heard(100), heard(100)
+    end_ns = 100 * PERIOD
+    for row in range(200):
+        silence.on_receipt(end_ns + row * 500_000)
+    due_ns, usual_ns = silence.due_ns(), plain.due_ns()
+    assert due_ns is not None
+    assert usual_ns is not None
+    assert due_ns - (end_ns + 199 * 500_000) >= 0.99 * (usual_ns - 99 * PERIOD)
+
+
+def test_a_plant_that_goes_on_faster_is_waited_for_less_after_a_while() -> None:
+    silence = heard(100)
+    for row in range(3000):
+        silence.on_receipt(100 * PERIOD + row * PERIOD // 100)
+    due_ns = silence.due_ns()
+    assert due_ns is not None
+    assert due_ns - (100 * PERIOD + 2999 * PERIOD // 100) <= 1.01 * LEAST_S * 1e9
+
+
+def test_who_was_frozen_himself_or_whose_clock_was_set_does_not_blame_the_plant() -> None:
+    """He looks an hour late; if nothing comes then, he tells it in its time."""
+    silence = heard(100)
+    due_ns = silence.due_ns()
+    assert due_ns is not None
+    late_ns = due_ns + 3600 * 10**9
+    assert silence.check(late_ns) == NO_CHANGE
+    again_ns = silence.due_ns()
+    assert again_ns == late_ns + (due_ns - 99 * PERIOD)
+    assert silence.check(again_ns) == Change(104 * PERIOD, None)
