@@ -1,8 +1,9 @@
 """Ctrl-C, also while a kernel is compiled.
 
-The compiler drops exceptions in two places. An exception within a callback of LLVM is printed and dropped, and the
-kernel with it, because `ctypes` cannot propagate it; and Numba clears one raised while it inspects argument types. The
-interrupt would be lost, and the command continue. So none is raised within such a callback, and an interrupt is raised
+The compiler drops exceptions in three places. One within a callback of LLVM is printed and dropped, and the kernel with
+it, because `ctypes` cannot propagate it; one within the constructor of an object of LLVM leaves it half made, and its
+destructor prints another; and Numba clears one raised while it inspects argument types. The interrupt would be lost and
+the command continue, or a traceback be shown. So none is raised within the binding of LLVM, and an interrupt is raised
 again until the command handles it.
 """
 
@@ -13,8 +14,8 @@ from types import FrameType
 
 AGAIN_S = 0.2
 
-_CALLBACKS = "_raw_object_cache_"
-"""Prefix of the functions that LLVM calls, in llvmlite's `ExecutionEngine`."""
+_BINDING = "llvmlite.binding"
+"""Package whose code calls LLVM; a callback of LLVM runs within it."""
 
 
 def raise_until_handled() -> None:
@@ -38,7 +39,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     if _is_handled(sys.exception()):
         return
     while frame is not None:
-        if frame.f_code.co_name.startswith(_CALLBACKS):
+        if frame.f_globals.get("__name__", "").startswith(_BINDING):
             return
         frame = frame.f_back
     raise KeyboardInterrupt

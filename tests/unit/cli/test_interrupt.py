@@ -5,9 +5,10 @@ from collections.abc import Generator, Iterator
 from contextlib import closing
 
 import pytest
-from llvmlite.binding import ExecutionEngine
+from llvmlite.binding import ExecutionEngine, create_pass_builder
+from llvmlite.binding.ffi import ObjectRef
 
-from reactorwatch.cli.interrupt import _CALLBACKS, clear_interrupt, raise_until_handled
+from reactorwatch.cli.interrupt import _BINDING, clear_interrupt, raise_until_handled
 
 
 @pytest.fixture(autouse=True)
@@ -48,15 +49,29 @@ def test_an_alarm_that_comes_after_the_interrupt_was_cleared_does_nothing() -> N
         signal.raise_signal(signal.SIGINT)
 
 
-def test_an_interrupt_within_a_callback_of_the_compiler_is_raised_behind_it() -> None:
-    is_done = []
+CODE_OF_THE_BINDING = """
+def callback(interrupt):
+    interrupt()
+    done.append("callback")
 
-    def _raw_object_cache_notify() -> None:
-        signal.raise_signal(signal.SIGINT)
-        is_done.append(True)
 
-    _raw_object_cache_notify()
-    assert is_done
+class Builder:
+    def __init__(self, interrupt):
+        interrupt()
+        self.made = True
+
+    def __del__(self):
+        done.append(f"{self.made}")
+"""
+
+
+@pytest.mark.parametrize(("called", "result"), [("callback", "callback"), ("Builder", "True")])
+def test_an_interrupt_within_the_binding_of_the_compiler_is_raised_behind_it(called: str, result: str) -> None:
+    done: list[str] = []
+    module = {"__name__": f"{_BINDING}.somewhere", "done": done}
+    exec(CODE_OF_THE_BINDING, module)
+    module[called](lambda: signal.raise_signal(signal.SIGINT))  # type: ignore[operator]
+    assert done == [result]
     with pytest.raises(KeyboardInterrupt):
         signal.pause()
 
@@ -96,5 +111,6 @@ def test_nothing_is_raised_while_a_generator_is_closed_for_an_interrupt() -> Non
     assert is_closed
 
 
-def test_the_compiler_s_callbacks_have_the_names_that_are_looked_for() -> None:
-    assert [name for name in vars(ExecutionEngine) if name.startswith(_CALLBACKS)]
+@pytest.mark.parametrize("part", [ExecutionEngine, ObjectRef, create_pass_builder])
+def test_the_binding_has_the_name_that_is_looked_for(part: object) -> None:
+    assert part.__module__.startswith(_BINDING)
