@@ -89,7 +89,7 @@ def test_nodes_run_without_rerun_and_a_dashboard_says_what_is_missing() -> None:
         "from importlib import machinery\n"
         "find = machinery.PathFinder.find_spec\n"
         "machinery.PathFinder.find_spec = lambda name, *rest: None if name.startswith('rerun') else find(name, *rest)\n"
-        "import diagnosis_node.__main__, monitor_node.__main__, monitor_node.fleet.node\n"
+        "import diagnosis_node.__main__, monitor_node.__main__\n"
         "import plant_node.__main__, recorder.__main__\n"
         "import reactorwatch.cli.diagnosis\n"
         "try:\n"

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
+from monitor_node.node import MonitorNode
 from monitor_node.storage.state_files import StateFolder
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
