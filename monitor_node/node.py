@@ -207,7 +207,7 @@ class MonitorNode(FleetMonitor):
         if self._is_single or now_ns >= self._report_ns:
             self._report_ns = now_ns + LOG_INTERVAL_NS
             self._log_notes()
-            self._log_refused(now_ns)
+            self._log_rejects(now_ns)
         return publications
 
     def next_tick_ns(self) -> int:
@@ -356,7 +356,7 @@ class MonitorNode(FleetMonitor):
             while monitor.failures.tracebacks:
                 log.debug("traceback", plant=plant, traceback=monitor.failures.tracebacks.pop(0))
 
-    def _log_refused(self, now_ns: int) -> None:
+    def _log_rejects(self, now_ns: int) -> None:
         """Log refused messages, at most once a minute for each plant, evictions and plants beyond the promise."""
         for plant, monitor in self._monitors.items():
             if (refused := monitor.rejects.report(now_ns)) is not None:
