@@ -83,7 +83,7 @@ def test_the_image_of_nodes_leaves_out_rerun_and_nothing_else() -> None:
     assert len(lines) == len(LINES) - 1
 
 
-def test_nodes_run_without_rerun_and_a_dashboard_says_what_is_missing() -> None:
+def test_nodes_run_without_rerun_and_a_dashboard_names_the_missing_package() -> None:
     program = (
         "import sys\n"
         "from importlib import machinery\n"
