@@ -157,7 +157,7 @@ def prepare(kinds: Sequence[PlantKind], *, points: bool) -> None:
     """
     RecursiveLeastSquares(1).update([1.0], 1.0)
     for kind in kinds:
-        model = Monitor(kind.config, 0, points=points, model=kind.model).model
+        model = Monitor(kind.config, 0, points=points, model=kind.model).pipeline.model
         for _ in chain(drift.preparation(kind.config, wanted=points), stage.preparation(kind.config, model)):
             pass
 
@@ -276,13 +276,15 @@ class FleetMonitor:
         """Process the diagnosis of a plant's training; the plant may have been removed."""
         self._submitted.discard(plant)
         if plant in self._monitors:
-            self._monitors[plant].on_finding(finding)
+            self._monitors[plant].pipeline.on_finding(finding)
 
     def _schedule(self, plant: str, monitor: Monitor) -> None:
         """Submit a training for diagnosis, once, and schedule the deadline if it is earlier than the present one."""
-        if monitor.awaits_diagnosis and plant not in self._submitted and (job := monitor.diagnosis_job) is not None:
-            self._submitted.add(plant)
-            self._diagnose(plant, job)
+        if monitor.pipeline.model_update.is_pending and plant not in self._submitted:
+            job = monitor.pipeline.diagnosis_job
+            if job is not None:
+                self._submitted.add(plant)
+                self._diagnose(plant, job)
         due_ns = monitor.next_tick_ns()
         if due_ns < self._due_ns.get(plant, due_ns + 1):
             self._due_ns[plant] = due_ns

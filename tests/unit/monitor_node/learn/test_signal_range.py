@@ -86,7 +86,7 @@ def test_any_value_out_of_range_is_as_good_as_missing_and_raises_one_alarm_at_on
     cleared = next(item for item in alarms if item.alarm == first.alarm and item.event == "cleared")
     assert cleared.time_ns == (FIRST_BAD + BAD_ROWS + CONFIG.clear_count - 1) * 6 * 10**9
     assert filter_state(shown) == filter_state(missing)
-    assert shown.state.watch.watched == missing.state.watch.watched
+    assert shown.pipeline.state.watched == missing.pipeline.state.watched
     assert shown.failures.by_stage == {}
 
 
