@@ -19,7 +19,7 @@ from monitor_node.alarms.commands import COMMANDS as ALARM_COMMANDS
 from monitor_node.alarms.commands import execute_command
 from monitor_node.checks.silence import SilenceCheck
 from monitor_node.config import MonitorConfig
-from monitor_node.health import HEARD_AGAIN_NS, NODE, STALL_NS, Failures, ReceiveStats, health_message
+from monitor_node.health import HEARD_AGAIN_NS, NODE, STALL_NS, Failures, ReceiveStats
 from monitor_node.ingest.alignment import Aligner, Row
 from monitor_node.ingest.samples import (
     LARGEST_NUMBER,
@@ -49,11 +49,12 @@ from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import OTHER_VERSION, Body, DecodeError, Encoded, Publication, decode, encode
 from reactorwatch.contract.commands import decode_command
-from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply, Promise, Sample
+from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply, Health, Promise, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import copy_of
+from reactorwatch.version import version
 
 COMMANDS: Mapping[str, type[Message]] = {**ALARM_COMMANDS, BASELINE: BaselineCommand}
 """Message type by command."""
@@ -482,16 +483,28 @@ class Monitor:
         self.pipeline.resume_from_alarms()
 
     def _health(self, now_ns: int, phase: str) -> Publication:
-        health = health_message(
-            now_ns,
-            self.stats,
-            self.aligner.memory.counts,
-            self.rejects.by_reason,
+        memory, stats, counts = self.memory, self.stats, self.aligner.memory.counts
+        health = Health(
+            time_ns=now_ns,
+            node=NODE,
+            version=version(),
             phase=phase,
-            received=self.memory.received,
-            published=self.memory.published,
+            uptime_s=(now_ns - stats.start_ns) / 1e9,
+            received=memory.received,
+            published=memory.published,
+            refused=self.rejects.total,
+            refused_by_reason=self.rejects.by_reason,
             failures=self.failures.by_stage,
-            heard_from_ns=self.memory.heard_from_ns,
+            heard_from_ns=memory.heard_from_ns,
+            lag_ms=stats.lag_ns / 1e6,
+            not_stored=stats.not_stored,
+            stalls=stats.stalls,
+            lost=counts.lost,
+            late=counts.late,
+            duplicated=counts.duplicated,
+            out_of_order=counts.out_of_order,
+            rows=counts.rows,
+            incomplete_rows=counts.incomplete_rows,
             reference=self.pipeline.reference,
             training=self.pipeline.trained_share,
         )

@@ -41,7 +41,7 @@ def wait_for_findings(worker: DiagnosisWorker) -> list[PlantFinding]:
 
 def test_a_training_that_cannot_be_diagnosed_is_a_finding_and_the_next_is_diagnosed() -> None:
     worker = DiagnosisWorker(SerialExecutor())
-    for name in ("a", "b", "a"):
+    for name in ("a", "b"):
         worker.submit(name, SHORT)
     found = wait_for_findings(worker)
     worker.close()
