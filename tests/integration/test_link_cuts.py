@@ -24,7 +24,7 @@ from benchmarks.link_cuts import (
     recorder_process,
     stick,
 )
-from benchmarks.recorder_kills import PATIENCE_S, SIGNALS, Publisher, Tokens, wait_for_a_flush
+from benchmarks.recorder_kills import BATCHES_PER_S, PATIENCE_S, SIGNALS, Publisher, Tokens
 from reactorwatch.cli.recording_reports import info_text
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
@@ -38,6 +38,16 @@ RATE_PER_S = 1000
 """A machine that has much else to do cannot keep up with the five thousand of `make cuts`."""
 KEPT = 60_000
 """On a key: what is published in five minutes, more than any cut lasts, also where processes are slow to start."""
+
+
+FLUSHED_BYTES = 20_000
+"""More than the beginning of a recording."""
+
+
+def wait_for_a_flush(folder: Path, publisher: Publisher) -> None:
+    """Wait until a file that is being written holds more than its beginning."""
+    while max((part.stat().st_size for part in folder.glob("*.part")), default=0) < FLUSHED_BYTES:
+        publisher.wait(publisher.sequence + BATCHES_PER_S // 10)
 
 
 @pytest.fixture
