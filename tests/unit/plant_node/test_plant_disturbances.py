@@ -78,7 +78,7 @@ def test_the_first_row_is_the_start_and_the_rows_do_not_depend_on_how_many_there
     np.testing.assert_array_equal(long.columns["T"][:50], short.columns["T"])
 
 
-def test_the_plant_carries_it_on_as_its_linear_model_says() -> None:
+def test_the_plant_propagates_it_as_its_linear_model_does() -> None:
     """The stationary covariance P = Phi P Phi' + Q of the sampled linear model, here for small noise."""
     sd, qc, period_min = np.array([1e-5, 0.02]), np.array([95.0]), 0.1
     point = steady_states(cstr(), qc)[-1]

@@ -8,9 +8,9 @@ import pytest
 from google.protobuf.message import Message
 from msgspec.structs import replace
 
-from monitor_node.__main__ import MonitorNode
 from monitor_node.alarms.commands import COMMANDS
 from monitor_node.config import MonitorConfig
+from monitor_node.node import MonitorNode
 from plant_node.node import COMMANDS as PLANT_COMMANDS
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode_message
 from reactorwatch.contract.messages_pb2 import (
@@ -48,7 +48,7 @@ def alarmed(leak: list[Encoded]) -> bytes:
     node = MonitorNode(CONFIG, 0)
     for message in leak:
         node.on_message(message, 0)
-    return node.to_bytes()
+    return node.monitor(PLANT).to_bytes()
 
 
 class Room:
@@ -65,7 +65,7 @@ class Room:
     def __init__(self, config: MonitorConfig, state: bytes = b"") -> None:
         self.node = MonitorNode(config, 0)
         if state:
-            self.node.from_bytes(state)
+            self.node.monitor(PLANT).from_bytes(state)
         self.said: list[Publication] = []
         self._operator = MemoryBus(Exchange())
         self._operator.declare_queryable(f"reactor/{PLANT}/command/*", self._answer)
@@ -85,6 +85,7 @@ class Room:
 
     def _answer(self, request: Request) -> None:
         reply, publications = self.node.on_command(request.question, 0)
+        assert reply is not None
         self.said += publications
         request.reply(reply)
 
@@ -212,13 +213,13 @@ REFUSED: list[tuple[str, Message, str]] = [
 def test_what_cannot_be_done_is_refused_in_one_line_and_changes_nothing(
     room: Room, name: str, message: Message, text: str
 ) -> None:
-    before = room.node.alarms.memory.to_bytes()
+    before = room.node.monitor(PLANT).alarms.memory.to_bytes()
     reply = room.ask(name, message)
     assert not reply.accepted
     assert reply.text.startswith(text)
     assert "\n" not in reply.text
     assert room.said == []
-    assert room.node.alarms.memory.to_bytes() == before
+    assert room.node.monitor(PLANT).alarms.memory.to_bytes() == before
     (health,) = room.node.on_tick(1)
     assert isinstance(health.message, Health)
     assert health.message.refused == 1
@@ -237,10 +238,11 @@ def test_a_flood_of_commands_is_refused_counted_and_written_nowhere(
     assert {reply.text for reply in replies if not reply.accepted} == {
         "too many commands by 'Anna': 30 at once and 5 a second are taken; try again in a second"
     }
-    assert room.node.rejects.by_reason == {"too_many_commands": 3000 - len(obeyed)}
+    assert room.node.monitor(PLANT).rejects.by_reason == {"too_many_commands": 3000 - len(obeyed)}
     assert room.ask("comment", AlarmCommand(alarm="shewhart/T", by="Ben", comment="mine")).accepted
     question = Encoded(f"reactor/{PLANT}/command/comment", *encode_message(by_anna(comment="a second later")))
     reply, _ = room.node.on_command(question, 1_000_000_000)
+    assert reply is not None
     assert reply.accepted
 
 
@@ -283,7 +285,7 @@ def test_what_was_said_survives_a_restart(tmp_path: Path, leak: list[Encoded]) -
     said = second.hear(list(samples(time_min + END_MIN, columns)))
     (back,) = [item.message for item in said if isinstance(item.message, Alarm) and item.message.alarm == c.alarm]
     assert (back.alarm, back.event, back.time_ns) == ("shewhart/C", "shelf time over", to_time_ns(END_MIN + 5))
-    assert second.node.phase == "training"
+    assert second.node.monitor(PLANT).phase == "training"
 
 
 def test_a_file_in_no_folder_is_refused_at_the_start(tmp_path: Path) -> None:
