@@ -167,14 +167,18 @@ class Recorder:
 
     def _count_recorded(self, message: Encoded) -> None:
         """Count a sample that an earlier file holds, so that those around it in this file do not count as lost."""
-        sample, channel = content_of(message), channel_of(message.key, message.encoding, True)
-        is_sample = isinstance(sample, messages.Sample) and sample.quality != _NO_SAMPLE and sample.time_ns >= 0
-        if is_sample and channel.is_product:
+        sample = content_of(message)
+        if not isinstance(sample, messages.Sample) or sample.quality == _NO_SAMPLE or sample.time_ns < 0:
+            return
+        if channel_of(message.key, message.encoding, True).is_product:
             self._counter(message.key).update(sample.sequence, sample.time_ns)
 
     def _counter(self, key: str) -> SequenceCounter:
         """Counter of a key, which becomes the most recently used one."""
-        counter = self._counters[key] = self._counters.pop(key, None) or self._new_counter()
+        counter = self._counters.pop(key, None)
+        if counter is None:
+            counter = self._new_counter()
+        self._counters[key] = counter
         return counter
 
     def _new_counter(self) -> SequenceCounter:
