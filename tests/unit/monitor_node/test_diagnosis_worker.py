@@ -69,7 +69,7 @@ def test_where_no_process_can_be_started_each_diagnosis_has_failed_and_the_next_
 
 
 @pytest.mark.slow
-def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_model_at_the_next_row(
+def test_a_live_monitor_continues_while_its_training_is_diagnosed_and_changes_the_model_at_the_next_row(
     warm: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("monitor_node.node.DiagnosisWorker", lambda: DiagnosisWorker(SerialExecutor()))

@@ -135,7 +135,9 @@ def test_an_error_in_what_is_prepared_is_left_to_the_first_look(monkeypatch: pyt
     assert monitor.failures.by_stage["isolation"] >= 1
 
 
-def test_a_monitor_prepares_part_by_part_once_it_listens_and_then_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_monitor_prepares_part_by_part_once_it_is_subscribed_and_then_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     prepared: list[int] = []
 
     def preparation(*_: object) -> Iterator[None]:

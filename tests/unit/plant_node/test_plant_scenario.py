@@ -8,7 +8,7 @@ import pytest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import (
-    SCENARIOS,
+    KINDS,
     Constant,
     FromFile,
     HeldRecord,
@@ -47,7 +47,7 @@ def levels(scenario: Scenario, seed: int = 0) -> np.ndarray[Any, np.dtype[np.flo
 
 
 def test_every_kind_of_the_catalogue_is_tested_here() -> None:
-    assert {type(item) for item in OF_ALL_KINDS} - {HeldRecord} == set(SCENARIOS) - {FromFile}
+    assert {type(item) for item in OF_ALL_KINDS} - {HeldRecord} == set(KINDS.values()) - {FromFile}
 
 
 @pytest.mark.parametrize("scenario", OF_ALL_KINDS, ids=lambda scenario: type(scenario).__name__)

@@ -75,7 +75,7 @@ def test_the_counts_of_keys_that_are_followed_no_longer_stay(monkeypatch: pytest
     assert (report.lost, report.duplicated) == (10, 10)
 
 
-def test_health_tells_what_was_lost_by_key() -> None:
+def test_health_reports_losses_by_key() -> None:
     recorder = Recorder("cstr", 0)
     for key, sequences in (("reactor/cstr/sample/T", (0, 1, 5)), ("reactor/cstr/sample/C", (0, 1, 1, 3, 2))):
         for sequence in sequences:

@@ -118,7 +118,7 @@ def test_there_is_no_file_of_a_plant_of_which_nothing_is_known(bench: Bench, tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == [CLAIM, "a.state"]
 
 
-def test_figures_of_alarms_are_told_from_the_first_alarm_of_a_plant_on() -> None:
+def test_alarm_kpis_are_published_from_the_first_alarm_of_a_plant_on() -> None:
     node = MonitorNode(QUICK, 0, FleetConfig(plants=PLANTS))
     runs = {"sound": run_of("sound", 21), "leaking": run_of("leaking", 22, leak_min=30.0)}
     said = list[Publication]()

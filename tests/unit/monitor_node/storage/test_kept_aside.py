@@ -291,7 +291,7 @@ def fleet_of(folder: Path, order: int, rows: list[Encoded]) -> MonitorNode:
     return node
 
 
-def test_a_fleet_goes_on_from_what_it_kept_when_its_settings_are_back(tmp_path: Path, rows: list[Encoded]) -> None:
+def test_a_fleet_resumes_from_its_stored_state_when_its_settings_are_back(tmp_path: Path, rows: list[Encoded]) -> None:
     """With the other settings the plant is watched from the start on, before its first sample."""
     fleet_of(tmp_path, 3, rows[:30])
     other = fleet_of(tmp_path, 2, [])
@@ -302,7 +302,7 @@ def test_a_fleet_goes_on_from_what_it_kept_when_its_settings_are_back(tmp_path: 
     assert fleet_of(tmp_path, 3, []).monitor("a").rows == 20
 
 
-def test_a_fleet_s_unusable_state_is_reported_before_its_plant_says_anything(
+def test_a_fleet_s_unusable_state_is_reported_before_its_plant_publishes_anything(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for data in (b"", b"reactorwatch monitor\x00\x01 and then no state"):

@@ -46,9 +46,7 @@ def stored_rows(config: MonitorConfig) -> int:
     return own(start_node(msgspec.structs.replace(config, state_file=str(copy)), 0)).rows
 
 
-def test_it_is_stored_when_its_time_has_come_and_something_was_heard(
-    config: MonitorConfig, leak: list[Encoded]
-) -> None:
+def test_it_is_stored_when_it_is_due_and_something_was_received(config: MonitorConfig, leak: list[Encoded]) -> None:
     node = start_node(config, 0)
     path = Path(str(config.state_file))
     for number, message in enumerate(leak[:60]):
@@ -62,7 +60,7 @@ def test_it_is_stored_when_its_time_has_come_and_something_was_heard(
     assert path.stat().st_mtime_ns == before
 
 
-def test_a_change_of_an_alarm_is_stored_before_it_is_told(config: MonitorConfig, leak: list[Encoded]) -> None:
+def test_a_change_of_an_alarm_is_stored_before_it_is_published(config: MonitorConfig, leak: list[Encoded]) -> None:
     node = start_node(config, 0)
     for message in leak:
         said = node.on_message(message, 0)
@@ -103,7 +101,7 @@ def test_at_its_end_it_is_stored(config: MonitorConfig, leak: list[Encoded]) -> 
 
 
 @pytest.mark.parametrize("data", [b"", b"reactorw", b"reactorwatch monitor\x00\x01 and then no state"])
-def test_a_damaged_file_is_kept_aside_and_told_in_one_line(
+def test_a_damaged_file_is_kept_aside_and_reported_in_one_line(
     data: bytes, config: MonitorConfig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = Path(str(config.state_file))
@@ -136,7 +134,7 @@ def test_a_file_in_no_folder_is_refused_at_the_start(tmp_path: Path) -> None:
         start_node(MonitorConfig(state_file=str(tmp_path / "none" / "monitor.state")), 0)
 
 
-def test_a_full_disk_is_told_once_counted_and_stops_no_watch(
+def test_a_full_disk_is_reported_once_counted_and_stops_no_monitor(
     config: MonitorConfig, leak: list[Encoded], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Neither at the start nor later; what was stored before is still there, and it is tried again."""
