@@ -10,7 +10,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from recorder import RecordedMessage, keep
 from recorder.core import KEYS_ALARM
-from recorder.files.recording import read_messages, recordings_in
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter, WriteError
 from recorder.keep import MAX_OTHER_CHANNELS, Channel, ChannelBudget
 from tests.unit.recorder import golden
@@ -39,7 +39,7 @@ def receive(fed: Fed, received: Iterable[Encoded], apart_ns: int = 0) -> None:
 
 
 def recorded_keys(folder: Path) -> set[str]:
-    return {entry.key for entry in read_messages(folder)}
+    return {entry.key for entry in Recording(folder).messages()}
 
 
 @pytest.mark.parametrize("kind", STRAYS)
@@ -67,7 +67,7 @@ def test_messages_of_the_product_beyond_the_budget_raise_the_alarm_and_those_wit
     assert "for more keys of this software" in raised.text
     assert "'reactor/p100/sample/T'" in raised.text
     fed.stop()
-    files = recordings_in(tmp_path)
+    files = Recording(tmp_path).files
     assert len(files) == 1  # every key is in use: another file would have no room for more
     samples = {f"reactor/p{number}/sample/T" for number in range(100)}
     own = {f"reactor/cstr/alarm/{KEYS_ALARM}", "reactor/cstr/health/recorder"}
@@ -87,7 +87,7 @@ def test_silent_keys_give_their_budget_to_others_in_the_next_file(tmp_path: Path
     receive(fed, (sample("cstr", second) for second in range(100, 200)), SECOND)
     assert [item.event for item in fed.alarms()] == ["raised", "cleared"]
     fed.stop()
-    first, second_file = recordings_in(tmp_path)
+    first, second_file = Recording(tmp_path).files
     assert recorded_keys(second_file) == {"reactor/cstr/sample/T", "reactor/cstr/health/recorder"}
     assert "reactor/cstr/sample/T" not in recorded_keys(first)
 
