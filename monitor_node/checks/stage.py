@@ -10,7 +10,7 @@ from math import nan
 
 import numpy as np
 
-from monitor_node.alarms.alarms import AlarmChange, Explanation, SuspectedCause
+from monitor_node.alarms.alarms import AlarmChange, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.checks.base import PLANT, CheckTraining, Finding, Flags, SignalCheck
 from monitor_node.checks.catalogue import CHECKS
@@ -168,14 +168,13 @@ class SignalChecks:
     def _changes(check: SignalCheck, findings: Sequence[Finding]) -> list[AlarmChange]:
         changes: list[AlarmChange] = []
         for i, judgement, unit, text, own_time_ns in findings:
-            alarm, signal = check.alarms[i], check.signals[i]
-            rule = alarm.memory.rule
-            raised = alarm.update(judgement) if judgement.out or rule.standing or rule.recent else None
-            if raised is None:
+            change = check.alarms[i].update(judgement, unit, own_time_ns)
+            if change is None:
                 continue
-            shares = {} if signal == PLANT else {signal: 1.0}
-            explanation = Explanation(text, shares, [SuspectedCause(check.cause, 1.0, kind=SENSOR)]) if raised else None
-            changes.append(AlarmChange(alarm, judgement, unit, explanation, own_time_ns))
+            if check.signals[i] != PLANT:
+                change.contributions = {check.signals[i]: 1.0}
+            change.text, change.suspects = text, [SuspectedCause(check.cause, 1.0, kind=SENSOR)]
+            changes.append(change)
         return changes
 
     @staticmethod

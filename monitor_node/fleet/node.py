@@ -6,7 +6,7 @@ from pathlib import Path
 
 import structlog
 
-from monitor_node.alarms.kpis import is_empty
+from monitor_node.alarms.incidents import is_empty
 from monitor_node.config import MonitorConfig
 from monitor_node.core import COMMANDS, Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker

@@ -255,7 +255,7 @@ def test_alarms_are_not_older_than_those_of_other_settings_after_a_state_was_asi
     node.on_stop(0)
     standing = next(alarm.alarm for alarm in node.alarms.all_alarms() if stands(alarm))
     other = start_node(msgspec.structs.replace(both, order=2), 0)
-    other.alarms.comment(standing, "Anna", "the valve is being repaired")
+    other.alarms.act(standing, "comment", "Anna", "the valve is being repaired")
     other.on_tick(0)
     again = start_node(both, 0)
     assert again.rows == node.rows
