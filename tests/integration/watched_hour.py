@@ -46,7 +46,7 @@ class Hour:
 
     def record(self, publications: Iterable[Publication]) -> None:
         """Publish to the recorder."""
-        self.fed.hear(publications, 0)
+        self.fed.receive(publications, 0)
 
     def publish(self, publication: Publication) -> None:
         """Publish to both."""
