@@ -444,7 +444,7 @@ class Monitor:
         promise = self.pipeline.evaluation.promises.promise
         if promise is None:
             return None
-        return promise.message(self.memory.last_ns or 0, self.pipeline.evaluation.rows_watched)
+        return promise.message(self.memory.last_ns or 0, self.pipeline.evaluation.memory.rows_watched)
 
     @property
     def excluded_signals(self) -> dict[str, str]:

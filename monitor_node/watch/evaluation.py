@@ -259,11 +259,6 @@ class Evaluation:
     # --- rates -----------------------------------------------------------------------------------------------
 
     @property
-    def rows_watched(self) -> int:
-        """Number of evaluated rows."""
-        return self._memory.rows_watched
-
-    @property
     def chance_alarms(self) -> int:
         """Number of alarms that can be false alarms."""
         return self._budget.count(self._evaluated)
@@ -344,7 +339,9 @@ class Evaluation:
     def _count_alarms(self, row: MeasuredRow, before: int) -> None:
         """Count a row's alarms that chance can raise, among its publications from an index on."""
         alarms = [item.message for item in row.publications[before:] if isinstance(item.message, Alarm)]
-        if alarms and (note := self.promises.count_alarms(row.time_ns, self.rows_watched, alarms, row.publications)):
+        if alarms and (
+            note := self.promises.count_alarms(row.time_ns, self._memory.rows_watched, alarms, row.publications)
+        ):
             self.notes.append(note)
 
     # --- events ----------------------------------------------------------------------------------------------

@@ -296,7 +296,7 @@ class PlantPipeline:
         return publications
 
     def _promise_messages(self, time_ns: int) -> list[Publication]:
-        return self.evaluation.promises.messages(time_ns, self.evaluation.rows_watched)
+        return self.evaluation.promises.messages(time_ns, self.evaluation.memory.rows_watched)
 
     # --- training --------------------------------------------------------------------------------------------
 
@@ -367,7 +367,7 @@ class PlantPipeline:
         evaluation, reference = self.evaluation, self.evaluation.reference
         if reference is not None:
             model = self.baselines.equations if reference.follows_equations else None
-            self._note(evaluation.promises.check(rows, model, reference.kind, evaluation.rows_watched))
+            self._note(evaluation.promises.check(rows, model, reference.kind, evaluation.memory.rows_watched))
 
     # --- changes of the baseline -----------------------------------------------------------------------------
 
@@ -411,7 +411,9 @@ class PlantPipeline:
         self._start(trained, again=True)
         self._check_training(rows)
         publications.append(Publication(self._baseline_key, change))
-        if self.evaluation.rows_watched:  # the filter stands at the end of the training, and rows have come since
+        if (
+            self.evaluation.memory.rows_watched
+        ):  # the filter stands at the end of the training, and rows have come since
             trained.reference.restart()
             self.evaluation.release_values()
             publications.extend(self.snapshots(time_ns))
