@@ -1,4 +1,4 @@
-"""A stuck sensor, a spike and a dead plant are told as what they are, at once, and as nothing else."""
+"""A stuck sensor, a spike and a dead plant are reported as such, at once, and as nothing else."""
 
 from typing import Any
 
