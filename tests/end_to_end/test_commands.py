@@ -1,4 +1,4 @@
-"""The command as people and scripts meet it: help, one line for what is wrong, a clean end when asked to stop."""
+"""The command line for users and scripts: help, one line for an error, a clean end on interrupt."""
 
 import json
 import signal

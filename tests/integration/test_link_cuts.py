@@ -1,4 +1,4 @@
-"""Nothing that was published is lost on the way: links are cut, routers killed, listeners late, stuck or started anew.
+"""No published message is lost: links are cut, routers killed, subscribers late, blocked or restarted.
 
 Thirty seconds and every pair of link and manner: `make cuts`.
 """

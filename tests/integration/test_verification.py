@@ -1,4 +1,4 @@
-"""The monitor's core says again what was recorded of it, value for value; and what it does not is found out."""
+"""The monitor's core reproduces its recorded output value for value, and every difference is reported."""
 
 import json
 from collections import Counter

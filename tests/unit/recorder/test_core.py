@@ -1,4 +1,4 @@
-"""What the recorder makes of messages."""
+"""Messages as the recorder stores them."""
 
 import pytest
 

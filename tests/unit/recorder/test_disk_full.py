@@ -1,4 +1,4 @@
-"""A disk that is full stops the recording, with an alarm, and not the recorder; with room again it goes on."""
+"""A full disk stops the recording, with an alarm, and not the recorder; with space again it resumes."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""What is told of a recording."""
+"""The overview of a recording."""
 
 from collections import Counter
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What is saved of a damaged recording: all before the damage, all after it, and never a wrong message."""
+"""Recovery of a damaged recording: all before the damage, all after it, and never a wrong message."""
 
 import io
 import struct

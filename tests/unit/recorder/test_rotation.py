@@ -1,4 +1,4 @@
-"""When a recording is flushed, synced and followed by a new file."""
+"""The times at which a recording is flushed, synced and followed by a new file."""
 
 from math import inf
 

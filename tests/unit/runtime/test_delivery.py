@@ -1,4 +1,4 @@
-"""Between a bus and who listens: one order, whichever thread it comes from, and nothing older than asked for."""
+"""Delivery from a bus to a subscriber: one order, whatever the thread, and nothing older than requested."""
 
 import time
 from collections.abc import Callable
