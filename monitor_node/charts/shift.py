@@ -11,7 +11,9 @@ reference follows it, or learns it.
 
 from math import isfinite, nan
 
-from monitor_node.alarms.alarms import AlarmChange, Explanation
+import numpy as np
+
+from monitor_node.alarms.alarms import AlarmChange
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.charts import chart_point
 from monitor_node.config import MonitorConfig
@@ -22,10 +24,13 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.spc.charts.base import Judgement, format_quantity
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.step_test import ONSETS, STEP_TEST, StepTests
-from reactorwatch.stored_state import pack_records, unpack_records
+from reactorwatch.stored_state import Records, place_records
 
 NAME = "shift"
 """Name of the chart."""
+
+STAYED = "stayed there, which the model follows from then on"
+"""End of an alarm's text."""
 
 
 class ShiftWatch:
@@ -59,17 +64,18 @@ class ShiftWatch:
         self.is_active = self._tests is not None
 
     @property
-    def memory(self) -> bytes:
-        """Numbers of the tests; empty without tests. The alarms belong to the board."""
-        return b"" if self._tests is None else pack_records(self._tests.numbers)
+    def memory(self) -> Records | None:
+        """Numbers of the tests; None without tests. The alarms belong to the board."""
+        return None if self._tests is None else self._tests.numbers
 
-    def resume(self, memory: bytes) -> None:
+    def resume(self, memory: Records | None) -> None:
         """Go on from a memory; after the board.
 
         Raises:
             ValueError: the memory is of other outputs.
         """
-        self._tests = StepTests(unpack_records(memory, STEP_TEST, len(self._outputs))) if memory else None
+        numbers = None if memory is None else place_records(memory, np.zeros(len(self._outputs), STEP_TEST))
+        self._tests = None if numbers is None else StepTests(numbers)
         self.is_active = self._tests is not None
 
     @property
@@ -106,14 +112,10 @@ class ShiftWatch:
             judgement = Judgement(point.statistic, 0.0, -point.limit, point.limit, abs(point.statistic) > point.limit)
             if points:
                 row.publications.append(Publication(self._keys[i], chart_point(row.time_ns, judgement)))
-            if (raised := alarm.update(judgement)) is None:
+            if (change := alarm.update(judgement, "sd")) is None:
                 continue
-            explanation = self._explain(i, point.size, point.rows, row.units[i]) if raised else None
-            changes.append(AlarmChange(alarm, judgement, "sd", explanation))
+            name, step = self._outputs[i], format_quantity(point.size, row.units[i], "+.3g")
+            change.text = f"{name} moved by {step} {point.rows} rows before and {STAYED}"
+            change.contributions = {name: 1.0}
+            changes.append(change)
         return changes
-
-    def _explain(self, output: int, size: float, rows: int, unit: str) -> Explanation:
-        name = self._outputs[output]
-        step = format_quantity(size, unit, "+.3g")
-        text = f"{name} moved by {step} {rows} rows before and stayed there, which the model follows from then on"
-        return Explanation(text, {name: 1.0})

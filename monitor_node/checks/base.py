@@ -106,8 +106,7 @@ class SignalCheck:
     @property
     def is_counting(self) -> bool:
         """True if judgements within their limits may change an alarm."""
-        rules = [alarm.memory.rule for alarm in self.alarms]
-        return any(rule.standing or rule.recent for rule in rules)
+        return any(alarm.memory.standing or alarm.memory.recent for alarm in self.alarms)
 
     def use_numbers(self, numbers: np.void) -> None:
         """Keep numbers of the memory in those of the plant (`row_frame`) from now on.

@@ -38,8 +38,7 @@ class RangeCheck(SignalCheck):
         for alarm, index in enumerate(self._bounded):
             value, (lower, upper, unit) = values[index], self.ranges[index]
             if lower <= value <= upper:
-                rule = self.alarms[alarm].memory.rule
-                if rule.standing or rule.recent:
+                if not self.alarms[alarm].is_idle:
                     findings.append(Finding(alarm, Judgement(value, 0.5 * (lower + upper), lower, upper, False), unit))
             elif value == value:  # NaN is not equal to itself
                 self._invalid = self._invalid or [False] * len(values)

@@ -81,7 +81,7 @@ class SilenceCheck(SignalCheck):
     def follow_alarms(self) -> None:
         """Take as silent what the alarms say is silent: the next sample ends it."""
         for timeout, alarm in zip(self._timeouts, self.alarms, strict=True):
-            timeout.is_active = alarm.memory.rule.standing
+            timeout.is_active = alarm.memory.standing
 
     def on_row(self, time_ns: int, values: tuple[float, ...]) -> list[Finding]:
         """See `SignalCheck`."""

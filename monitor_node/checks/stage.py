@@ -7,10 +7,11 @@ sample is overdue.
 
 from collections.abc import Mapping, Sequence
 from math import nan
+from typing import Any
 
 import numpy as np
 
-from monitor_node.alarms.alarms import AlarmChange, Explanation, SuspectedCause
+from monitor_node.alarms.alarms import AlarmChange, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.checks.base import PLANT, CheckTraining, Finding, Flags, SignalCheck
 from monitor_node.checks.catalogue import CHECKS
@@ -21,7 +22,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.training_errors import TrainingErrors
-from reactorwatch.stored_state import Records
+from reactorwatch.stored_state import Records, read_memory
 
 SENSOR = "sensor"
 """Kind of the causes that checks suspect."""
@@ -100,15 +101,15 @@ class SignalChecks:
     # --- memory ----------------------------------------------------------------------------------------------
 
     @property
-    def memory(self) -> dict[str, bytes]:
-        """Memory of each check as it is stored, by name; the alarms belong to the board."""
-        return {check.name: check.memory.to_bytes() for check in self._checks if check.memory is not None}
+    def memory(self) -> dict[str, Any]:
+        """Memory of each check by name; the alarms belong to the board."""
+        return {check.name: check.memory for check in self._checks if check.memory is not None}
 
-    def resume(self, memory: Mapping[str, bytes], now_ns: int | None = None) -> None:
+    def resume(self, memory: Mapping[str, Any], now_ns: int | None = None) -> None:
         """Resume from the memory of checks with the same settings; the alarms are restored before.
 
         Args:
-            memory: memory of each check.
+            memory: memory of each check, as it was read.
             now_ns: present time, from which the data timeout counts; None: the data timeouts stay as they are.
 
         Raises:
@@ -119,7 +120,7 @@ class SignalChecks:
             raise ValueError(f"the state must be of the checks {sorted(checks)}, got {sorted(memory)}")
         for name, check in checks.items():
             if now_ns is not None or check is not self.silence:
-                check.memory = check.memory.from_bytes(memory[name])
+                check.memory = read_memory(memory[name], type(check.memory))
         self._use_numbers()
         if now_ns is not None:
             self.silence.of_plant.arm(now_ns)
@@ -168,14 +169,13 @@ class SignalChecks:
     def _changes(check: SignalCheck, findings: Sequence[Finding]) -> list[AlarmChange]:
         changes: list[AlarmChange] = []
         for i, judgement, unit, text, own_time_ns in findings:
-            alarm, signal = check.alarms[i], check.signals[i]
-            rule = alarm.memory.rule
-            raised = alarm.update(judgement) if judgement.out or rule.standing or rule.recent else None
-            if raised is None:
+            change = check.alarms[i].update(judgement, unit, own_time_ns)
+            if change is None:
                 continue
-            shares = {} if signal == PLANT else {signal: 1.0}
-            explanation = Explanation(text, shares, [SuspectedCause(check.cause, 1.0, kind=SENSOR)]) if raised else None
-            changes.append(AlarmChange(alarm, judgement, unit, explanation, own_time_ns))
+            if check.signals[i] != PLANT:
+                change.contributions = {check.signals[i]: 1.0}
+            change.text, change.suspects = text, [SuspectedCause(check.cause, 1.0, kind=SENSOR)]
+            changes.append(change)
         return changes
 
     @staticmethod

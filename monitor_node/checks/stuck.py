@@ -62,7 +62,7 @@ class StuckCheck(SignalCheck):
     @property
     def invalid(self) -> Flags:
         """See `SignalCheck`."""
-        return [alarm.memory.rule.standing for alarm in self.alarms]
+        return [alarm.memory.standing for alarm in self.alarms]
 
     def on_restart(self) -> None:
         """See `SignalCheck`. After a gap equal readings are counted on: it makes them no likelier."""

@@ -100,26 +100,22 @@ class IdentifiedModels:
 
     def __init__(self, config: MonitorConfig, *, points: bool) -> None:
         self._config, self.points, self.adapts = config, points, True
+        self.predictors: list[ArxPredictor] = []
         self.restart()
 
     def restart(self) -> None:
         """Start models that know nothing."""
         structure, forgetting = arx_structure(self._config), self._config.forgetting
-        self.predictors = [
+        self.predictors[:] = [
             ArxPredictor.of(structure, forgetting, with_snapshots=self.points) for _ in self._config.outputs
         ]
         self.bank: ArxBank | None = None
 
-    @property
-    def memory(self) -> list[ArxPredictor]:
-        """Copies of the models, without the bank."""
-        return [copy_of(predictor) for predictor in self.predictors]
-
     def resume(self, predictors: Sequence[ArxPredictor], *, follows: bool) -> None:
-        """Resume from a `memory` of the same settings.
+        """Resume from models of the same settings.
 
         Args:
-            predictors: the models.
+            predictors: the models, which are copied.
             follows: True if the next row follows the ones before.
 
         Raises:

@@ -1,4 +1,4 @@
-"""`diagnose` as people and scripts meet it, and what the extended model is good for afterwards."""
+"""`diagnose` on the command line, and the use of its extended model afterwards."""
 
 import json
 import re

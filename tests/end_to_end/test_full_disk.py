@@ -1,4 +1,4 @@
-"""A recorder that cannot write says so where operators look, and they can say that they have seen it."""
+"""A recorder that cannot write reports it in an alarm, which operators can acknowledge."""
 
 import contextlib
 import json

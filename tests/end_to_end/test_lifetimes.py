@@ -1,4 +1,4 @@
-"""How processes start and end: what can pass is waited for, and nothing of a run lives on without its supervisor."""
+"""Start and end of processes: transient causes are waited for, and no process outlives its supervisor."""
 
 import errno
 import fcntl

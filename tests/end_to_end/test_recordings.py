@@ -1,4 +1,4 @@
-"""What can be done with recordings, as people and scripts do it."""
+"""Commands on recordings, for users and scripts."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`reactorwatch alarm` against a monitor as a process of its own on a real router, which is killed and begun again."""
+"""`reactorwatch alarm` against a monitor process on a real router, which is killed and restarted."""
 
 import json
 import re

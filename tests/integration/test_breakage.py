@@ -1,4 +1,4 @@
-"""What breaks around a monitor costs no alarm of the plant's, raises none of its own, and is counted."""
+"""Failures around a monitor cost no alarm of the plant, raise none of their own, and are counted."""
 
 import itertools
 import random

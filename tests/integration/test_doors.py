@@ -1,4 +1,4 @@
-"""Who may not, cannot: real sessions on loopback, against the router's settings that `certify` writes.
+"""Access control: real sessions on loopback, against the router's settings that `certify` writes.
 
 What is refused is refused in silence. So each test also shows the like that is let in, and looks once whatever was
 sent before has come through: a session that leaves has a question answered by the router first.

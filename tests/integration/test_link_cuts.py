@@ -1,4 +1,4 @@
-"""Nothing that was published is lost on the way: links are cut, routers killed, listeners late, stuck or started anew.
+"""No published message is lost: links are cut, routers killed, subscribers late, blocked or restarted.
 
 Thirty seconds and every pair of link and manner: `make cuts`.
 """
@@ -24,20 +24,30 @@ from benchmarks.link_cuts import (
     recorder_process,
     stick,
 )
-from benchmarks.recorder_kills import PATIENCE_S, SIGNALS, Publisher, Tokens, wait_for_a_flush
+from benchmarks.recorder_kills import BATCHES_PER_S, PATIENCE_S, SIGNALS, Publisher, Tokens
 from reactorwatch.cli.recording_reports import info_text
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
-from recorder.files.recording import recordings_in
+from recorder.files.recording import Recording
 from recorder.tools.inspect import inspect
 
 RATE_PER_S = 1000
 """A machine that has much else to do cannot keep up with the five thousand of `make cuts`."""
 KEPT = 60_000
 """On a key: what is published in five minutes, more than any cut lasts, also where processes are slow to start."""
+
+
+FLUSHED_BYTES = 20_000
+"""More than the beginning of a recording."""
+
+
+def wait_for_a_flush(folder: Path, publisher: Publisher) -> None:
+    """Wait until a file that is being written holds more than its beginning."""
+    while max((part.stat().st_size for part in folder.glob("*.part")), default=0) < FLUSHED_BYTES:
+        publisher.wait(publisher.sequence + BATCHES_PER_S // 10)
 
 
 @pytest.fixture
@@ -177,7 +187,7 @@ def test_a_restarted_recorder_loses_nothing_and_repeats_nothing(tmp_path: Path, 
     finally:
         publisher.close()
         bus.close()
-    files = recordings_in(tmp_path)
+    files = Recording(tmp_path).files
     assert len(files) == 2
     found = read_content(files, publisher)
     assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)

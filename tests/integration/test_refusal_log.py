@@ -1,4 +1,4 @@
-"""The router of a site says in its log what it refuses, without being flooded itself."""
+"""The router of a site logs what it refuses, at a bounded rate."""
 
 import signal
 import subprocess

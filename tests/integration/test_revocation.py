@@ -1,4 +1,4 @@
-"""A revoked certificate may do nothing, and its holder goes on with the new one; a site without plants has a router."""
+"""A revoked certificate grants nothing, and its owner continues with the new one; a site may have no plant."""
 
 import datetime
 import shutil

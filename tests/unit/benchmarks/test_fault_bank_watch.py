@@ -1,4 +1,4 @@
-"""What is read from the monitor's messages: when alarms stood, and whom it suspected."""
+"""Intervals of alarms and suspects, read from the monitor's messages."""
 
 from math import inf
 

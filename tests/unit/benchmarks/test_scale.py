@@ -1,4 +1,4 @@
-"""`scale` on a busy machine: its parts start, and one that does not says why."""
+"""`scale` on a busy machine: its parts start, and one that does not reports the reason."""
 
 import itertools
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A plant that only its columns describe is watched live, too: by `up --record` and `monitor`."""
+"""A plant that only its columns describe is monitored live, too: by `up --record` and `monitor`."""
 
 from pathlib import Path
 from typing import Any

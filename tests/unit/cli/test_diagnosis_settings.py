@@ -1,4 +1,4 @@
-"""What diagnoses after alarms take from the settings, the flags and the monitor."""
+"""Settings of diagnoses after alarms, from the settings file, the flags and the monitor."""
 
 from pathlib import Path
 from typing import Any

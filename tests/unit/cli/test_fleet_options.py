@@ -1,4 +1,4 @@
-"""What `monitor` says of a fleet that cannot be: one line, and exit code 2, before it waits for a router."""
+"""`monitor` refuses an impossible fleet in one line with exit code 2, before it waits for a router."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a folder stands for where many files may be named."""
+"""Expansion of folders where many files may be named."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""`identify` and `linearise` say what the contract promises, for machines and for people."""
+"""`identify` and `linearise` print what the contract promises, as text and as JSON."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A disk that is full, for every command with an output: one line, exit code 2, nothing left, and the answer is said.
+"""A full disk, for every command with an output: one line, exit code 2, no file left, and the result is printed.
 
 The limit on the size of files stands for the disk: the system refuses what goes beyond it, to every writer there is.
 """

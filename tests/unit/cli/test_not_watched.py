@@ -1,4 +1,4 @@
-"""Where no file can be watched, diagnosed or identified, the exit code is 3, and each line states why."""
+"""Exit code 3 if no file can be monitored, diagnosed or identified; each line states the reason."""
 
 import csv
 import json

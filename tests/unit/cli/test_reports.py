@@ -1,4 +1,4 @@
-"""`backtest` says what judged the rows and by which noise levels."""
+"""`backtest` prints the reference in use and its noise levels."""
 
 import dataclasses
 import re

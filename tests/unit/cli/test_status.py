@@ -1,4 +1,4 @@
-"""What `status` shows is what was said: rates counted by hand, alarms in sight, nodes that are there or not."""
+"""`status` shows what was published: rates counted by hand, active alarms, nodes that are present or not."""
 
 from google.protobuf.message import Message
 

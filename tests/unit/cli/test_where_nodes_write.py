@@ -1,4 +1,4 @@
-"""Where nodes write and what they take without settings: defaults hold for any process, folders are made."""
+"""Paths and inputs of nodes without settings: defaults hold for any process, folders are made."""
 
 from contextlib import nullcontext
 from pathlib import Path

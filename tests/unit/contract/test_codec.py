@@ -1,4 +1,4 @@
-"""The contract: what is encoded is decoded, what is not ours is refused, and yesterday's bytes still read."""
+"""The contract: messages decode as they were encoded, foreign ones are refused, and yesterday's bytes still read."""
 
 import re
 import subprocess

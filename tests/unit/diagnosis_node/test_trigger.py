@@ -1,4 +1,4 @@
-"""When an alarm is diagnosed, and on which samples."""
+"""The time and the samples of a diagnosis after an alarm."""
 
 import pytest
 

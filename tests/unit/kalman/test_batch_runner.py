@@ -1,4 +1,4 @@
-"""Filters that go through their records together say what each would say alone, to the last bit."""
+"""Filters run as a batch give the output of each alone, to the last bit."""
 
 from collections.abc import Sequence
 

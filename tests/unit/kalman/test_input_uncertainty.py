@@ -1,4 +1,4 @@
-"""Ways on which an input changed, and nobody knows when."""
+"""Intervals in which an input changed at an unknown time."""
 
 from dataclasses import replace
 

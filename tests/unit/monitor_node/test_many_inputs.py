@@ -1,4 +1,4 @@
-"""Plants with no, one or several inputs: watched, resumed, replayed and back-tested alike, whatever is missing."""
+"""Plants with no, one or several inputs: monitored, resumed, replayed and back-tested alike, whatever is missing."""
 
 from dataclasses import dataclass, replace
 

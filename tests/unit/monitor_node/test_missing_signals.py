@@ -1,4 +1,4 @@
-"""A signal that does not come raises an alarm, is left out with the reason, and the others are watched."""
+"""A missing signal raises an alarm, is left out with the reason, and the others are monitored."""
 
 import numpy as np
 import pytest

@@ -1,8 +1,8 @@
-"""What the monitor does with samples that are late, missing, doubled or irregular, and with a clock that jumps.
+"""Samples that are late, missing, doubled or irregular, and a clock that jumps.
 
 The policy: what happened to samples on their way is counted, and nothing of it is taken for a fault of the process.
 Each test feeds a run as the bus would, and looks at what is counted, what is alarmed, and whether a fault is still
-found. A gap may be told as a silence of the plant; that is no false alarm.
+found. The silence alarm of a gap is no false alarm.
 """
 
 import random
@@ -30,7 +30,7 @@ ONSET_MIN = 90.0  # of the leak, in runs that have one
 
 
 class RunOutput(NamedTuple):
-    """What a monitor said of a run.
+    """The output of a monitor for a run.
 
     Attributes:
         published: everything but health, as bytes.
@@ -53,7 +53,7 @@ class Run(NamedTuple):
     rows: list[tuple[int, float, tuple[float, ...]]]
 
     def messages(self, without: Callable[[int, str], bool] = lambda _row, _signal: False) -> list[Encoded]:
-        """The run as the plant publishes it, but for samples that are told to be missing."""
+        """The run as the plant publishes it, but for the samples left out."""
         return [
             sample(signal, number, time_min, value)
             for number, time_min, values in self.rows

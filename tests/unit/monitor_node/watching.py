@@ -15,7 +15,7 @@ from .samples import Rows, leaking_run, samples
 
 @dataclass
 class Watched:
-    """A monitor that was run over a record, and what it said."""
+    """A monitor that was run over a record, and its output."""
 
     monitor: Monitor
     published: list[Publication] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""How a state goes over into a model that has other states."""
+"""Transfer of a state into a model that has other states."""
 
 from dataclasses import replace
 from typing import ClassVar

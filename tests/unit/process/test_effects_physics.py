@@ -1,4 +1,4 @@
-"""Effects against the physics written out by hand and integrated by scipy, to a tolerance far below ours."""
+"""Effects against the physics written out by hand and integrated by scipy, with a far smaller tolerance."""
 
 from math import exp
 

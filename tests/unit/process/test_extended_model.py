@@ -1,4 +1,4 @@
-"""The file of an extended model: what is written is what is read, and what cannot be is told in one line."""
+"""The file of an extended model: it is read as it was written, and an error is reported in one line."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Fault specifications: what they mean, and what is said about wrong ones."""
+"""Fault specifications: their meaning, and the errors of wrong ones."""
 
 import numpy as np
 import pytest

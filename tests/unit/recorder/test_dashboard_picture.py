@@ -1,4 +1,4 @@
-"""Pictures of dashboards. They need Rerun's viewer and a graphics driver; without these the tests skip and say so."""
+"""Pictures of dashboards. They need Rerun's viewer and a graphics driver; without these the tests are skipped."""
 
 import io
 import subprocess

@@ -1,4 +1,4 @@
-"""What recordings are called."""
+"""Names of recordings."""
 
 from datetime import UTC, datetime
 from pathlib import Path

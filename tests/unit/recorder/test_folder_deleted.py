@@ -1,4 +1,4 @@
-"""A folder or file that is deleted under a recorder raises the alarm, and recording goes on in a new file."""
+"""A folder or file that is deleted under a recorder raises the alarm, and recording resumes in a new file."""
 
 import shutil
 from collections.abc import Callable

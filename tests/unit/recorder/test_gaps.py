@@ -1,4 +1,4 @@
-"""What was lost on the way is in the file, in what is made of the file, and in what the recorder says of itself."""
+"""Lost messages are listed in the file, in what is derived from it, and in the recorder's health."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""How things stand when a file is begun."""
+"""Latched messages at the start of a file."""
 
 from google.protobuf.message import Message
 

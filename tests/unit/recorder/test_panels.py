@@ -1,4 +1,4 @@
-"""What every panel has to keep, and what each of them shows of the golden run. The phase plane has its own file."""
+"""Rules of every panel, and the content of each for the golden run. The phase plane has its own file."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""A replay from a time on begins with the alarms that stand then, and says where it waits for long."""
+"""A replay from a given time starts with the active alarms, and reports a long wait."""
 
 from collections.abc import Iterator
 from typing import Any

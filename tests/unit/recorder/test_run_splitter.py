@@ -1,4 +1,4 @@
-"""Where a new run of a plant starts, as the numbers and times of its samples tell."""
+"""The start of a new run of a plant, by the sequence numbers and times of its samples."""
 
 from dataclasses import dataclass
 from itertools import pairwise

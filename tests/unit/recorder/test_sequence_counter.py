@@ -1,4 +1,4 @@
-"""What sequence numbers say about what never came."""
+"""Losses counted by sequence numbers."""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""What keeps a file from being read is told with its name."""
+"""Errors of reading a file are reported with its name."""
 
 from pathlib import Path
 

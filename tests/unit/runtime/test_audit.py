@@ -1,4 +1,4 @@
-"""What somebody told a node to do is on the bus, with who, and what came of it."""
+"""Commands are published for audit, with their author and result."""
 
 import threading
 

@@ -69,7 +69,7 @@ def test_a_queryable_that_does_not_answer_within_the_time_is_not_waited_for_long
     assert CommandReply.FromString(answer.payload).text == "here"
 
 
-def test_a_token_is_seen_by_those_who_come_late_and_goes_with_its_bus() -> None:
+def test_a_late_subscriber_sees_a_token_and_the_token_ends_with_its_bus() -> None:
     exchange, seen = Exchange(), list[tuple[str, bool]]()
     node, watcher = MemoryBus(exchange), MemoryBus(exchange)
     node.declare_token("reactor/cstr/alive/monitor")

@@ -1,7 +1,8 @@
-"""Between a bus and who listens: one order, whichever thread it comes from, and nothing older than asked for."""
+"""Delivery from a bus to a subscriber: one order, whatever the thread, and nothing older than requested."""
 
 import time
 from collections.abc import Callable
+from math import inf, isinf
 from queue import SimpleQueue
 from types import SimpleNamespace
 
@@ -108,6 +109,27 @@ def test_the_query_reaches_back_to_the_message_before_the_gap(clock: SimpleNames
     items = [received.get(timeout=WITHIN_S) for _ in range(before + 4)]
     delivery.close()
     assert [item.payload.decode() for item in items if isinstance(item, Encoded)] == [*map(str, range(before + 4))]
+
+
+def test_a_gap_that_was_long_on_its_way_is_queried_in_all_that_is_cached(clock: SimpleNamespace) -> None:
+    """A busy subscriber takes a message long after its publication, so what is missing is older than it seems."""
+    received: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    queried: SimpleQueue[float] = SimpleQueue()
+
+    def query(_stream: str, since_s: float) -> list[SequencedMessage]:
+        queried.put(since_s)
+        return [message(number) for number in range(0 if isinf(since_s) else 2, 4)]
+
+    delivery = Delivery(each(received), received.put, query)
+    delivery.start()
+    delivery.receive([message(0)])
+    delivery.receive([message(3)])
+    clock.now_ns += reorder_buffer.TIMEOUT_NS
+    delivery.receive([message(4)])
+    items = [received.get(timeout=WITHIN_S) for _ in range(5)]
+    delivery.close()
+    assert [item.payload.decode() for item in items if isinstance(item, Encoded)] == [*map(str, range(5))]
+    assert [queried.get_nowait() for _ in range(queried.qsize())] == [reorder_buffer.TIMEOUT_NS / 1e9, inf]
 
 
 def test_a_stream_that_began_while_the_link_was_down_is_asked_for_from_its_beginning(clock: SimpleNamespace) -> None:

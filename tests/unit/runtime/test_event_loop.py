@@ -1,4 +1,4 @@
-"""The loop of the nodes: nothing that arrives is lost, ticks come when they are due, a stop is heard at once."""
+"""The event loop of the nodes: no message is lost, ticks come when they are due, a stop acts at once."""
 
 import signal
 import threading

@@ -1,4 +1,4 @@
-"""Jobs come to the same whoever does them; a failure stays with its job, and a dead worker costs a retry."""
+"""Jobs give the same results on any executor; a failure stays with its job, and a dead worker costs a retry."""
 
 import multiprocessing
 import os

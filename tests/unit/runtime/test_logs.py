@@ -1,4 +1,4 @@
-"""A log is a line an event: for people as text, for programs as an object."""
+"""A log is a line an event: as text, or as a JSON object."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""A free port of the loopback address stays free for who named it."""
+"""A free port of the loopback address stays reserved for the process that named it."""
 
 import errno
 import socket

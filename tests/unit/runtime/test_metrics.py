@@ -1,4 +1,4 @@
-"""What a node counts is on its page as it was published, in the words of Prometheus."""
+"""The counts of a node are on its metrics page as they were published, in the Prometheus format."""
 
 import socket
 import sys

@@ -1,4 +1,4 @@
-"""What a node published goes on in that order, whatever comes late; and what never comes is told."""
+"""Messages of a publisher are delivered in order, however late they arrive; lost ones are reported."""
 
 import random
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""What can pass is waited for at a node's start, and what only a person can mend is raised at once."""
+"""Transient errors are waited for at a node's start, and permanent ones are raised at once."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""What holds for every chart of the catalogue."""
+"""Properties of every chart of the catalogue."""
 
 from typing import Any
 

@@ -14,7 +14,7 @@ LEAST_S = 1.0
 
 
 def trained_timeout(rows: int, period_ns: int = PERIOD, speed: float = 1.0) -> DataTimeout:
-    """One that has heard a regular plant, received at `speed` times the plant's time from 0 on."""
+    """A timeout after samples of a regular plant, received at `speed` times the plant's time from 0 on."""
     silence = DataTimeout(limit=5.0, least_s=LEAST_S)
     for row in range(rows):
         silence.on_receipt(int(row * period_ns / speed))
@@ -259,7 +259,7 @@ def test_a_plant_that_resumes_faster_gets_a_shorter_timeout_after_a_while() -> N
 
 
 def test_a_monitor_that_was_frozen_or_had_its_clock_set_does_not_blame_the_plant() -> None:
-    """He looks an hour late; if nothing comes then, he tells it in its time."""
+    """The check runs an hour late; if nothing arrives after it, the alarm is raised in due time."""
     silence = trained_timeout(100)
     due_ns = silence.due_ns()
     assert due_ns is not None

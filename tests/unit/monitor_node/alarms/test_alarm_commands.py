@@ -1,4 +1,4 @@
-"""What people ask of the alarms on the bus: done and told, or refused in one line with nothing changed."""
+"""Operators' alarm commands on the bus: done and published, or refused in one line with nothing changed."""
 
 import gc
 import shutil

@@ -1,4 +1,4 @@
-"""A look for causes stops at a budget of filter steps, whatever the sensors show, and says so."""
+"""A search for causes stops at a budget of filter steps, whatever the sensors show, and reports it."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""A sensor that is wrong is told what it should read."""
+"""Reconstruction of the value that a faulty sensor should read."""
 
 from math import isnan, nan
 

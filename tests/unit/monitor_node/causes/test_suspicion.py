@@ -1,4 +1,4 @@
-"""After an alarm its cause is named, as data come, and what a faulty sensor should read is told."""
+"""After an alarm its cause is named as data arrive, and the true value of a faulty sensor is published."""
 
 import numpy as np
 import pytest

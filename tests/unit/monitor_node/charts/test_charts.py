@@ -1,4 +1,4 @@
-"""The charts of a plant together: every kind finds what it is for, says whose it is, and begins anew afterwards."""
+"""The charts of a plant together: each finds its kind of fault, names the signal, and restarts afterwards."""
 
 from itertools import pairwise
 from typing import Any

@@ -1,4 +1,4 @@
-"""The watch over a fleet: each plant is watched as if it were alone, by one monitor."""
+"""Monitoring of a fleet: each plant is monitored as if it were alone, by one monitor."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Which samples are of the plant that is watched: a stranger's are refused, and no run of the plant's own loses one."""
+"""Samples of another plant are refused, and no run of the monitored plant loses one."""
 
 import random
 

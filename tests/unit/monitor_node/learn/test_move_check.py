@@ -1,4 +1,4 @@
-"""A model that errs after moves of the inputs does not keep its promise, and says so."""
+"""A model that errs after moves of the inputs does not keep its promise, and this is reported."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Training: a disturbed stretch is left out and told, too much of it is refused, and the better reference is taken."""
+"""Training: a disturbed segment is excluded and reported, too many are refused, and the better reference is taken."""
 
 import msgspec
 import numpy as np

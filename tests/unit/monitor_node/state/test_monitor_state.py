@@ -1,4 +1,4 @@
-"""A monitor that was stopped and goes on from its stored state says what it would have said, value for value."""
+"""A monitor that resumes from its stored state publishes what it would have published, value for value."""
 
 import random
 from itertools import chain

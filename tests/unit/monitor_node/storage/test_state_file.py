@@ -1,4 +1,4 @@
-"""What a monitor remembers outlives it in a file, and a file that is no good costs no more than what was learned."""
+"""The state of a monitor persists in a file, and a damaged file costs no more than what was learned."""
 
 import errno
 import os

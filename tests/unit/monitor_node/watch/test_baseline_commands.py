@@ -1,4 +1,4 @@
-"""A plant changes, and its people say so: accept, relearn and restore what it is judged by."""
+"""Baseline commands after a change of the plant: accept, relearn and restore."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A plant has modes: each has its own reference, start-up is watched by signal checks only, an unseen mode says so."""
+"""Modes of a plant: each has its own reference, start-up has signal checks only, an unseen mode is reported."""
 
 import msgspec
 import numpy as np
