@@ -20,7 +20,6 @@ from monitor_node.health import Failures
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.learn.arx_reference import ArxReference
-from monitor_node.learn.identified_models import IdentifiedModels
 from monitor_node.learn.references import Reference
 from monitor_node.learn.signal_range import possible_ranges, stated_ranges
 from monitor_node.learn.training import NO_VALUE, TrainingResult
@@ -71,7 +70,7 @@ class Evaluation:
         self,
         config: MonitorConfig,
         board: Annunciator,
-        models: IdentifiedModels,
+        models: ArxReference,
         *,
         model: ProcessModel | None,
         is_process: bool,
@@ -90,7 +89,6 @@ class Evaluation:
         self.signals = SignalChecks(config, board, self._ranges, self.ordinary.numbers)
         self._use_ranges()
         self._drift = DriftWatch(config, board, publish=self._points)
-        models.adapts = self._drift.wanted
         self._shift = ShiftWatch(config, board)
         self._budget = AlarmBudget(config, self._charts.design, self.signals, self._shift, self._drift)
         self._suspicion: Suspicion | None = None
@@ -120,7 +118,7 @@ class Evaluation:
         if self.is_ordinary:
             self._charts.store(self.ordinary.numbers[0])
         return TrainedState(
-            copy_of(reference.memory),
+            None if reference is self._models else copy_of(reference.memory),
             [(check.name, check.result) for check in self.checks],
             dict(self.left_out),
             pack_records(self.ordinary.numbers["whiteners"][0]),
@@ -133,7 +131,6 @@ class Evaluation:
             baseline,
             self._shift.memory,
             None if self.promises.promise is None else copy_of(self.promises.promise),
-            None if self._models.bank is None else copy_of(self._models.bank.memory),
         )
 
     def restore(self, state: TrainedState, equations: ProcessModel | None) -> None:
@@ -165,10 +162,10 @@ class Evaluation:
         self._whiteners = [Prewhitener(None, numbers[i : i + 1]) for i in range(outputs)]
         learned = [whitener.autoregression for whitener in self._whiteners]
         self._leave_out(state.left_out)
-        self._set_reference(state.reference.reference(equations, self._config.outputs), learned, state.arl0)
+        stored = state.reference
+        reference = self._models if stored is None else stored.reference(equations, self._config.outputs)
+        self._set_reference(reference, learned, state.arl0)
         self._charts.resume(copy_of(state.charts), self._evaluated)
-        if state.bank is not None:
-            self._models.use_bank(identified=True, memory=state.bank)
         self._shift.resume(state.shift)
         self._quarantined, self.rows_watched = tuple(state.withheld), state.rows_watched
 
@@ -227,8 +224,6 @@ class Evaluation:
         self._use_ranges()
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
-        self._models.use_bank(identified=reference.is_identified)
-        reference.use_models(self._models)
         self.ordinary.start(reference)
 
     def _use_ranges(self) -> None:
@@ -243,7 +238,7 @@ class Evaluation:
 
     def stop(self) -> None:
         """Evaluate no rows."""
-        self.reference = self._suspicion = self._models.bank = None
+        self.reference = self._suspicion = None
         self.ordinary.stop()
         self._use_ranges()
         self._leave_out({})
@@ -413,9 +408,11 @@ class Evaluation:
     def _update_drift(self, row: MeasuredRow) -> list[AlarmChange]:
         if not self._drift.wanted:
             return []
-        is_beside = self.reference is None or not self.reference.is_identified
-        if is_beside and (predictions := self._models.update(row)):
-            row.publications.extend(estimates(row, self._paths_beside, predictions))
+        is_beside = self.reference is not self._models
+        if is_beside or self._models.stays_as_fitted:
+            predictions = self._models.adapt(row)
+            if is_beside and predictions:
+                row.publications.extend(estimates(row, self._paths_beside, predictions))
         return self._drift.update(row, self._models.predictors)
 
     def _set_learning(self) -> None:

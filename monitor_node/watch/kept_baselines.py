@@ -1,7 +1,7 @@
 """Baselines of one plant: the one in force, and those that operators can restore."""
 
 from monitor_node.health import NODE
-from monitor_node.learn.identified_models import IdentifiedModels
+from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.model_update import ACCEPT, RESTORE, TRAINED, ModelUpdate, ScheduledChange, check_command
 from monitor_node.learn.references import Reference
 from monitor_node.learn.training_diagnosis import read_equations
@@ -11,6 +11,7 @@ from monitor_node.watch.pipeline_state import KeptBaseline, TrainedState
 from monitor_node.watch.training_stage import TrainingStage
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.stored_state import copy_of
 
 MOST_KEPT = 3
 """Baselines that can be restored; memory stays bounded."""
@@ -33,7 +34,7 @@ class KeptBaselines:
     def __init__(
         self,
         model: ProcessModel | None,
-        models: IdentifiedModels,
+        models: ArxReference,
         training: TrainingStage,
         evaluation: Evaluation,
         update: ModelUpdate,
@@ -91,7 +92,7 @@ class KeptBaselines:
         return KeptBaseline(
             self._in_force.SerializeToString(),
             self.trained_state(reference),
-            self._models.memory,
+            copy_of(self._models.memory),
             self._evaluation.signals.memory,
         )
 
@@ -102,14 +103,12 @@ class KeptBaselines:
 
     def restore(self, kept: KeptBaseline) -> None:
         """Judge by a baseline that was replaced; its filters and charts start with the next row."""
+        self._models.resume(kept.models)
         self._models.restart()
-        self._models.resume(kept.predictors, follows=False)
         self._evaluation.signals.resume(kept.signals)
         change = Baseline.FromString(kept.change)
         equations = read_equations(change.model) if change.model else self._model
         self._evaluation.restore_baseline(kept.trained, equations)
-        if self._evaluation.reference is not None:
-            self._models.use_bank(identified=self._evaluation.reference.is_identified)
         self._evaluation.restart_charts()
 
     def stop_judging(self) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import msgspec
 
 from monitor_node.config import MonitorConfig
-from monitor_node.learn.identified_models import IdentifiedModels
+from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.watch.evaluation import Evaluation
 from monitor_node.watch.kept_baselines import KeptBaselines
 from monitor_node.watch.pipeline_state import ModesState, ModeTraining
@@ -34,7 +34,7 @@ class OperatingModes:
     def __init__(
         self,
         config: MonitorConfig,
-        models: IdentifiedModels,
+        models: ArxReference,
         training: TrainingStage,
         evaluation: Evaluation,
         baselines: KeptBaselines,
@@ -92,7 +92,7 @@ class OperatingModes:
         if state.is_judged and evaluation.reference is not None:
             state.baselines[old] = self._baselines.make(evaluation.reference)
         elif state.is_judged and training.rows.times:
-            state.trainings[old] = ModeTraining(training.rows, self._models.memory)
+            state.trainings[old] = ModeTraining(training.rows, copy_of(self._models.memory))
         evaluation.incident = None
         state.mode, state.expected = [values[name] for name in self._names], self.expected_false_alarms
         new = key_of(state.mode)
@@ -109,7 +109,8 @@ class OperatingModes:
         training.restart(began_ns)
         if begun is not None:
             training.rows = copy_of(begun.rows)
-            self._models.resume(begun.predictors, follows=False)
+            self._models.resume(begun.models)
+            self._models.restart()
         if not state.is_learned or (begun and training.is_enough()):
             return ""
         state.is_judged = False

@@ -14,7 +14,7 @@ from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.health import NODE, Failures
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import Interval, SamplingPeriod
-from monitor_node.learn.identified_models import IdentifiedModels
+from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.model_update import ModelUpdate, ScheduledChange, is_command
 from monitor_node.learn.signal_range import input_bounds
 from monitor_node.learn.training import TrainingResult
@@ -91,7 +91,7 @@ class PlantPipeline:
         self._promise_checked = False
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
-        self.models = IdentifiedModels(config, points=points)
+        self.models = ArxReference(config, points=points)
         self.evaluation = Evaluation(
             config,
             board,
@@ -118,7 +118,7 @@ class PlantPipeline:
         return PipelineState(
             copy_of(self._sampling),
             evaluation.signals.memory,
-            self.models.memory,
+            copy_of(self.models.memory),
             training.refusals,
             training.began_ns,
             self.model_update.rows or copy_of(training.rows),
@@ -144,7 +144,7 @@ class PlantPipeline:
         self._sampling = copy_of(state.sampling)
         self.operation.restore(state.operation)
         self.evaluation.signals.resume(state.signals, now_ns)
-        self.models.resume(state.predictors, follows=True)
+        self.models.resume(state.models)
         self._training.refusals, self._training.began_ns = state.refusals, state.began_ns
         self.baselines.kept = list(state.kept)
         self.model_update.changes.extend(ScheduledChange(None, Baseline.FromString(item)) for item in state.commands)
@@ -360,13 +360,15 @@ class PlantPipeline:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
         _, trained = self._training.finish_early(times=TIMES_FEWEST)
-        state, reference = self.state, copy_of(trained.reference.memory)
+        state = self.state
+        memory = None if trained.reference is self.models else copy_of(trained.reference.memory)
 
         def start(config: MonitorConfig) -> "PlantPipeline":
             pipeline = PlantPipeline(config, Annunciator(config), points=False, model=self.model)
             pipeline.restore(state, 0)
-            of_pipeline = reference.reference(pipeline.baselines.equations, config.outputs)
-            pipeline._start(trained._replace(reference=of_pipeline, checks=list(trained.checks)))
+            equations = pipeline.baselines.equations
+            reference = pipeline.models if memory is None else memory.reference(equations, config.outputs)
+            pipeline._start(trained._replace(reference=reference, checks=list(trained.checks)))
             return pipeline
 
         return start
@@ -427,7 +429,7 @@ class PlantPipeline:
             return False
         self.evaluation.leave_ordinary()
         try:
-            trained = self.model_update.relearn(change, self.models.predictors)
+            trained = self.model_update.relearn(change, self.models)
         except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
             self._failures.add("baseline", error, "the plant is judged by the equations as given")
             return False

@@ -5,10 +5,8 @@ import msgspec
 from monitor_node.causes.stage import SuspicionMemory
 from monitor_node.charts.charts import ChartsMemory
 from monitor_node.ingest.sampling import SamplingPeriod
-from monitor_node.learn.arx import ArxPredictor
-from monitor_node.learn.arx_reference import ArxRanges
+from monitor_node.learn.arx_reference import ArxMemory
 from monitor_node.learn.black_box_reference import BlackBoxMemory
-from monitor_node.learn.identified_models import RowHistory
 from monitor_node.learn.process_reference import ProcessMemory
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.operation import CarriedState
@@ -20,7 +18,7 @@ class TrainedState(StoredState, frozen=True):
     """State after the training.
 
     Attributes:
-        reference: state of the reference.
+        reference: memory of the reference; None: the identified models judge.
         checks: checks of the training: name and result of each.
         left_out: signals that are not monitored, with the reason.
         whiteners: numbers of the prewhitening filters, one an output, see `WHITENER`.
@@ -33,10 +31,9 @@ class TrainedState(StoredState, frozen=True):
         baseline: change of the model in force, a serialized `Baseline`; empty: the model is as given.
         shift: numbers of the tests for lasting steps, one an output, see `STEP_TEST`; empty without them.
         promise: the promise of false alarms.
-        bank: state of the fitted models' bank; None if there is none.
     """
 
-    reference: ProcessMemory | BlackBoxMemory | ArxRanges
+    reference: ProcessMemory | BlackBoxMemory | None
     checks: list[tuple[str, str]]
     left_out: dict[str, str]
     whiteners: bytes
@@ -49,7 +46,6 @@ class TrainedState(StoredState, frozen=True):
     baseline: bytes = b""
     shift: bytes = b""
     promise: PlantPromise | None = None
-    bank: RowHistory | None = None
 
 
 class KeptBaseline(StoredState, frozen=True):
@@ -58,13 +54,13 @@ class KeptBaseline(StoredState, frozen=True):
     Attributes:
         change: change by which it came into force, a serialized `Baseline`.
         trained: state after the training, when it was replaced.
-        predictors: identified models, one an output.
+        models: memory of the identified models.
         signals: memory of each signal check.
     """
 
     change: bytes
     trained: TrainedState
-    predictors: list[ArxPredictor]
+    models: ArxMemory
     signals: dict[str, bytes]
 
 
@@ -73,11 +69,11 @@ class ModeTraining(StoredState, frozen=True):
 
     Attributes:
         rows: rows of the training.
-        predictors: identified models, one an output.
+        models: memory of the identified models.
     """
 
     rows: TrainingRows
-    predictors: list[ArxPredictor]
+    models: ArxMemory
 
 
 class ModesState(msgspec.Struct, forbid_unknown_fields=True):
@@ -110,7 +106,7 @@ class PipelineState(StoredState, frozen=True):
     Attributes:
         sampling: state of the sampling period.
         signals: memory of each signal check.
-        predictors: identified models, one an output.
+        models: memory of the identified models.
         refusals: number of refused trainings.
         began_ns: start of the present or last training; None before its first row.
         training: rows of the training; after it while its diagnosis is pending, then empty.
@@ -125,7 +121,7 @@ class PipelineState(StoredState, frozen=True):
 
     sampling: SamplingPeriod
     signals: dict[str, bytes]
-    predictors: list[ArxPredictor]
+    models: ArxMemory
     refusals: int
     began_ns: int | None
     training: TrainingRows

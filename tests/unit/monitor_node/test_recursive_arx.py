@@ -59,7 +59,7 @@ def test_its_prediction_is_that_of_its_newest_parameters(
 
 def adapted(monitor: Monitor) -> bytes:
     """What the adaptive model has learned."""
-    return monitor.pipeline.models.memory[0].rls.memory.to_bytes()
+    return monitor.pipeline.models.predictors[0].rls.memory.to_bytes()
 
 
 def test_it_learns_nothing_while_an_alarm_is_active_and_what_it_learned_last_is_taken_back(
