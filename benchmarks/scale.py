@@ -44,11 +44,12 @@ from benchmarks.fleet.traffic import (
     record,
     route,
 )
+from monitor_node.__main__ import UNCACHED, watch
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.node import UNCACHED, FleetNode, watch
 from monitor_node.monitor_state import SEAL
+from monitor_node.node import MonitorNode
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.runtime.bus_zenoh import connect
@@ -56,7 +57,6 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
-from tests.memory_bus import Exchange, MemoryBus
 
 SIZES = (1, 10, 100, 1000, 10_000)
 FAST_SAMPLES = 600_000
@@ -96,17 +96,17 @@ def memory_bytes() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-class Counting(FleetNode):
+class Counting(MonitorNode):
     """A fleet's monitor that counts its samples and stops after the last."""
 
-    def __init__(self, config: MonitorConfig, bus: Any, stop: StopSignal) -> None:
-        super().__init__(config, FleetConfig(plants=FLEET), bus, time.time_ns())
+    def __init__(self, config: MonitorConfig, stop: StopSignal) -> None:
+        super().__init__(config, time.time_ns(), FleetConfig(plants=FLEET))
         self._stop, self.samples, self.expected = stop, 0, -1
         self.began_s = self.ended_s = 0.0
         self.known = self.before = 0
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
-        """See `FleetNode`."""
+        """See `MonitorNode`."""
         if self.samples < self.known:
             self.began_s, self.before = time.process_time(), self.samples
         publications = super().on_messages(messages, now_ns)
@@ -146,7 +146,7 @@ def monitor(endpoint: str, plants: int, expected: int, sharp: bool) -> None:
     stop = StopSignal()
     bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, uncached=UNCACHED, many_keys=True)
     assert bus is not None
-    node = Counting(SHARP if sharp else FAST, bus, stop)
+    node = Counting(SHARP if sharp else FAST, stop)
     core = 0.0 if sharp else without_bus(plants)
     taken = node.learn(plants)
     node.samples, node.expected, node.known = 0, expected, KNOWN_ROWS * SIGNALS * plants
@@ -166,7 +166,7 @@ def monitor(endpoint: str, plants: int, expected: int, sharp: bool) -> None:
 
 def without_bus(plants: int) -> float:
     """Samples a second from bytes to results."""
-    node = Counting(FAST, MemoryBus(Exchange()), StopSignal())
+    node = Counting(FAST, StopSignal())
     node.learn(plants)
     messages = record()[SIGNALS * LEARNED_ROWS :]
     fleet = [

@@ -165,12 +165,13 @@ def fit_settings(config: PlantConfig, process: Process) -> ProcessSettings:
     model = process.require_model()
     try:
         controllers, model = _controllers(config, process, model)
+        bounds = _bounds(process, model)
         return ProcessSettings(
-            _scenarios(config, process, model),
+            _scenarios(config, process, model, bounds),
             controllers,
             model,
             tuple(parse_fault(text, process.faults).with_defaults(0.0, config.duration_min) for text in config.faults),
-            _actuators(config, process, model),
+            _actuators(config, model, bounds),
             _by_signal("noise_sd", config.noise_sd, process.operation.noise_sd, model),
             _by_signal("resolution", config.resolution, resolutions(process), model),
         )
@@ -184,9 +185,10 @@ def to_model_unit(signal: Signal, model: ProcessModel) -> tuple[float, float]:
     return (1.0, 0.0) if signal.unit in ("", unit) else conversion(signal.unit, unit, f"signal {signal.name!r}")
 
 
-def _scenarios(config: PlantConfig, process: Process, model: ProcessModel) -> dict[str, Settings]:
+def _scenarios(
+    config: PlantConfig, process: Process, model: ProcessModel, bounds: Mapping[str, Bounds]
+) -> dict[str, Settings]:
     given = split_scenarios(config.scenario, model.input_names)
-    bounds = _bounds(process, model)
     found = {}
     for item in model.inputs:
         levels = process.operation.inputs.get(item.name) or InputLevels.of(item, bounds[item.name])
@@ -242,7 +244,7 @@ def _bounds(process: Process, model: ProcessModel) -> dict[str, Bounds]:
     return found
 
 
-def _actuators(config: PlantConfig, process: Process, model: ProcessModel) -> dict[str, Actuator]:
+def _actuators(config: PlantConfig, model: ProcessModel, bounds: Mapping[str, Bounds]) -> dict[str, Actuator]:
     limits = dict(config.limits)
     if config.valve_limits_l_min is not None:
         if len(model.inputs) != 1:
@@ -259,7 +261,7 @@ def _actuators(config: PlantConfig, process: Process, model: ProcessModel) -> di
             raise InputError(
                 f"limits of {name} must be in [{item.lower:g}, {item.upper:g}] {item.unit}, got {lower:g} and {upper:g}"
             )
-    return {name: Actuator(*limits.get(name, bounds)) for name, bounds in _bounds(process, model).items()}
+    return {name: Actuator(*limits.get(name, own)) for name, own in bounds.items()}
 
 
 def resolutions(process: Process) -> dict[str, float]:

@@ -12,20 +12,20 @@ While the equations cannot be integrated, the state is held and the rows are mar
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import isfinite, sqrt
 from typing import Literal
 
 import numpy as np
 
 from plant_node.config import PlantConfig, ProcessSettings, to_model_unit
-from plant_node.instruments import ControlLoop, Sensor, check_controller, check_set_point, close_loops, process_noise
+from plant_node.instruments import ControlLoop, ProcessNoise, Sensor, check_controller, check_set_point, close_loops
 from plant_node.scenario import Scenario, seed_of_input
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import TIMING
-from reactorwatch.process.fault import FaultSpecification, parse_fault
+from reactorwatch.process.fault import FaultSpecification
 from reactorwatch.process.integrate import SimulationError, Stepper
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import complete_state, start_state
@@ -37,12 +37,12 @@ MAX_FAULTS = 32
 
 @dataclass(frozen=True)
 class FaultChange:
-    """A fault that has set in, or was cleared.
+    """A fault of the plant, which sets in and may be cleared.
 
     Attributes:
         specification: the fault, with all parameters.
-        onset_min: plant time at which it set in.
-        active: whether it is in the plant now.
+        onset_min: plant time at which it sets in.
+        active: true from its onset until it is cleared.
     """
 
     specification: FaultSpecification
@@ -69,15 +69,6 @@ class Row:
     changes: tuple[FaultChange, ...]
 
 
-@dataclass(eq=False)
-class _Installed:
-    """A fault in the plant."""
-
-    specification: FaultSpecification
-    onset_min: float
-    announced: bool = False
-
-
 class Plant:
     """The simulated plant.
 
@@ -88,6 +79,8 @@ class Plant:
         scenarios: programme of each input, by name.
 
     Attributes:
+        number: index of the next row.
+        effects: effects that can be faults of the plant.
         units: units of the signals, by name, in which they are published.
         trouble: reason why the equations could not be integrated; None: they could.
 
@@ -103,7 +96,8 @@ class Plant:
         self.units = {name: signals[name].unit or unit for name, unit in model.units.items()}
         self.trouble: str | None = None
         self._scales = {name: to_model_unit(signals[name], model) for name in model.units}
-        self._effects = process.faults
+        self.effects = process.faults
+        self.number = 0
         self._config = config
         self._base = model
         self._scenarios = [scenarios[name] for name in model.input_names]
@@ -113,8 +107,15 @@ class Plant:
         self._sensors = [
             Sensor(name, settings.noise_sd[name], settings.resolution[name], config.seed) for name in model.units
         ]
-        self._process_noise = process_noise(config.process_noise_sd, model, config.period_min, config.seed)
-        self._number = 0
+        for name in config.process_noise_sd:
+            if name not in model.state_names:
+                valid = ", ".join(model.state_names)
+                raise InputError(f"process_noise_sd: {model.name} has no state {name!r} (valid: {valid})")
+        self._process_noise = [  # states of faults come after those of the process
+            (index, ProcessNoise(state, sd * sqrt(config.period_min), config.seed))
+            for index, state in enumerate(model.states)
+            if (sd := config.process_noise_sd.get(state.name, 0.0))
+        ]
         self._held: Array | None = None
         for control in settings.controllers.values():
             check_controller(control, model, settings.actuators.get(control.input))
@@ -124,19 +125,14 @@ class Plant:
             if name in settings.controllers
         }
         self._cleared: list[FaultChange] = []
-        self._installed = [_Installed(item, item.values.get("onset", 0.0)) for item in settings.faults]
+        self._installed = [FaultChange(item, item.values.get("onset", 0.0), False) for item in settings.faults]
         self._use(self._extend_model(self._installed))
         self._x = self._start()
 
     @property
-    def number(self) -> int:
-        """Index of the next row."""
-        return self._number
-
-    @property
     def time_min(self) -> float:
         """Plant time of the next row, from which on commands act."""
-        return to_minutes(to_time_ns(self._number * self._config.period_min))
+        return to_minutes(to_time_ns(self.number * self._config.period_min))
 
     @property
     def mode(self) -> Literal["open loop", "automatic", "manual"]:
@@ -154,26 +150,16 @@ class Plant:
         """Measure a row, and integrate to the next."""
         time_min, inputs = self.time_min, self._inputs(advance=True)
         self._x, self._held = self._stepper.start_row(self._x, inputs, self._p, time_min), inputs
-        row = Row(
-            number=self._number,
-            time_min=time_min,
-            readings={
-                sensor.signal: self._publish(sensor.signal, sensor.reading(float(value), self._number, beyond))
-                for sensor, value, beyond in zip(
-                    self._sensors,
-                    (*inputs, *self._true_outputs(inputs)),
-                    (*np.zeros(inputs.size).tolist(), *self._noise_beyond(inputs)),
-                    strict=True,
-                )
-            },
-            good=self.trouble is None,
-            changes=self._changes(time_min),
-        )
-        self._number += 1
+        sensors = zip(self._sensors, inputs, strict=False)  # those of the inputs come first
+        read = {sensor.signal: sensor.reading(float(value), self.number) for sensor, value in sensors}
+        read |= self._read_outputs(inputs, self._outputs)
+        readings = {signal: self._publish(signal, value) for signal, value in read.items()}
+        row = Row(self.number, time_min, readings, self.trouble is None, self._changes(time_min))
+        self.number += 1
         try:
             self._x = self._stepper.advance(self._x, inputs, self._p, time_min, self.time_min)
             for index, noise in self._process_noise:
-                self._x[index] = noise.add_to(float(self._x[index]), self._number)
+                self._x[index] = noise.add_to(float(self._x[index]), self.number)
             self.trouble = None
         except SimulationError as error:
             self.trouble = str(error)
@@ -211,14 +197,6 @@ class Plant:
         else:
             self._manual[signal] = level
 
-    def parse_fault(self, text: str) -> FaultSpecification:
-        """Read a fault specification with the effects of the process.
-
-        Raises:
-            InputError: a part of it is invalid.
-        """
-        return parse_fault(text, self._effects)
-
     def inject(self, specification: FaultSpecification) -> FaultSpecification:
         """Inject a fault.
 
@@ -241,7 +219,7 @@ class Plant:
             )
         if len(self._installed) >= MAX_FAULTS:
             raise InputError(f"there are {MAX_FAULTS} faults in the plant, which is the most; clear one")
-        self._install([*self._installed, _Installed(fault, onset_min)])
+        self._install([*self._installed, FaultChange(fault, onset_min, False)])
         return fault
 
     def clear(self, cause: str) -> tuple[FaultSpecification, ...]:
@@ -257,35 +235,38 @@ class Plant:
         if not cleared:
             there = sorted({item.specification.effect.name for item in self._installed})
             raise InputError(f"no fault {cause!r} is in the plant (there is: {', '.join(there) or 'none'})")
-        self._install([item for item in self._installed if item not in cleared])
-        self._cleared += [FaultChange(item.specification, item.onset_min, False) for item in cleared if item.announced]
+        self._install([item for item in self._installed if item.specification.effect.name != cause])
+        self._cleared += [replace(item, active=False) for item in cleared if item.active]
         return tuple(item.specification for item in cleared)
 
     def _inputs(self, *, advance: bool = False) -> Array:
         """Inputs of the next row, limited by their actuators; `advance` takes the control loops to the row after it."""
-        measured, commands = self._measured_outputs(), list[float]()
+        # Controllers act on outputs that do not depend on this row's inputs, which are not known yet.
+        measured = self._read_outputs(self._base_inputs(), self._controller_outputs) if self._loops else {}
+        commands: list[float] = []
         for index, name in enumerate(self._base.input_names):
             loop = self._loops.get(name)
             if loop is None:
                 commands.append(self._actuators[name].limit(self._manual.get(name, self._level(index))))
                 continue
-            now = measured[loop.controller.output], self.time_min, self._dither(index)
-            commands.append(loop.command(*now))
+            reading, dither = measured[loop.controller.output], self._dither(index)
+            command, after = loop.step(reading, self.time_min, dither, self._config.period_min)
+            commands.append(command)
             if advance:
-                self._loops[name] = loop.advance(*now, self._config.period_min)
+                self._loops[name] = after
         return np.array(commands)
 
-    def _measured_outputs(self) -> dict[str, float]:
-        """Readings of the next row on which controllers act, by output; empty without controllers."""
-        if not self._loops:
-            return {}
-        # The controlled outputs do not depend on this row's inputs, which are not known yet.
-        outputs = self._true_outputs(self._base_inputs(), self._controller_outputs)
-        sensors = self._sensors[len(self._base.inputs) :]
-        return {
-            sensor.signal: sensor.reading(float(value), self._number, beyond)
-            for sensor, value, beyond in zip(sensors, outputs, self._noise_beyond(self._base_inputs()), strict=True)
-        }
+    def _read_outputs(self, inputs: Array, function: ArrayFunction) -> dict[str, float]:
+        """Readings of the next row by output, at these inputs."""
+        x, u, p, now, middle = function.arguments
+        x[0], u[0], now[0], middle[0] = self._x, inputs, self.time_min, self.time_min
+        p[0] = self._p[: p.size]  # the parameters of timing faults come last
+        function()
+        beyond = [0.0] * len(self._base.outputs)  # variances of the noise beyond the sensors' own
+        if self._noise is not None:
+            beyond = np.array(self._noise(inputs, self._p, self.time_min)).ravel().tolist()
+        outputs = zip(self._sensors[len(inputs) :], function.results[1][0], beyond, strict=True)
+        return {sensor.signal: sensor.reading(float(value), self.number, more) for sensor, value, more in outputs}
 
     def _base_inputs(self) -> Array:
         """Inputs without feedback: base and dither of controlled ones, levels of the others."""
@@ -320,32 +301,16 @@ class Plant:
             self._loops[name] = replace(self._loops[name], integral=value)
         return state[: len(model.states)]
 
-    def _true_outputs(self, inputs: Array, function: ArrayFunction | None = None) -> Array:
-        function = function or self._outputs
-        x, u, p, now, middle = function.arguments
-        x[0], u[0], now[0], middle[0] = self._x, inputs, self.time_min, self.time_min
-        p[0] = self._p[: p.size]  # the parameters of timing faults come last
-        function()
-        outputs: Array = function.results[1][0]
-        return outputs
-
-    def _noise_beyond(self, inputs: Array) -> list[float]:
-        """Variances of the noise of the outputs' sensors beyond their own."""
-        if self._noise is None:
-            return [0.0] * len(self._base.outputs)
-        variances: list[float] = np.array(self._noise(inputs, self._p, self.time_min)).ravel().tolist()
-        return variances
-
     def _changes(self, time_min: float) -> tuple[FaultChange, ...]:
         """Fault changes up to now that were not reported yet."""
         changes, self._cleared = self._cleared, []
-        for item in self._installed:
-            if not item.announced and item.onset_min <= time_min:
-                item.announced = True
-                changes.append(FaultChange(item.specification, item.onset_min, True))
+        for index, item in enumerate(self._installed):
+            if not item.active and item.onset_min <= time_min:
+                self._installed[index] = replace(item, active=True)
+                changes.append(self._installed[index])
         return tuple(changes)
 
-    def _install(self, faults: list[_Installed]) -> None:
+    def _install(self, faults: list[FaultChange]) -> None:
         """Continue from the present state with these faults; nothing changes if they are invalid."""
         model = self._extend_model(faults)
         held = self._inputs() if self._held is None else self._held
@@ -353,15 +318,14 @@ class Plant:
         self._installed = faults
         self._use(model)
 
-    def _physical(self, faults: list[_Installed]) -> list[_Installed]:
+    def _physical(self, faults: list[FaultChange]) -> list[FaultChange]:
         """Faults of the plant, without those of the timestamps, which a controller does not see."""
         return [fault for fault in faults if fault.specification.effect.location != TIMING]
 
-    def _extend_model(self, faults: list[_Installed]) -> ProcessModel:
+    def _extend_model(self, faults: list[FaultChange]) -> ProcessModel:
         """The model with these faults; the physical ones come first, as timing faults shift their times."""
         model = self._base
-        physical = self._physical(faults)
-        for fault in (*physical, *(fault for fault in faults if fault not in physical)):
+        for fault in sorted(faults, key=lambda item: item.specification.effect.location == TIMING):
             try:
                 model = fault.specification.extend(model)
             except ValueError as error:

@@ -4,7 +4,6 @@ The random number of row k is a function of (seed, stream, k), drawn in blocks w
 neither on the first row of a run nor on any other stream: without noise in C, that in T is the same to the last bit.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import hypot, isfinite, sqrt
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.process.controller import Controller
-from reactorwatch.process.model import ProcessModel, variable
+from reactorwatch.process.model import ProcessModel, Variable, variable
 
 BLOCK = 1024  # rows
 
@@ -90,51 +89,20 @@ class ProcessNoise:
     """Process noise of one state.
 
     Attributes:
-        state: name of the state.
-        sd: noise level, in the state's unit per square root of a minute.
-        period_min: sampling period.
-        lower: lower bound of the state; the noise does not move it beyond.
-        upper: upper bound of the state.
+        state: the state; the noise does not move it beyond its bounds.
+        sd: standard deviation of the noise of a row, in the state's unit.
         seed: seed of the noise.
     """
 
-    state: str
+    state: Variable
     sd: float
-    period_min: float
-    lower: float
-    upper: float
     seed: int
 
     def add_to(self, value: float, row: int) -> float:
         """Add the noise of a row to the integrated value of the state."""
-        increment = self.sd * sqrt(self.period_min) * standard_normal(self.seed, f"process {self.state}", row)
+        state, increment = self.state, self.sd * standard_normal(self.seed, f"process {self.state.name}", row)
         # A state that the equations took beyond its bounds is not pulled back: that would not be noise.
-        return min(max(value + increment, min(self.lower, value)), max(self.upper, value))
-
-
-def process_noise(
-    sd: Mapping[str, float], model: ProcessModel, period_min: float, seed: int
-) -> list[tuple[int, ProcessNoise]]:
-    """Make the process noise of each state with a level above 0, with the index of the state.
-
-    Args:
-        sd: noise levels by name of the state; see `ProcessNoise`.
-        model: the process; states of faults come after its own.
-        period_min: sampling period.
-        seed: seed of the noise.
-
-    Raises:
-        InputError: an unknown state.
-    """
-    names = model.state_names
-    for name in sd:
-        if name not in names:
-            raise InputError(f"process_noise_sd: {model.name} has no state {name!r} (valid: {', '.join(names)})")
-    return [
-        (index, ProcessNoise(state.name, sd[state.name], period_min, state.lower, state.upper, seed))
-        for index, state in enumerate(model.states)
-        if sd.get(state.name, 0.0)
-    ]
+        return min(max(value + increment, min(state.lower, value)), max(state.upper, value))
 
 
 @dataclass(frozen=True)
@@ -153,32 +121,26 @@ class ControlLoop:
     integral: float = 0.0
     manual: float | None = None
 
-    def command(self, measured: float, time_min: float, dither: float) -> float:
-        """Command of a row, limited to the actuator's range, from the output measured in it."""
-        if self.manual is not None:
-            return self.manual
-        return self.actuator.limit(self._raw_command(measured, time_min, dither))
+    def step(self, measured: float, time_min: float, dither: float, period_min: float) -> tuple[float, "ControlLoop"]:
+        """Command of a row from the output measured in it, within the actuator's range, and the loop at the next row.
 
-    def advance(self, measured: float, time_min: float, dither: float, period_min: float) -> "ControlLoop":
-        """The loop at the next row; the integral part rests where the command is at its limit."""
-        control = self.controller
-        if self.manual is not None or not control.is_integral:
-            return self
+        The integral part rests where the command is at its limit.
+        """
+        if self.manual is not None:
+            return self.manual, self
+        control, actuator = self.controller, self.actuator
         deviation = measured - control.set_point_at(time_min)
+        raw = control.base + dither + control.gain * deviation + self.integral
+        if not control.is_integral:
+            return actuator.limit(raw), self
         change = control.gain * deviation * period_min / control.integral_time_min
-        raw = self._raw_command(measured, time_min, dither)
-        actuator = self.actuator
         if (change > 0 and raw >= actuator.upper) or (change < 0 and raw <= actuator.lower):
-            return self
-        return replace(self, integral=self.integral + change)
+            return actuator.limit(raw), self
+        return actuator.limit(raw), replace(self, integral=self.integral + change)
 
     def with_set_point(self, value: float) -> "ControlLoop":
         """The loop on automatic with another set point, constant from then on."""
         return replace(self, controller=with_changes(self.controller, set_point=value), manual=None)
-
-    def _raw_command(self, measured: float, time_min: float, dither: float) -> float:
-        control = self.controller
-        return control.base + dither + control.gain * (measured - control.set_point_at(time_min)) + self.integral
 
 
 def check_controller(control: Controller, model: ProcessModel, actuator: Actuator | None) -> None:

@@ -24,6 +24,7 @@ from reactorwatch.contract.messages_pb2 import (
     SetInput,
 )
 from reactorwatch.errors import InputError
+from reactorwatch.process.fault import parse_fault
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.version import version
 
@@ -87,11 +88,10 @@ class PlantNode:
             self._lag_ns = 0 if isinf(self._config.speed) else now_ns - due_ns
             publications += self._publications(self._plant.next_row())
         self._log_problems(now_ns)
+        self._published += len(publications)
         if now_ns >= self._health_due_ns:
             self._health_due_ns = now_ns + round(self._config.health_period_s * 1e9)
-            self._published += len(publications) + 1
-            return [*publications, self._health(now_ns, "holding" if self._plant.trouble else "running")]
-        self._published += len(publications)
+            publications.append(self._health(now_ns, "holding" if self._plant.trouble else "running"))
         return publications
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
@@ -103,18 +103,14 @@ class PlantNode:
         self._received += 1
         try:
             text = self._execute(question)
-        except InputError as error:
-            self._refused["command"] += 1
-            return CommandReply(accepted=False, text=str(error)), []
-        except DecodeError as error:
-            self._refused[error.reason] += 1
+        except (InputError, DecodeError) as error:
+            self._refused[error.reason if isinstance(error, DecodeError) else "command"] += 1
             return CommandReply(accepted=False, text=str(error)), []
         self._log(text)
         return CommandReply(accepted=True, text=text), []
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish the last health message."""
-        self._published += 1
         return [self._health(now_ns, "stopped")]
 
     def _row_due_ns(self, started_ns: int) -> int:
@@ -129,7 +125,8 @@ class PlantNode:
                 text = f"{command.signal} = {command.value:g} {self._plant.units[command.signal]} {when}"
                 return text if self._plant.mode == "open loop" else f"{text}, on {self._plant.mode}"
             case InjectFault():
-                return f"fault {self._plant.inject(self._plant.parse_fault(command.specification))} is in the plant"
+                fault = parse_fault(command.specification, self._plant.effects)
+                return f"fault {self._plant.inject(fault)} is in the plant"
             case ClearFault():
                 cleared = ", ".join(str(item) for item in self._plant.clear(command.cause))
                 return f"fault {cleared} is taken away {when}"
@@ -140,27 +137,25 @@ class PlantNode:
         quality = Quality.QUALITY_GOOD if row.good else Quality.QUALITY_BAD
         publications = [self._fault(change, time_ns) for change in row.changes]
         for signal, value in row.readings.items():
-            sample = Sample(
-                time_ns=time_ns, sequence=row.number, value=value, unit=self._plant.units[signal], quality=quality
-            )
+            unit = self._plant.units[signal]
+            sample = Sample(time_ns=time_ns, sequence=row.number, value=value, unit=unit, quality=quality)
             publications.append(Publication(keys.key(self._config.name, keys.SAMPLE, signal), sample))
         return publications
 
     def _fault(self, change: FaultChange, time_ns: int) -> Publication:
         cause = change.specification.effect.name
         self._log(f"fault {change.specification} {'sets in' if change.active else 'is gone'}")
-        return Publication(
-            keys.key(self._config.name, keys.FAULT, cause),
-            Fault(
-                time_ns=time_ns,
-                cause=cause,
-                specification=str(change.specification),
-                active=change.active,
-                onset_ns=self._time_ns(change.onset_min),
-            ),
+        fault = Fault(
+            time_ns=time_ns,
+            cause=cause,
+            specification=str(change.specification),
+            active=change.active,
+            onset_ns=self._time_ns(change.onset_min),
         )
+        return Publication(keys.key(self._config.name, keys.FAULT, cause), fault)
 
     def _health(self, now_ns: int, phase: str) -> Publication:
+        self._published += 1
         started_ns = now_ns if self._started_ns is None else self._started_ns
         health = Health(
             time_ns=now_ns,

@@ -56,11 +56,6 @@ class _Between(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """See `Scenario`."""
         return 0.5 * (self.low + self.high)
 
-    @property
-    def extremes(self) -> Mapping[str, float]:
-        """Lowest and highest level, by name of what sets them."""
-        return {"low": self.low, "high": self.high}
-
 
 class RandomSteps(_Between, frozen=True, forbid_unknown_fields=True):
     """A new level, uniformly distributed, at regular times.
@@ -108,12 +103,6 @@ class Sines(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for period in self.periods_min:
             _check_positive("periods_min", period)
 
-    @property
-    def extremes(self) -> Mapping[str, float]:
-        """Lowest and highest level, by name of what sets them."""
-        swing = sum(abs(amplitude) for amplitude in self.amplitudes)
-        return {"mean - amplitudes": self.mean - swing, "mean + amplitudes": self.mean + swing}
-
     def level(self, time_min: float, seed: int) -> float:
         """See `Scenario`."""
         phases = self.phases or (0.0,) * len(self.amplitudes)
@@ -158,11 +147,6 @@ class Constant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def mean(self) -> float:
         """See `Scenario`."""
         return self.value
-
-    @property
-    def extremes(self) -> Mapping[str, float]:
-        """The level, by name of what sets it."""
-        return {"level": self.value}
 
     def level(self, time_min: float, seed: int) -> float:
         """See `Scenario`."""
@@ -229,7 +213,7 @@ class HeldRecord:
 
 Settings: TypeAlias = RandomSteps | Sines | Square | Constant | FromFile
 
-SCENARIOS: tuple[type[Settings], ...] = (RandomSteps, Sines, Square, Constant, FromFile)
+KINDS: dict[str, type[Settings]] = {item.kind: item for item in (RandomSteps, Sines, Square, Constant, FromFile)}
 
 
 def split_scenarios(setting: str | Mapping[str, Any], inputs: Sequence[str]) -> dict[str, str | Mapping[str, Any]]:
@@ -260,24 +244,23 @@ def scenario_settings(setting: str | Mapping[str, Any], levels: InputLevels) -> 
     Raises:
         InputError: an unknown kind or key, or a value that breaks a rule.
     """
-    kinds = {item.kind: item for item in SCENARIOS}
     if isinstance(setting, str):
-        is_file = "." in setting and setting not in kinds
+        is_file = "." in setting and setting not in KINDS
         setting = {"kind": FromFile.kind, "path": setting} if is_file else {"kind": setting}
     if "kind" not in setting:
-        raise InputError(f"scenario must have a 'kind' (valid: {', '.join(kinds)}), got {dict(setting)}")
+        raise InputError(f"scenario must have a 'kind' (valid: {', '.join(KINDS)}), got {dict(setting)}")
     kind = setting["kind"]
     values = {OLD_KEYS.get(key, key): value for key, value in setting.items() if key != "kind"}
-    if kind not in kinds:
-        raise InputError(f"scenario: {describe_unknown('kind', str(kind), kinds)}")
-    fields = tuple(field.encode_name for field in msgspec.structs.fields(kinds[kind]))
+    if kind not in KINDS:
+        raise InputError(f"scenario: {describe_unknown('kind', str(kind), KINDS)}")
+    fields = tuple(field.encode_name for field in msgspec.structs.fields(KINDS[kind]))
     for key in values:
         if key not in fields:
             raise InputError(f"scenario {kind}: {describe_unknown('key', key, fields)}")
     if kind == FromFile.kind and "path" not in values:
         raise InputError("scenario file: 'path' must say which record drives the plant")
     try:
-        settings: Settings = msgspec.convert({**levels.defaults(kind), **values}, kinds[kind])
+        settings: Settings = msgspec.convert({**levels.defaults(kind), **values}, KINDS[kind])
     except msgspec.ValidationError as error:
         raise InputError(f"scenario {kind}: {error}") from error
     return settings
@@ -289,9 +272,16 @@ def check_levels(settings: Settings, item: Variable) -> None:
     Raises:
         InputError: they are not.
     """
-    if isinstance(settings, FromFile):
-        return
-    for name, level in settings.extremes.items():
+    extremes: dict[str, float] = {}
+    match settings:
+        case RandomSteps() | Square():
+            extremes = {"low": settings.low, "high": settings.high}
+        case Sines():
+            swing = sum(abs(amplitude) for amplitude in settings.amplitudes)
+            extremes = {"mean - amplitudes": settings.mean - swing, "mean + amplitudes": settings.mean + swing}
+        case Constant():
+            extremes = {"level": settings.value}
+    for name, level in extremes.items():
         if not item.lower <= level <= item.upper:
             raise InputError(
                 f"scenario {settings.kind}: {name} must be in [{item.lower:g}, {item.upper:g}] {item.unit}, "

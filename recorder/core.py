@@ -26,7 +26,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from reactorwatch.version import version
 from recorder import RecordedMessage
-from recorder.columns.samples import SequenceCounter
+from recorder.columns.samples import SequenceCounter, content_of
 from recorder.keep import Channel
 
 log = structlog.get_logger()
@@ -132,11 +132,12 @@ class Recorder:
         """
         key, payload, encoding, received_ns = message
         self._received += 1
-        if self._fingerprints and self._is_recorded(key, payload, now_ns):
-            return None
         received_ns = received_ns or now_ns
         if now_ns - received_ns > self._longest_lag_ns:
             self._longest_lag_ns = now_ns - received_ns
+        if self._fingerprints and self._is_recorded(key, payload, now_ns):
+            self._count_recorded(message)
+            return None
         if received_ns < self._last_ns:
             received_ns = self._last_ns
         self._last_ns = received_ns
@@ -155,9 +156,7 @@ class Recorder:
             if time_ns >= 0 and decoded.quality == _NO_SAMPLE:
                 self._refused["payload"] += 1
             elif time_ns >= 0 and channel.is_product:
-                counter = self._counters.pop(key, None) or self._new_counter()
-                self._counters[key] = counter  # the most recently used one is last
-                counter.update(sequence, time_ns)
+                self._counter(key).update(sequence, time_ns)
         else:
             time_ns = getattr(decoded, "time_ns", received_ns)
         if time_ns < 0:  # before 1970, which MCAP cannot represent
@@ -165,6 +164,22 @@ class Recorder:
             time_ns = received_ns
         recorded = _new(RecordedMessage, (key, payload, encoding, received_ns, time_ns, False))
         return _new(ReceivedMessage, (recorded, decoded, channel, sequence))
+
+    def _count_recorded(self, message: Encoded) -> None:
+        """Count a sample that an earlier file holds, so that those around it in this file do not count as lost."""
+        sample = content_of(message)
+        if not isinstance(sample, messages.Sample) or sample.quality == _NO_SAMPLE or sample.time_ns < 0:
+            return
+        if channel_of(message.key, message.encoding, True).is_product:
+            self._counter(message.key).update(sample.sequence, sample.time_ns)
+
+    def _counter(self, key: str) -> SequenceCounter:
+        """Counter of a key, which becomes the most recently used one."""
+        counter = self._counters.pop(key, None)
+        if counter is None:
+            counter = self._new_counter()
+        self._counters[key] = counter
+        return counter
 
     def _new_counter(self) -> SequenceCounter:
         """Counter of a new key, for which the least recently used one is evicted if there are too many."""

@@ -1,4 +1,4 @@
-"""What runs in a thread while a test talks to it."""
+"""Run a function in a thread while a test talks to it."""
 
 import subprocess
 import threading

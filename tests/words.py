@@ -56,6 +56,12 @@ FRAGMENT = re.compile(
 PEOPLE = re.compile(
     r"\b(he|him|his|she|who|whom|whoever|nobody|ours|strangers?|vouch(?:es|ed)?|told|anew|likewise)\b", re.IGNORECASE
 )
+PERSONAL_NAME = re.compile(
+    r"(?:^|_)(?:anew|anybody|everybody|felt|goes_on|he|hears?|heard|him|his|likewise|nobody|ours|said|says?|somebody"
+    r"|strangers?|tells?|told|who|whoever|whom)(?=_|$)",
+    re.IGNORECASE,
+)
+"""Names in the tests state their claim in the field's words: a node publishes and receives, an error is reported."""
 
 EXCEPTIONS = {
     "reactorwatch/api/diagnosis.py::DiagnosisResult.extended: participle": "a public name",
@@ -119,6 +125,24 @@ def entries() -> set[str]:
         for file in files
         for violation in violations(file.read_text(encoding="utf-8"))
     }
+
+
+def entries_of_tests() -> list[str]:
+    """`path::name: rule` of the names and first lines in the tests that break a rule."""
+    return [
+        f"{file.relative_to(ROOT).as_posix()}::{violation}"
+        for file in sorted((ROOT / "tests").rglob("*.py"))
+        for violation in violations_of_test(file.read_text(encoding="utf-8"))
+    ]
+
+
+def violations_of_test(source: str) -> list[str]:
+    """`name: rule` of the names and the first line of a module of the tests."""
+    tree = ast.parse(source)
+    first_line = (ast.get_docstring(tree) or "").partition("\n")[0]
+    broken = ["module: head"] if HEAD.match(first_line) or PEOPLE.search(first_line) else []
+    names = (name for name, node in _definitions(tree) if isinstance(node, _Definition))
+    return broken + [f"{name}: people" for name in names if PERSONAL_NAME.search(name.rpartition(".")[2])]
 
 
 def baseline() -> set[str]:

@@ -22,7 +22,6 @@ from reactorwatch.identification.black_box.filter import BlackBoxFilter
 from reactorwatch.identification.black_box.fit import fit_black_box
 from reactorwatch.runtime.event_loop import StopSignal
 from recorder.tools.player import samples_of
-from tests.memory_bus import Exchange, MemoryBus
 
 ROWS, PLANTS = 20_000, 1000
 OUTPUTS, TRAINING, WATCHED = 8, 1000, 4000
@@ -53,7 +52,7 @@ def backtest_rows() -> tuple[float, float]:
 def plant_kB() -> float:  # noqa: N802 # kB is the unit
     """Memory of a plant in its normal state, by that of a fleet."""
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
-    return Counting(FAST, MemoryBus(Exchange()), StopSignal()).learn(PLANTS) / 1000.0
+    return Counting(FAST, StopSignal()).learn(PLANTS) / 1000.0
 
 
 def black_box_row() -> tuple[float, float]:

@@ -123,3 +123,7 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Settings of a plant's monitor with its share of the false alarms, or its own number where that is smaller."""
         shares = [item for item in (self.share_per_30_days, config.false_alarms_per_30_days) if item is not None]
         return msgspec.structs.replace(config, false_alarms_per_30_days=min(shares, default=None))
+
+
+ONE_PLANT = FleetConfig()
+"""Settings where there is no fleet: the one plant of the monitor's settings is watched."""

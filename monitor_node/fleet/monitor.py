@@ -6,7 +6,7 @@ monitor's shard. Its publications are the same, value for value, as if it were m
 Nothing here reads a clock or does I/O.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from heapq import heappop, heappush
 from itertools import chain
@@ -171,6 +171,7 @@ class FleetMonitor:
         start_ns: present time.
         shard: own shard of the plants.
         points: see `Monitor`.
+        passes: exceptions that end the monitor, see `Failures`; by default all of them concern one plant alone.
         on_watch: called with a plant and True when its monitor is added, with False when it is removed.
         diagnose: called with a plant and the diagnosis of its training; the result is passed to `on_finding`.
 
@@ -188,13 +189,14 @@ class FleetMonitor:
         shard: Shard = WHOLE,
         *,
         points: bool = False,
+        passes: type[Exception] | tuple[()] = (),
         on_watch: Callable[[str, bool], None] = lambda _plant, _watched: None,
         diagnose: Callable[[str, DiagnosisJob], None] = lambda _plant, _job: None,
     ) -> None:
         for kind in kinds:  # inconsistent settings are refused here
             Monitor(kind.config, start_ns, points=points, model=kind.model)
         self._kinds, self._named = kinds, {kind.pattern: kind for kind in reversed(kinds)}
-        self._shard, self._points = shard, points
+        self._shard, self._points, self._passes = shard, points, passes
         self._on_watch, self._diagnose = on_watch, diagnose
         self._register = PlantRegister()
         self._monitors: dict[str, Monitor] = {}
@@ -252,7 +254,7 @@ class FleetMonitor:
         kind = self._named.get(plant) or next(item for item in self._kinds if fnmatchcase(plant, item.pattern))
         config = msgspec.structs.replace(kind.config, plant=plant)
         monitor = self._monitors[plant] = Monitor(config, now_ns, points=self._points, model=kind.model)
-        monitor.failures.passes = ()
+        monitor.failures.passes = self._passes
         if restore is not None:
             restore(monitor)
         for signal in (*config.signals, *config.carried_signals):
@@ -362,18 +364,3 @@ class FleetMonitor:
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish the health of all plants' monitors for the last time."""
         return [item for monitor in self._monitors.values() for item in monitor.on_stop(now_ns)]
-
-    def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
-        """Notes to log: plant and line."""
-        for plant, monitor in self._monitors.items():
-            rejected = monitor.rejects.report(now_ns)
-            if rejected is not None:
-                yield plant, rejected
-            while monitor.notes:
-                yield plant, monitor.notes.pop(0)
-
-    def tracebacks(self) -> Iterator[tuple[str, str]]:
-        """Plant and traceback of each contained error that was reported."""
-        for plant, monitor in self._monitors.items():
-            while monitor.failures.tracebacks:
-                yield plant, monitor.failures.tracebacks.pop(0)

@@ -144,7 +144,7 @@ class StateFile:
     """
 
     def __init__(self, path: Path, monitor: Monitor, every_s: float) -> None:
-        self._path, self._monitor, self._every_ns = path, monitor, int(every_s * 1e9)
+        self._path, self.monitor, self._every_ns = path, monitor, int(every_s * 1e9)
         self.claim = Claim(path.with_name(f".{path.name}{CLAIM}"), f"state_file {path}")
         self._changes_stored: int | None = None
         self._received_stored: int | None = None
@@ -165,7 +165,7 @@ class StateFile:
     def _load(self) -> str:
         try:
             asides = find_kept_aside(self._path.parent).get(self._path.name, [])
-            restored = restore(self._path, self._monitor, asides)
+            restored = restore(self._path, self.monitor, asides)
         except ForeignFileError as error:
             raise InputError(f"state_file {self._path}: {error}; it is left as it is: name another file") from error
         except InputError as error:
@@ -183,16 +183,16 @@ class StateFile:
 
     def due_ns(self) -> int | None:
         """Time of the next storage; None: nothing has changed."""
-        return None if self._monitor.memory.received == self._received_stored else self._due_ns
+        return None if self.monitor.memory.received == self._received_stored else self._due_ns
 
     def is_due(self, now_ns: int) -> bool:
         """True if an alarm or the baseline has changed, or messages were received and the interval is over."""
         if self._due_ns is None or now_ns < self._due_ns - self._every_ns:  # the first time, or the clock was set back
             self._due_ns = now_ns + self._every_ns
-        if self._monitor.changes == self._changes_stored and now_ns < self._due_ns:
+        if self.monitor.changes == self._changes_stored and now_ns < self._due_ns:
             return False
         self._due_ns = now_ns + self._every_ns
-        return self._monitor.changes != self._changes_stored or self._monitor.memory.received != self._received_stored
+        return self.monitor.changes != self._changes_stored or self.monitor.memory.received != self._received_stored
 
     def store(self) -> None:
         """Write the present state.
@@ -200,18 +200,18 @@ class StateFile:
         Raises:
             InputError: the file cannot be written; it is unchanged. The next try is after the interval.
         """
-        self._changes_stored, self._received_stored = self._monitor.changes, None
+        self._changes_stored, self._received_stored = self.monitor.changes, None
         self._write()
-        self._received_stored = self._monitor.memory.received
+        self._received_stored = self.monitor.memory.received
 
     def _write(self) -> None:
         try:
-            write_durably(self._path, self._monitor.to_bytes(), self.claim.check)
+            write_durably(self._path, self.monitor.to_bytes(), self.claim.check)
         except InputError:
-            self._monitor.stats.not_stored += 1
+            self.monitor.stats.not_stored += 1
             raise
         except OSError as error:
-            self._monitor.stats.not_stored += 1
+            self.monitor.stats.not_stored += 1
             raise InputError(f"state_file {self._path}: cannot be written: {error.strerror}") from error
 
 

@@ -106,7 +106,6 @@ def monitor(
     from monitor_node.__main__ import run
     from monitor_node.config import MonitorConfig
     from monitor_node.fleet.config import FleetConfig
-    from monitor_node.fleet.node import run as run_fleet
     from reactorwatch.cli.supervise import diagnosis_settings, run_diagnosis_node
     from reactorwatch.records.output import check_folder_name
     from reactorwatch.runtime.config import LogConfig, section
@@ -132,11 +131,11 @@ def monitor(
     if state is not None:
         check_folder_name(state, "--state")
     if fleet.plants is not None:
-        run_fleet(config_of_monitor, fleet, bus, _metrics(tables))
+        run(config_of_monitor, bus, _metrics(tables), fleet)
         return
     diagnosis = diagnosis_settings(tables, config_of_monitor, diagnose)
     with run_diagnosis_node(diagnosis, bus, section(LogConfig, "log", tables, {})) if diagnosis.out else nullcontext():
-        run(config_of_monitor, bus, _metrics(tables), **({"state": state} if state is not None else {}))
+        run(config_of_monitor, bus, _metrics(tables), state=state)
 
 
 def record(

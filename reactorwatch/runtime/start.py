@@ -104,8 +104,12 @@ def claim_name(bus: Bus, node: str, token: str, stop: StopSignal) -> bool:
     return False
 
 
-def wait_ready(attempt: Callable[[], Result], bus: Bus, node: str, plant: str, stop: StopSignal) -> Result | None:
+def wait_ready(
+    attempt: Callable[[], Result], bus: Bus, node: str, plant: str | None, stop: StopSignal
+) -> Result | None:
     """Call a function of a node's start until the machine lets it succeed; the log and health say what is waited for.
+
+    A node of no single plant, so with None, publishes no health.
 
     Returns:
         Its result; None if a stop was requested first.
@@ -114,6 +118,8 @@ def wait_ready(attempt: Callable[[], Result], bus: Bus, node: str, plant: str, s
     def on_failure(reason: str, is_new: bool) -> None:
         if is_new:
             log.warning("waiting", node=node, why=reason)
+        if plant is None:
+            return
         health = Health(time_ns=time.time_ns(), node=node, version=__version__, phase=keys.BLOCKED, waiting_for=reason)
         bus.publish(encode(Publication(keys.key(plant, keys.HEALTH, node), health)))
 

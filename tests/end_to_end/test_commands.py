@@ -1,4 +1,4 @@
-"""The command as people and scripts meet it: help, one line for what is wrong, a clean end when asked to stop."""
+"""The command line for users and scripts: help, one line for an error, a clean end on interrupt."""
 
 import json
 import signal
@@ -113,20 +113,20 @@ def record_csv(tmp_path: Path) -> Path:
         (["monitor", "--model", "BAD.json"], "process file BAD.json: is not JSON"),
     ],
 )
-def test_what_is_wrong_is_told_in_one_line_and_nothing_is_written(
+def test_an_error_is_reported_in_one_line_and_nothing_is_written(
     called: Command, tmp_path: Path, record_csv: Path, arguments: list[str], expected: str
 ) -> None:
-    check_told_in_one_line(called, tmp_path, record_csv, arguments, expected)
+    check_one_line_error(called, tmp_path, record_csv, arguments, expected)
 
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [(["identify", "RECORD"], "rows"), (["diagnose", "RECORD", "-o", "out"], "needs at least 200 rows, got 3")],
 )
-def test_a_record_that_holds_too_little_is_told_in_one_line_and_nothing_is_written(
+def test_a_record_that_holds_too_little_is_reported_in_one_line_and_nothing_is_written(
     called: Command, tmp_path: Path, record_csv: Path, arguments: list[str], expected: str
 ) -> None:
-    check_told_in_one_line(called, tmp_path, record_csv, arguments, expected, code=3)
+    check_one_line_error(called, tmp_path, record_csv, arguments, expected, code=3)
 
 
 @pytest.mark.parametrize(
@@ -137,13 +137,13 @@ def test_a_record_that_holds_too_little_is_told_in_one_line_and_nothing_is_writt
     ],
     ids=["before a command is known", "of a node"],
 )
-def test_a_process_of_its_own_tells_the_same(
+def test_a_process_of_its_own_reports_the_same_error(
     command: Command, tmp_path: Path, record_csv: Path, arguments: list[str], expected: str
 ) -> None:
-    check_told_in_one_line(command, tmp_path, record_csv, arguments, expected)
+    check_one_line_error(command, tmp_path, record_csv, arguments, expected)
 
 
-def check_told_in_one_line(
+def check_one_line_error(
     command: Command, tmp_path: Path, record_csv: Path, arguments: list[str], expected: str, code: int = 2
 ) -> None:
     (tmp_path / "BAD.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,x,440\n")
@@ -163,7 +163,7 @@ def check_told_in_one_line(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_node_without_a_router_waits_says_so_and_can_be_stopped(endpoint: str, start: Start) -> None:
+def test_a_node_without_a_router_waits_reports_it_and_can_be_stopped(endpoint: str, start: Start) -> None:
     process = start("monitor", "--endpoint", endpoint)
     assert process.stdout is not None
     line = process.stdout.readline()

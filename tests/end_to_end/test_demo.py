@@ -90,7 +90,7 @@ def test_a_back_test_gives_the_same_alarms_value_for_value(recorded: list[Encode
     assert [alarm.SerializeToString() for alarm in again.alarm_messages] == [a.SerializeToString() for a in live]
 
 
-def test_every_node_said_goodbye(recorded: list[Encoded]) -> None:
+def test_the_last_health_of_every_node_is_stopped(recorded: list[Encoded]) -> None:
     last = {health.node: health.phase for health in bodies(recorded, Health)}
     assert last["plant"] == last["monitor"] == "stopped"
 

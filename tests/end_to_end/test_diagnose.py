@@ -1,4 +1,4 @@
-"""`diagnose` as people and scripts meet it, and what the extended model is good for afterwards."""
+"""`diagnose` on the command line, and the use of its extended model afterwards."""
 
 import json
 import re
@@ -43,16 +43,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory, record: Record) -> Path:
 
 
 @pytest.fixture(scope="module")
-def said(folder: Path) -> subprocess.CompletedProcess[str]:
+def diagnosis_run(folder: Path) -> subprocess.CompletedProcess[str]:
     from .conftest import REACTORWATCH
 
     arguments = ["diagnose", "leak.csv", "--json", "-o", "report", "--tolerance", "C=0.001,T=0.2"]
     return subprocess.run([REACTORWATCH, *arguments], capture_output=True, text=True, check=False, cwd=folder)
 
 
-def test_machines_get_one_object_and_a_report(said: subprocess.CompletedProcess[str], folder: Path) -> None:
-    assert said.returncode == 0, said.stderr
-    (line,) = said.stdout.splitlines()
+def test_machines_get_one_object_and_a_report(diagnosis_run: subprocess.CompletedProcess[str], folder: Path) -> None:
+    assert diagnosis_run.returncode == 0, diagnosis_run.stderr
+    (line,) = diagnosis_run.stdout.splitlines()
     found = json.loads(line)
     assert found["file"] == "leak.csv"
     assert found["samples"] == ROWS
@@ -75,9 +75,9 @@ def test_machines_get_one_object_and_a_report(said: subprocess.CompletedProcess[
 
 
 def test_simulate_with_the_extended_model_is_the_free_run_of_the_diagnosis(
-    said: subprocess.CompletedProcess[str], folder: Path, known: Diagnosis, called: Command
+    diagnosis_run: subprocess.CompletedProcess[str], folder: Path, known: Diagnosis, called: Command
 ) -> None:
-    assert said.returncode == 0
+    assert diagnosis_run.returncode == 0
     done = called("simulate", "leak.csv", "-o", "free.csv", "--model", "report/extended.json", cwd=folder)
     assert done.returncode == 0, done.stderr
     simulated = read_csv(folder / "free.csv").columns
@@ -90,18 +90,18 @@ def test_simulate_with_the_extended_model_is_the_free_run_of_the_diagnosis(
 
 
 def test_the_same_record_against_the_extended_model_is_nominal(
-    said: subprocess.CompletedProcess[str], folder: Path, called: Command
+    diagnosis_run: subprocess.CompletedProcess[str], folder: Path, called: Command
 ) -> None:
-    assert said.returncode == 0
+    assert diagnosis_run.returncode == 0
     done = called("diagnose", "leak.csv", "--model", "report/extended.json", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "The simulation is right" in done.stdout
 
 
 def test_the_monitor_takes_the_extended_model_for_its_reference(
-    said: subprocess.CompletedProcess[str], folder: Path, called: Command
+    diagnosis_run: subprocess.CompletedProcess[str], folder: Path, called: Command
 ) -> None:
-    assert said.returncode == 0
+    assert diagnosis_run.returncode == 0
     settings = "[monitor]\ntraining_min = 60.0\nisolation = false\n"
     (folder / "nominal.toml").write_text(settings)
     (folder / "settings.toml").write_text(f'{settings}model = "report/extended.json"\n')
@@ -113,9 +113,9 @@ def test_the_monitor_takes_the_extended_model_for_its_reference(
 
 
 def test_a_plant_of_the_extended_model_has_the_fault_in_it(
-    said: subprocess.CompletedProcess[str], folder: Path
+    diagnosis_run: subprocess.CompletedProcess[str], folder: Path
 ) -> None:
-    assert said.returncode == 0
+    assert diagnosis_run.returncode == 0
     model = str(folder / "report" / "extended.json")
     (text,) = json.loads((folder / "report" / "extended.json").read_text())["effects"]
     fault = "feed_temperature:step:2@10min"
@@ -201,18 +201,18 @@ def test_the_proposed_experiment_is_a_file_that_drives_a_plant(tmp_path: Path, c
         ("qc=85..900", "limits of qc must be within 0..500 l/min, got 85..900"),
     ],
 )
-def test_limits_that_cannot_be_are_told_in_a_line(folder: Path, called: Command, limits: str, said: str) -> None:
+def test_impossible_limits_are_reported_in_one_line(folder: Path, called: Command, limits: str, said: str) -> None:
     done = called("diagnose", "leak.csv", "-o", "nothing", "--limits", limits, cwd=folder)
     assert (done.returncode, done.stdout, done.stderr) == (2, "", f"reactorwatch: {said}\n")
     assert not (folder / "nothing").exists()
 
 
 def test_the_drawing_has_both_models_on_one_timeline(
-    said: subprocess.CompletedProcess[str], folder: Path, known: Diagnosis
+    diagnosis_run: subprocess.CompletedProcess[str], folder: Path, known: Diagnosis
 ) -> None:
     from rerun.chunk import RrdReader
 
-    assert said.returncode == 0
+    assert diagnosis_run.returncode == 0
     assert known.curves is not None
     drawn: dict[str, list[float]] = {}
     for chunk in RrdReader(str(folder / "report" / "report.rrd")).stream().to_chunks():

@@ -1,4 +1,4 @@
-"""A recorder that cannot write says so where operators look, and they can say that they have seen it."""
+"""A recorder that cannot write reports it in an alarm, which operators can acknowledge."""
 
 import contextlib
 import json
@@ -89,7 +89,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-def test_a_demonstration_on_a_full_disk_says_so_in_a_line(small_disk: Path, called: Command) -> None:
+def test_a_demonstration_on_a_full_disk_reports_it_in_one_line(small_disk: Path, called: Command) -> None:
     done = called("demo", "--out", small_disk / "runs", "--speed", "max")
     assert (done.returncode, done.stdout) == (2, "")
     *_, said = done.stderr.splitlines()

@@ -1,4 +1,4 @@
-"""How processes start and end: what can pass is waited for, and nothing of a run lives on without its supervisor."""
+"""Start and end of processes: transient causes are waited for, and no process outlives its supervisor."""
 
 import errno
 import fcntl
@@ -166,7 +166,7 @@ main()
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES], ids=errno.errorcode.get)
 @pytest.mark.parametrize("command", [RECORDER, MONITOR, FLEET], ids=" ".join)
-def test_a_folder_that_the_machine_refuses_is_waited_for_with_a_line_and_health_that_says_so(
+def test_a_folder_that_the_machine_refuses_is_waited_for_and_reported_in_a_line_and_in_health(
     command: tuple[str, ...], number: int, tmp_path: Path, run: Run, bus: ZenohBus, endpoint: str, wait_alive: WaitAlive
 ) -> None:
     marker, reports = tmp_path / "refused", Reports(bus)
@@ -214,7 +214,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [RECORDER, MONITOR], ids=" ".join)
-def test_a_disk_that_is_full_at_the_start_ends_no_node_and_health_says_so(
+def test_a_disk_that_is_full_at_the_start_ends_no_node_and_health_reports_it(
     command: tuple[str, ...], small_disk: Path, run: Run, bus: ZenohBus, endpoint: str, wait_alive: WaitAlive
 ) -> None:
     """A monitor watches meanwhile; a recorder has nothing to do."""
@@ -395,7 +395,7 @@ def test_nodes_end_with_a_supervisor_that_was_killed_and_the_next_has_one_of_eac
 
 
 @pytest.mark.slow
-def test_a_second_instance_of_a_node_ends_and_names_the_first_which_goes_on(
+def test_a_second_instance_of_a_node_ends_and_names_the_first_which_continues(
     run: Run, bus: ZenohBus, endpoint: str, wait_alive: WaitAlive, tmp_path: Path
 ) -> None:
     """All at once: each waits until the lease of one that died would have ended."""

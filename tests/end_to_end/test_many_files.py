@@ -78,7 +78,7 @@ def test_a_diagnosis_is_the_same_in_one_process_in_two_and_on_a_cluster(
     assert others == [alone, alone]
 
 
-def test_a_folder_stands_for_the_records_in_it_and_a_summary_says_what_came_of_each(
+def test_a_folder_stands_for_the_records_in_it_and_a_summary_lists_the_result_of_each(
     folder: Path, called: Command, tmp_path: Path
 ) -> None:
     options = ("--training", "15", "--jobs", "1", "-o", tmp_path / "out")
@@ -104,7 +104,7 @@ def test_imported_recordings_of_a_folder_are_one_each(folder: Path, called: Comm
     assert [item["file"] for item in objects(done)] == [str(tmp_path / f"{number}.mcap") for number in range(2)]
 
 
-def test_options_that_cannot_be_meant_are_told_once_and_not_for_each_file(folder: Path, called: Command) -> None:
+def test_impossible_options_are_reported_once_and_not_for_each_file(folder: Path, called: Command) -> None:
     for options in (("--tolerance", "pH=1"), ("--limits", "p=1..2"), ("--uncertain", "K9=2%"), ("--model", "no.json")):
         done = called("diagnose", "run-*.csv", "-o", "nothing", *options, cwd=folder)
         assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, "", 1), options
@@ -130,7 +130,7 @@ def test_a_process_that_is_killed_meanwhile_costs_no_result(folder: Path, tmp_pa
     assert [item["file"] for item in said] == [f"run-{number:02}.csv" for number in range(MORE_FILES)]
 
 
-def test_ctrl_c_ends_all_processes_and_says_nothing(folder: Path, tmp_path: Path) -> None:
+def test_ctrl_c_ends_all_processes_and_prints_nothing(folder: Path, tmp_path: Path) -> None:
     for number in range(500):  # more than is done before we look
         shutil.copy(folder / "run-0.csv", tmp_path / f"run-{number:03}.csv")
     arguments = [REACTORWATCH, "diagnose", "run-*.csv", "--json", "--jobs", "2"]
@@ -158,7 +158,7 @@ def workers_of(number: int) -> list[int]:
 
 
 @pytest.mark.slow
-def test_a_back_test_by_two_processes_says_what_that_of_the_file_alone_says_and_the_terminal_shows_progress(
+def test_a_back_test_by_two_processes_equals_that_of_the_file_alone_and_the_terminal_shows_progress(
     folder: Path, called: Command
 ) -> None:
     terminal, theirs = os.openpty()

@@ -1,4 +1,4 @@
-"""The chain on a record that nobody here made: replayed as a plant, watched, recorded, drawn."""
+"""The full chain on a published measured record: replay, monitor, recorder, dashboard."""
 
 import json
 import signal

@@ -1,4 +1,4 @@
-"""What can be done with recordings, as people and scripts do it."""
+"""Commands on recordings, for users and scripts."""
 
 import json
 from pathlib import Path
@@ -22,7 +22,7 @@ def recording(tmp_path: Path, called: Command) -> Path:
     return tmp_path / "run.mcap"
 
 
-def test_info_tells_people_and_machines_what_is_in_it(recording: Path, called: Command) -> None:
+def test_info_lists_the_contents_as_text_and_as_json(recording: Path, called: Command) -> None:
     said = called("info", recording)
     assert said.returncode == 0
     assert "900 messages of 3 topics" in said.stdout
@@ -46,7 +46,7 @@ def test_a_cut_keeps_the_minutes_of_the_recording_and_a_folder_of_cuts_is_one_re
     assert (tmp_path / "both.csv").read_bytes() == (tmp_path / "run.csv").read_bytes()
 
 
-def test_recover_says_what_it_saved_and_leaves_the_damaged_file(
+def test_recover_reports_what_it_saved_and_leaves_the_damaged_file(
     recording: Path, tmp_path: Path, called: Command
 ) -> None:
     content = recording.read_bytes()

@@ -55,7 +55,7 @@ def test_a_demonstration_runs_on_a_secured_router_and_each_node_has_its_own_cert
 
 
 @pytest.mark.slow
-def test_up_lets_in_who_has_a_certificate_and_nobody_else(site: Path, tmp_path: Path, start: Start) -> None:
+def test_up_admits_clients_with_a_certificate_and_no_others(site: Path, tmp_path: Path, start: Start) -> None:
     process = start("up", "--site", site, "--out", tmp_path / "runs", "--speed", "60")
     viewer = connect(bus_of(site / "cstr" / "viewer" / "settings.toml"), "viewer", StopSignal())
     assert viewer is not None
@@ -102,7 +102,7 @@ def test_up_lets_in_who_has_a_certificate_and_nobody_else(site: Path, tmp_path: 
         (["up", "--config", "SITE/cstr/plant/settings.toml"], "name the site with --site"),
     ],
 )
-def test_what_cannot_be_is_told_in_a_line_and_nothing_is_written(
+def test_impossible_options_are_reported_in_one_line_and_nothing_is_written(
     site: Path, tmp_path: Path, called: Command, arguments: list[str], said: str
 ) -> None:
     done: subprocess.CompletedProcess[str] = called(

@@ -103,7 +103,7 @@ def test_a_browser_shows_the_lines_of_a_run_while_it_runs(page: Browser, setting
     assert not listens("127.0.0.1", port), "the viewer ends with the command"
 
 
-def test_a_port_that_somebody_has_is_told(called: Command) -> None:
+def test_a_port_in_use_is_reported(called: Command) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -114,7 +114,7 @@ def test_a_port_that_somebody_has_is_told(called: Command) -> None:
     assert "choose another --port" in done.stderr
 
 
-def test_without_a_screen_there_is_no_window_and_one_line_says_what_to_do(
+def test_without_a_screen_there_is_no_window_and_one_line_states_the_remedy(
     called: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):

@@ -1,4 +1,4 @@
-"""Holds what a diagnosis said against the truth."""
+"""Score a diagnosis against the truth."""
 
 from dataclasses import dataclass, field
 from math import exp, inf, nan

@@ -130,7 +130,7 @@ def test_a_plant_that_starts_near_the_unstable_point_lights_and_an_extinguished_
     ],
     ids=lambda item: item.kind if isinstance(item, HiddenCourse) else "",
 )
-def test_courses_are_what_their_names_say(course: HiddenCourse, expected: list[float]) -> None:
+def test_courses_match_their_names(course: HiddenCourse, expected: list[float]) -> None:
     times = np.array([0.0, 5.0, 10.0, 15.0])
     assert course.at(times) == pytest.approx(expected, abs=1e-7)
 

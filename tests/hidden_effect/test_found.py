@@ -147,7 +147,7 @@ def test_the_onset_of_a_step_is_found_to_the_row() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES[:2])
-def test_what_is_said_can_be_written_as_json(name: str) -> None:
+def test_a_diagnosis_can_be_written_as_json(name: str) -> None:
     said = replace(found(name)[1], curves=None)
     assert json.loads(json.dumps(asdict(said), allow_nan=False))["verdict"] == said.verdict
 

@@ -92,7 +92,7 @@ def test_an_input_that_went_in_straight_lines_is_a_matter_of_timing_by_half_a_ro
 
 
 @pytest.mark.parametrize("case", ["medium", "low noise", "irregular"])
-def test_when_stamps_became_late_is_known_as_well_as_the_interval_says(case: str) -> None:
+def test_the_onset_of_late_stamps_lies_within_its_interval(case: str) -> None:
     record = hidden(case, "sample_timing")
     said = diagnose(record.record, cstr())
     (cause,) = said.causes

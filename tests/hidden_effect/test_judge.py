@@ -26,7 +26,9 @@ def hidden(*names: str, size: float = 2.0, onset_min: float = 4.0) -> Hidden:
     return Hidden(record, 1, Circumstances(), effects, courses, 1000.0, EMPTY, np.full((11, 2), 440.0))
 
 
-def said(*names: str, verdict: str = "named", others: tuple[str, ...] = (), location: str = "feed") -> Diagnosis:
+def make_diagnosis(
+    *names: str, verdict: str = "named", others: tuple[str, ...] = (), location: str = "feed"
+) -> Diagnosis:
     """A diagnosis that names steps of 2.02 +- 0.02 at 4.5 +- 0.1 min."""
     parameters = {"size": Estimate(2.02, 0.02, "K"), "onset": Estimate(4.5, 0.1, "min")}
     causes = tuple(Cause(name, "step", "", location, parameters) for name in names)
@@ -56,7 +58,7 @@ def said(*names: str, verdict: str = "named", others: tuple[str, ...] = (), loca
 
 
 def test_the_right_name_is_first_and_its_numbers_are_compared() -> None:
-    judged = judge(hidden("feed_temperature"), said("feed_temperature"), 1.0)
+    judged = judge(hidden("feed_temperature"), make_diagnosis("feed_temperature"), 1.0)
     assert judged.first
     assert judged.listed
     assert judged.right_place
@@ -70,18 +72,20 @@ def test_the_right_name_is_first_and_its_numbers_are_compared() -> None:
 
 
 def test_beside_the_error_on_rows_not_seen_stands_the_noise_that_was_drawn_in_them() -> None:
-    judged = judge(hidden("feed_temperature"), said("feed_temperature"), 1.0)
+    judged = judge(hidden("feed_temperature"), make_diagnosis("feed_temperature"), 1.0)
     assert judged.drawn == pytest.approx(1.2 * np.sqrt(0.5))  # of four rows two, by 1.2 standard deviations
 
 
 def test_the_error_of_a_curve_is_relative_to_the_true_one() -> None:
-    judged = judge(hidden("feed_temperature", onset_min=4.9), said("feed_temperature"), 1.0)
+    judged = judge(hidden("feed_temperature", onset_min=4.9), make_diagnosis("feed_temperature"), 1.0)
     # Of eleven rows six are past both onsets: 0.02 off there, where the truth is 2.
     assert judged.curve_errors == pytest.approx((0.01,))
 
 
 def test_a_wrong_name_with_the_truth_among_the_alternatives_is_listed() -> None:
-    judged = judge(hidden("feed_temperature"), said("coolant_flow", others=("feed_temperature", "heat_loss")), 1.0)
+    judged = judge(
+        hidden("feed_temperature"), make_diagnosis("coolant_flow", others=("feed_temperature", "heat_loss")), 1.0
+    )
     assert not judged.first
     assert judged.listed
     assert judged.count == 3
@@ -91,28 +95,28 @@ def test_a_wrong_name_with_the_truth_among_the_alternatives_is_listed() -> None:
 
 def test_one_of_two_causes_alone_is_not_what_is_hidden() -> None:
     truth = hidden("feed_temperature", "volume")
-    assert not judge(truth, said("volume", others=("feed_temperature",)), 1.0).listed
-    assert judge(truth, said("volume", others=("volume+feed_temperature",)), 1.0).listed
-    assert judge(truth, said("volume", "feed_temperature"), 1.0).first
+    assert not judge(truth, make_diagnosis("volume", others=("feed_temperature",)), 1.0).listed
+    assert judge(truth, make_diagnosis("volume", others=("volume+feed_temperature",)), 1.0).listed
+    assert judge(truth, make_diagnosis("volume", "feed_temperature"), 1.0).first
 
 
-def test_nothing_said_of_nothing_is_right_and_anything_else_is_wrong() -> None:
-    nominal = replace(said(verdict="nominal", location=""), significant=False)
+def test_no_cause_named_where_none_is_hidden_is_right_and_any_other_verdict_is_wrong() -> None:
+    nominal = replace(make_diagnosis(verdict="nominal", location=""), significant=False)
     assert judge(hidden(), nominal, 1.0).first
     assert not judge(hidden(), nominal, 1.0).wrong
-    for claim in (said("volume"), said(verdict="unknown", location="")):
+    for claim in (make_diagnosis("volume"), make_diagnosis(verdict="unknown", location="")):
         assert judge(hidden(), claim, 1.0).wrong
         assert not judge(hidden(), claim, 1.0).listed
 
 
 def test_not_seeing_a_cause_is_a_miss_and_no_wrong_claim() -> None:
-    judged = judge(hidden("volume"), said(verdict="nominal", location=""), 1.0)
+    judged = judge(hidden("volume"), make_diagnosis(verdict="nominal", location=""), 1.0)
     assert not judged.first
     assert not judged.wrong
 
 
 def test_unknown_in_the_right_place_is_not_the_name_but_the_place() -> None:
-    judged = judge(hidden("boiling"), said(verdict="unknown", location="energy_balance"), 1.0)
+    judged = judge(hidden("boiling"), make_diagnosis(verdict="unknown", location="energy_balance"), 1.0)
     assert judged.called == "unknown"
     assert judged.right_place
     assert not judged.first

@@ -41,7 +41,7 @@ def off_in_sd(hidden_effect: HiddenEffect, seed: int) -> float:
 
 
 @pytest.mark.slow
-def test_sizes_scatter_about_the_truth_as_their_standard_deviations_say() -> None:
+def test_sizes_scatter_about_the_truth_with_their_standard_deviations() -> None:
     """Also where the concentration is disturbed and noise levels say, as here mostly, that it is not."""
     smooth = [item for item in named() if not next(one for one in EFFECTS if one.name == item.name).is_discontinuous]
     squares = [off_in_sd(item, SEED + place) ** 2 for place, item in enumerate(smooth)]

@@ -190,7 +190,7 @@ def test_a_delayed_analyser_shows_what_scipy_has_in_between_the_rows() -> None:
     assert np.abs(found.concentration - exact)[TIME > 0.237].max() < 1e-8
 
 
-def test_an_input_that_is_stamped_late_was_felt_earlier() -> None:
+def test_an_input_that_is_stamped_late_acted_earlier() -> None:
     late = hidden("sample_timing", 0.04).state
     # The rows that the plant feels are those of a record whose input is stamped in time.
     felt = np.unique(np.concatenate([TIME, TIME - 0.04]))

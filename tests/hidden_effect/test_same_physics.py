@@ -54,7 +54,7 @@ def relative_error(effect: Effect, size: float, profile: Profile = CONSTANT) -> 
 
 @pytest.mark.parametrize("profile", [CONSTANT, STEP], ids=lambda item: item.name)
 @pytest.mark.parametrize("effect", KNOWN, ids=lambda item: item.name)
-def test_an_effect_is_what_the_equations_by_hand_say(effect: Effect, profile: Profile) -> None:
+def test_an_effect_matches_the_equations_by_hand(effect: Effect, profile: Profile) -> None:
     hand = HAND[effect.name]
     size = hand.largest if effect.name in LAGS else hand.signs[0] * (hand.smallest * hand.largest) ** 0.5
     # Where a step sets in between two rows, a lag begins with what has been there since the row began.

@@ -1,4 +1,4 @@
-"""What each test has for itself: a site, a router, a log."""
+"""Fixtures of each test: a site, a router, a log."""
 
 from collections.abc import Iterator
 from contextlib import closing

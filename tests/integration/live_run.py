@@ -1,4 +1,4 @@
-"""Plant, monitor and recorder as processes on a router, and what is heard of them."""
+"""Plant, monitor and recorder as processes on a router, and the messages that they publish."""
 
 import subprocess
 import threading

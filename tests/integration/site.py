@@ -55,7 +55,7 @@ class Site:
         self.endpoint = make(folder)
         self.router = router_from_file(folder / "router" / "router.json5")
         self._joined: list[ZenohBus] = []
-        self._heard: list[Encoded] = []
+        self._received: list[Encoded] = []
         self._changed = threading.Condition()
         for keys in ("sample/*", "audit/*", "alarm/recording/*"):
             self.router.subscribe(f"reactor/cstr/{keys}", self._on_message)  # no whole stream: each as it comes
@@ -76,11 +76,11 @@ class Site:
         with ThreadPoolExecutor(len(buses)) as closing:
             list(closing.map(ZenohBus.close, buses))
 
-    def heard_until(self, is_last: Callable[[Encoded], bool]) -> list[Encoded]:
+    def received_until(self, is_last: Callable[[Encoded], bool]) -> list[Encoded]:
         """What was let in, up to a message."""
         with self._changed:
-            assert self._changed.wait_for(lambda: any(map(is_last, self._heard)), WITHIN_S)
-            return list(self._heard)
+            assert self._changed.wait_for(lambda: any(map(is_last, self._received)), WITHIN_S)
+            return list(self._received)
 
     def close_readers(self) -> None:
         """End all sessions, the newest first; a session hands on what waits in it before it ends."""
@@ -94,5 +94,5 @@ class Site:
 
     def _on_message(self, message: Encoded) -> None:
         with self._changed:
-            self._heard.append(message)
+            self._received.append(message)
             self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""`reactorwatch alarm` against a monitor as a process of its own on a real router, which is killed and begun again."""
+"""`reactorwatch alarm` against a monitor process on a real router, which is killed and restarted."""
 
 import json
 import re
@@ -39,7 +39,7 @@ class Control:
         self.bus = bus
         self._called = called
         self.file = folder / "monitor.state"
-        self.heard: list[Message] = []
+        self.received: list[Message] = []
         self.alive = False
         self._changed = threading.Condition()
         self._settings = folder / "settings.toml"
@@ -70,7 +70,7 @@ class Control:
         found: list[Message] = []
 
         def is_there() -> bool:
-            found[:] = [message for message in self.heard if condition(message)]
+            found[:] = [message for message in self.received if condition(message)]
             return bool(found)
 
         with self._changed:
@@ -89,7 +89,7 @@ class Control:
 
     def _on_message(self, message: Encoded) -> None:
         with self._changed:
-            self.heard.append(decode(message.payload, message.encoding))
+            self.received.append(decode(message.payload, message.encoding))
             self._changed.notify_all()
 
     def _on_alive(self, _: str, is_alive: bool) -> None:

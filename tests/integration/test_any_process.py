@@ -1,4 +1,4 @@
-"""A plant of any process in the running system: watched, recorded, verified, drawn, diagnosed, and played again."""
+"""A plant of any process in the running system: monitored, recorded, verified, drawn, diagnosed and replayed."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""What breaks around a monitor costs no alarm of the plant's, raises none of its own, and is counted."""
+"""Failures around a monitor cost no alarm of the plant, raise none of their own, and are counted."""
 
 import itertools
 import random
@@ -33,7 +33,7 @@ def run(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LiveRun]:
 
 
 @pytest.mark.slow
-def test_a_monitor_that_was_frozen_hears_later_what_it_missed(run: LiveRun) -> None:
+def test_a_monitor_that_was_frozen_receives_later_what_it_missed(run: LiveRun) -> None:
     """Stopped for longer than its patience with the plant, while it watches."""
     monitor, plant = run.start_all()
     run.wait_until(18.0)
@@ -46,7 +46,7 @@ def test_a_monitor_that_was_frozen_hears_later_what_it_missed(run: LiveRun) -> N
     assert run.recorded_alarms() == run.expected_alarms()
 
 
-def test_a_plant_that_is_frozen_is_silent_until_it_goes_on(run: LiveRun) -> None:
+def test_a_plant_that_is_frozen_is_silent_until_it_resumes(run: LiveRun) -> None:
     _, plant = run.start_all()
     run.wait_until(20.0)
     plant.send_signal(signal.SIGSTOP)

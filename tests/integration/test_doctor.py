@@ -105,7 +105,7 @@ def test_nothing_is_wrong_on_loopback_without_certificates(tmp_path: Path) -> No
         bus.close()
 
 
-def test_what_the_doctor_says_is_heard_by_no_node(site: Site, tmp_path: Path) -> None:
+def test_no_node_receives_the_messages_of_the_doctor(site: Site, tmp_path: Path) -> None:
     heard: list[Encoded] = []
     recorder = site.join("cstr/recorder")
     recorder.subscribe("reactor/cstr/**", heard.append)
@@ -120,18 +120,18 @@ def test_what_the_doctor_says_is_heard_by_no_node(site: Site, tmp_path: Path) ->
     assert [message.payload for message in heard if message.key not in of_nodes] == [b"measured"]
 
 
-def test_a_router_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_missing_router_is_reported(tmp_path: Path) -> None:
     assert set(wrong(BusConfig(endpoint=free_endpoint()), tmp_path)) == {"router"}
 
 
-def test_a_router_of_another_authority_is_told(site: Site, tmp_path: Path) -> None:
+def test_a_router_of_another_authority_is_reported(site: Site, tmp_path: Path) -> None:
     make(tmp_path / "foreign", site.endpoint)
     found = wrong(settings(tmp_path / "foreign", "cstr/plant"), tmp_path)
     assert set(found) == {"router"}
     assert "authority" in found["router"].cure
 
 
-def test_a_bus_open_to_all_is_told(tmp_path: Path) -> None:
+def test_an_open_bus_is_reported(tmp_path: Path) -> None:
     """The first check, before anything is called: the address is one set aside for documents."""
     found = next(iter(run_checks(BusConfig(endpoint="tcp/192.0.2.1:7447"), "cstr", tmp_path, 0.0, 0.0, now())))
     assert found.check == "certificate"
@@ -139,7 +139,7 @@ def test_a_bus_open_to_all_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("days", "expected"), [(1.0, "valid until"), (-1.0, "expired")])
-def test_a_certificate_that_is_or_will_soon_be_expired_is_told(tmp_path: Path, days: float, expected: str) -> None:
+def test_a_certificate_that_is_or_will_soon_be_expired_is_reported(tmp_path: Path, days: float, expected: str) -> None:
     endpoint = make(tmp_path)
     shutil.rmtree(tmp_path / "cstr" / "viewer")
     make_site(tmp_path, ("cstr",), endpoint, endpoint, 10.0, now() + datetime.timedelta(days=days - 10.0))
@@ -148,24 +148,24 @@ def test_a_certificate_that_is_or_will_soon_be_expired_is_told(tmp_path: Path, d
     assert "certify" in found["certificate"].cure
 
 
-def test_a_key_that_others_can_read_is_told(tmp_path: Path) -> None:
+def test_a_key_that_others_can_read_is_reported(tmp_path: Path) -> None:
     make(tmp_path)
     (tmp_path / "cstr" / "viewer" / "key.pem").chmod(0o644)
     assert "chmod 600" in wrong(settings(tmp_path, "cstr/viewer"), tmp_path)["private key"].cure
 
 
-def test_a_key_of_another_certificate_is_told(tmp_path: Path) -> None:
+def test_a_key_of_another_certificate_is_reported(tmp_path: Path) -> None:
     make(tmp_path)
     (tmp_path / "cstr" / "viewer" / "key.pem").write_bytes((tmp_path / "cstr" / "plant" / "key.pem").read_bytes())
     assert "is not the key of" in wrong(settings(tmp_path, "cstr/viewer"), tmp_path)["identity"].found
 
 
-def test_a_certificate_of_another_plant_is_told(tmp_path: Path) -> None:
+def test_a_certificate_of_another_plant_is_reported(tmp_path: Path) -> None:
     make(tmp_path)
     assert "other.viewer" in wrong(settings(tmp_path, "other/viewer"), tmp_path)["identity"].found
 
 
-def test_a_plant_that_the_router_has_no_rules_for_is_told(tmp_path: Path) -> None:
+def test_a_plant_that_the_router_has_no_rules_for_is_reported(tmp_path: Path) -> None:
     """As when it was not started again after the plant was added: it lets in, and lets nothing through."""
     make(tmp_path)
     file = tmp_path / "router" / "router.json5"
@@ -179,13 +179,13 @@ def test_a_plant_that_the_router_has_no_rules_for_is_told(tmp_path: Path) -> Non
         bus.close()
 
 
-def test_a_node_that_is_not_there_is_told(site: Site, tmp_path: Path) -> None:
+def test_a_missing_node_is_reported(site: Site, tmp_path: Path) -> None:
     with nodes({node: site.join(f"cstr/{node}") for node in ("plant", "monitor")}):
         found = wrong_of_what_is_there(settings(site.folder, "cstr/viewer"), tmp_path, {"plant", "monitor"})
     assert set(found) == {"recorder"}
 
 
-def test_a_clock_that_is_off_and_another_version_are_told(site: Site, tmp_path: Path) -> None:
+def test_a_clock_offset_and_another_version_are_reported(site: Site, tmp_path: Path) -> None:
     others = {node: site.join(f"cstr/{node}") for node in ("plant", "recorder")}
     with nodes(others), nodes({"monitor": site.join("cstr/monitor")}, late_s=[3600.0], version="0.0.1"):
         found = wrong(settings(site.folder, "cstr/viewer"), tmp_path)
@@ -213,7 +213,7 @@ def nodes_of_a_minute(buses: dict[str, ZenohBus], late_s: float = 0.0) -> Iterat
         yield
 
 
-def test_what_a_node_said_a_minute_ago_is_not_taken_for_its_clock(site: Site, tmp_path: Path) -> None:
+def test_a_message_published_a_minute_ago_is_not_taken_for_the_clock_of_its_node(site: Site, tmp_path: Path) -> None:
     """Publishers remember it, and subscribers ask for it: whatever the plant's speed, it is as old as it is."""
     with nodes_of_a_minute({node: site.join(f"cstr/{node}") for node in NODES}):
         assert wrong(settings(site.folder, "cstr/viewer"), tmp_path, 20.0) == {}
@@ -239,7 +239,7 @@ def test_two_monitors_of_one_plant_are_reported(site: Site, tmp_path: Path) -> N
     assert found["monitors"].found == "2 of them watch cstr: every alarm is raised as often"
 
 
-def test_a_disk_without_room_is_told(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported(tmp_path: Path) -> None:
     found = wrong(BusConfig(endpoint=free_endpoint()), tmp_path / "not" / "made yet", room_mb=1e12)
     assert "make room" in found["disk"].cure
 

@@ -1,4 +1,4 @@
-"""Who may not, cannot: real sessions on loopback, against the router's settings that `certify` writes.
+"""Access control: real sessions on loopback, against the router's settings that `certify` writes.
 
 What is refused is refused in silence. So each test also shows the like that is let in, and looks once whatever was
 sent before has come through: a session that leaves has a question answered by the router first.
@@ -46,18 +46,18 @@ def tls_client(endpoint: str, **tls: str | bool) -> zenoh.Config:
     return config
 
 
-def test_who_has_a_certificate_of_the_site_is_let_in(site: Site) -> None:
+def test_a_client_with_a_certificate_of_the_site_is_admitted(site: Site) -> None:
     for who in (*OTHERS, "cstr/plant"):
         site.join(who)
 
 
-def test_who_has_no_certificate_is_not_let_in(site: Site) -> None:
+def test_a_client_without_a_certificate_is_rejected(site: Site) -> None:
     ca = str(site.folder / "cstr" / "viewer" / "ca.pem")
     with pytest.raises(zenoh.ZError):
         zenoh.open(tls_client(site.endpoint, root_ca_certificate=ca))
 
 
-def test_who_has_a_certificate_of_another_authority_is_not_let_in(site: Site, tmp_path: Path) -> None:
+def test_a_client_with_a_certificate_of_another_authority_is_rejected(site: Site, tmp_path: Path) -> None:
     make(tmp_path / "foreign", site.endpoint)
     foreign = tmp_path / "foreign" / "cstr" / "plant"
     ca = str(site.folder / "cstr" / "plant" / "ca.pem")  # so that it is not the client that turns away
@@ -96,23 +96,23 @@ def test_plain_tcp_is_not_let_in(site: Site) -> None:
     assert connect(plain, "plant", OneAttempt()) is None
 
 
-def test_nobody_but_the_plant_publishes_its_samples(site: Site) -> None:
+def test_only_the_plant_publishes_its_samples(site: Site) -> None:
     intruders = [site.join(who) for who in OTHERS]
     for who, intruder in zip(OTHERS, intruders, strict=True):
         intruder.publish(sample(who.encode()))
     site.leave(*intruders)
     site.join("cstr/plant").publish(sample(b"measured"))
-    heard = site.heard_until(lambda message: message.payload == b"measured")
-    assert [message.payload for message in heard] == [b"measured"]
+    received = site.received_until(lambda message: message.payload == b"measured")
+    assert [message.payload for message in received] == [b"measured"]
 
 
 def test_a_recorder_that_uses_the_monitor_s_numbers_suppresses_none_of_its_alarms(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    heard: list[Encoded] = []
+    received: list[Encoded] = []
     monkeypatch.setattr("secrets.randbits", lambda _: 7)  # both publishers get the same name
     viewer, monitor, recorder = (site.join(f"cstr/{who}") for who in ("viewer", "monitor", "recorder"))
-    viewer.subscribe("reactor/cstr/alarm/**", heard.append)
+    viewer.subscribe("reactor/cstr/alarm/**", received.append)
     monitor.publish(Encoded("reactor/cstr/alarm/ewma/T", b"0", ""))
     for _ in range(200):
         recorder.publish(Encoded("reactor/cstr/alarm/recording/zz", b"forged", ""))
@@ -121,15 +121,15 @@ def test_a_recorder_that_uses_the_monitor_s_numbers_suppresses_none_of_its_alarm
         monitor.publish(Encoded("reactor/cstr/alarm/ewma/T", b"%d" % number, ""))
     site.leave(monitor)
     site.close_readers()
-    assert [item.payload for item in heard if item.payload != b"forged"] == [b"%d" % number for number in range(6)]
+    assert [item.payload for item in received if item.payload != b"forged"] == [b"%d" % number for number in range(6)]
 
 
 def test_the_monitor_does_not_publish_the_recorder_s_alarms(site: Site) -> None:
-    heard: list[tuple[str, bytes]] = []
+    received: list[tuple[str, bytes]] = []
     forged = ("recording/disk", "recording/zz", "recording/disk/@adv/pub/x/_")
     for name in ("*", *forged):
         site.router.subscribe(
-            f"reactor/cstr/alarm/{name}", lambda message: heard.append((message.key, message.payload))
+            f"reactor/cstr/alarm/{name}", lambda message: received.append((message.key, message.payload))
         )
     monitor = site.join("cstr/monitor")
     for name in forged:
@@ -141,7 +141,7 @@ def test_the_monitor_does_not_publish_the_recorder_s_alarms(site: Site) -> None:
         recorder.publish(Encoded(f"reactor/cstr/alarm/{name}", b"full", ""))
     site.leave(recorder)
     full = [(f"reactor/cstr/alarm/{name}", b"full") for name in forged[:2]]
-    assert sorted(heard) == [*full, ("reactor/cstr/alarm/x", b"raised")]
+    assert sorted(received) == [*full, ("reactor/cstr/alarm/x", b"raised")]
 
 
 WILD = ("sample/*", "sample/**", "sample/T$*", "sample/$*T")
@@ -152,11 +152,11 @@ def test_a_message_on_many_keys_at_once_is_taken_by_no_subscriber(
     site: Site, plain_log: None, capsys: pytest.CaptureFixture[str], *, gathered: bool
 ) -> None:
     """A router's rules cannot tell `sample/*` from `sample/T`, so subscribers refuse the message and log it once."""
-    heard, last = list[bytes](), threading.Event()
+    received, last = list[bytes](), threading.Event()
 
     def on_messages(messages: list[Encoded]) -> None:
-        heard.extend(message.payload for message in messages)
-        if b"measured" in heard:
+        received.extend(message.payload for message in messages)
+        if b"measured" in received:
             last.set()
 
     if gathered:
@@ -168,7 +168,7 @@ def test_a_message_on_many_keys_at_once_is_taken_by_no_subscriber(
         plant._session.put(f"reactor/cstr/{key}", b"made up")
     plant.publish(sample(b"measured"))
     assert last.wait(WITHIN_S)
-    assert heard == [b"measured"]
+    assert received == [b"measured"]
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "must be on one key" in line]
     assert "reactor/cstr/sample/*" in line
 
@@ -179,12 +179,12 @@ def test_a_recorder_that_forges_the_monitor_s_source_suppresses_none_of_its_alar
     """Zenoh's subscriber drops them; publishers are asked for the last they have published, past it."""
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.LAST_QUERY_PERIOD_S", 0.5)
     key, changed, numbers = "reactor/cstr/alarm/ewma/T", threading.Condition(), itertools.count()
-    heard: list[bytes] = []
+    received: list[bytes] = []
     sources: dict[bytes, zenoh.SourceInfo] = {}
 
-    def hear(message: Encoded) -> None:
+    def receive(message: Encoded) -> None:
         with changed:
-            heard.append(message.payload)
+            received.append(message.payload)
             changed.notify_all()
 
     def note(sample: zenoh.Sample) -> None:
@@ -195,7 +195,7 @@ def test_a_recorder_that_forges_the_monitor_s_source_suppresses_none_of_its_alar
 
     def wait_for(is_so: Callable[[], bool]) -> None:
         with changed:
-            assert changed.wait_for(is_so, WITHIN_S), (heard, sources)
+            assert changed.wait_for(is_so, WITHIN_S), (received, sources)
 
     def publish() -> bytes:
         payload = b"%d" % next(numbers)
@@ -203,30 +203,32 @@ def test_a_recorder_that_forges_the_monitor_s_source_suppresses_none_of_its_alar
         return payload
 
     viewer, monitor, recorder = (site.join(f"cstr/{who}") for who in ("viewer", "monitor", "recorder"))
-    viewer.subscribe("reactor/cstr/alarm/**", hear)
+    viewer.subscribe("reactor/cstr/alarm/**", receive)
     spy = recorder._session.declare_subscriber("reactor/cstr/alarm/**", note)
     while not sources:  # a subscriber misses what is published before its publisher knows of it
-        wait_for(partial(heard.__contains__, publish()))
+        wait_for(partial(received.__contains__, publish()))
     newest = publish()
-    wait_for(lambda: newest in heard and newest in sources)
+    wait_for(lambda: newest in received and newest in sources)
     for ahead in range(1, 51):
         forged = zenoh.SourceInfo(sources[newest].source_id, sources[newest].source_sn + ahead)
         recorder._session.put("reactor/cstr/alarm/recording/zz", b"forged", source_info=forged)
-    wait_for(lambda: heard.count(b"forged") == 50)
+    wait_for(lambda: received.count(b"forged") == 50)
     last = [publish() for _ in range(5)][-1]
-    wait_for(lambda: last in heard)
+    wait_for(lambda: last in received)
     spy.undeclare()
-    assert [payload for payload in heard if payload != b"forged"] == [b"%d" % number for number in range(int(last) + 1)]
+    assert [payload for payload in received if payload != b"forged"] == [
+        b"%d" % number for number in range(int(last) + 1)
+    ]
 
 
-def test_who_told_the_plant_what_cannot_be_forged(site: Site) -> None:
+def test_the_author_of_a_command_cannot_be_forged(site: Site) -> None:
     intruders = [site.join(who) for who in ("cstr/engineer", "cstr/monitor", "other/plant")]
     for intruder in intruders:
         intruder.publish(Encoded("reactor/cstr/audit/set_input", b"forged", ""))
     site.leave(*intruders)
     site.join("cstr/plant").publish(Encoded("reactor/cstr/audit/set_input", b"recorded", ""))
-    heard = site.heard_until(lambda message: message.payload == b"recorded")
-    assert [message.payload for message in heard] == [b"recorded"]
+    received = site.received_until(lambda message: message.payload == b"recorded")
+    assert [message.payload for message in received] == [b"recorded"]
 
 
 HOLDERS = tuple(f"{plant}/{who}" for plant in ("cstr", "other") for who in ("plant", "monitor", "recorder", *PEOPLE))
@@ -266,7 +268,7 @@ def answered(
         ("plant", "inject_fault", {"cstr/engineer"}),
     ],
 )
-def test_operators_and_engineers_of_the_plant_command_it_and_nobody_else(
+def test_only_operators_and_engineers_of_the_plant_command_it(
     site: Site, node: str, command: str, may: set[str]
 ) -> None:
     assert answered(site, node, command) == may
@@ -300,33 +302,33 @@ def test_a_viewer_reads_its_own_plant_and_no_other(site: Site) -> None:
     assert not wide
 
 
-def test_a_recorder_of_the_whole_plant_is_told_what_was_before(site: Site) -> None:
+def test_a_recorder_of_the_whole_plant_receives_the_history(site: Site) -> None:
     """It asks for that below a wider key than any that the plant publishes on."""
-    heard: list[Encoded] = []
+    received: list[Encoded] = []
     site.join("cstr/plant").publish(sample(b"measured"))
-    site.heard_until(lambda message: message.payload == b"measured")
-    site.join("cstr/recorder").subscribe("reactor/cstr/**", heard.append, history_s=60.0)
+    site.received_until(lambda message: message.payload == b"measured")
+    site.join("cstr/recorder").subscribe("reactor/cstr/**", received.append, history_s=60.0)
     site.close_readers()
-    assert [message.payload for message in heard] == [b"measured"]
+    assert [message.payload for message in received] == [b"measured"]
 
 
 @pytest.mark.parametrize("whose", ["plant", "recorder"])
 def test_what_is_published_while_a_link_is_cut_is_recovered_past_the_rules(site: Site, whose: str) -> None:
     proxy = Proxy(site.endpoint)
     around = {whose: proxy.endpoint.replace("tcp/", "tls/")}
-    heard: list[bytes] = []
+    received: list[bytes] = []
     changed = threading.Condition()
 
-    def hear(message: Encoded) -> None:
+    def receive(message: Encoded) -> None:
         with changed:
-            heard.append(message.payload)
+            received.append(message.payload)
             changed.notify_all()
 
     def wait_for(count: int) -> None:
         with changed:
-            assert changed.wait_for(lambda: len(heard) >= count, WITHIN_S), f"{len(heard)} of {count}"
+            assert changed.wait_for(lambda: len(received) >= count, WITHIN_S), f"{len(received)} of {count}"
 
-    site.join("cstr/recorder", around.get("recorder")).subscribe("reactor/cstr/**", hear)
+    site.join("cstr/recorder", around.get("recorder")).subscribe("reactor/cstr/**", receive)
     plant = site.join("cstr/plant", around.get("plant"))
     for number in range(50):
         plant.publish(sample(b"%d" % number))
@@ -336,14 +338,14 @@ def test_what_is_published_while_a_link_is_cut_is_recovered_past_the_rules(site:
             plant.publish(sample(b"%d" % number))
     wait_for(100)
     proxy.close()
-    assert heard == [b"%d" % number for number in range(100)]
+    assert received == [b"%d" % number for number in range(100)]
 
 
-def test_what_a_plant_remembers_is_not_told_to_a_reader_of_another(site: Site) -> None:
+def test_the_history_of_a_plant_is_not_sent_to_a_reader_of_another(site: Site) -> None:
     own: list[Encoded] = []
     foreign: list[Encoded] = []
     site.join("cstr/plant").publish(sample(b"measured"))
-    site.heard_until(lambda message: message.payload == b"measured")
+    site.received_until(lambda message: message.payload == b"measured")
     site.join("cstr/viewer").subscribe("reactor/cstr/sample/**", own.append, history_s=60.0)
     site.join("other/viewer").subscribe("reactor/cstr/sample/**", foreign.append, history_s=60.0)
     site.close_readers()
@@ -351,7 +353,7 @@ def test_what_a_plant_remembers_is_not_told_to_a_reader_of_another(site: Site) -
     assert not foreign
 
 
-def test_who_is_alive_is_told_to_readers_of_the_plant_and_cannot_be_feigned(site: Site) -> None:
+def test_liveliness_is_visible_to_readers_of_the_plant_and_cannot_be_forged(site: Site) -> None:
     alive: list[str] = []
     foreign: list[str] = []
     intruder = site.join("cstr/viewer")
@@ -390,7 +392,7 @@ def test_two_monitors_of_a_plant_notice_each_other_and_cannot_be_feigned(site: S
     assert seen["a"] | seen["b"] == {"a", "b"}
 
 
-def test_an_answer_says_what_was_done(site: Site) -> None:
+def test_a_reply_states_the_action_taken(site: Site) -> None:
     """The whole way of a command and its reply, over TLS."""
     site.join("cstr/monitor").declare_queryable(
         "reactor/cstr/command/acknowledge", lambda request: request.reply(CommandReply(accepted=True, text="seen"))

@@ -159,17 +159,17 @@ def test_each_plant_is_watched_by_the_monitor_of_its_shard_which_answers_its_com
             assert "ewma/T" in [alarm.alarm for alarm in reply.alarms]
 
 
-class Told:
+class AlarmLog:
     """The alarms of plants, and how many rows were judged, as monitors publish it."""
 
     def __init__(self, bus: ZenohBus) -> None:
         self.changes: dict[str, list[Change]] = {plant: [] for plant in PLANTS}
         self._rows = dict.fromkeys(PLANTS, 0)
         self._changed = threading.Condition()
-        bus.subscribe("reactor/*/alarm/**", self._hear)
-        bus.subscribe("reactor/*/health/monitor", self._hear)
+        bus.subscribe("reactor/*/alarm/**", self._on_message)
+        bus.subscribe("reactor/*/health/monitor", self._on_message)
 
-    def _hear(self, encoded: Encoded) -> None:
+    def _on_message(self, encoded: Encoded) -> None:
         message, topic = decode(encoded.payload, encoded.encoding), keys.parse(encoded.key)
         assert topic is not None
         with self._changed:
@@ -180,7 +180,7 @@ class Told:
             self._changed.notify_all()
 
     def wait_for(self, rows: int, changes: int = 0) -> None:
-        """Wait until so many rows of each plant were judged, and so many changes of alarms told in all."""
+        """Wait until so many rows of each plant were judged, and so many changes of alarms were published in all."""
         with self._changed:
             assert self._changed.wait_for(
                 lambda: min(self._rows.values()) >= rows and sum(map(len, self.changes.values())) >= changes, WITHIN_S
@@ -199,7 +199,7 @@ def change(alarm: Alarm) -> Change:
     return Change(alarm.alarm, alarm.event, alarm.time_ns)
 
 
-def test_what_is_told_again_and_again_waits_on_new_keys_if_there_were_many_lately(
+def test_repeated_messages_wait_on_new_keys_if_there_were_many_lately(
     bus_config: BusConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.MAX_NEW_KEYS", 2)
@@ -270,7 +270,7 @@ def test_kills_of_monitors_neither_lose_an_alarm_nor_publish_one_twice(bus_confi
     }
     processes = {shard: started(bus_config, tmp_path, f"{shard}/2", tmp_path / f"states{shard}") for shard in (1, 2)}
     with client(bus_config) as bus:
-        told, crew_are, watchers = Told(bus), crew_of(bus), Watchers()
+        alarm_log, crew_are, watchers = AlarmLog(bus), crew_of(bus), Watchers()
         bus.subscribe_liveliness("reactor/*/alive/monitor", watchers.on_token)
         for plant in PLANTS:
             bus.declare_token(f"reactor/{plant}/alive/plant")
@@ -281,14 +281,14 @@ def test_kills_of_monitors_neither_lose_an_alarm_nor_publish_one_twice(bus_confi
                     for message in run[3 * row : 3 * row + 3]:
                         bus.publish(message)
                 if row in KILLED_AT:
-                    told.wait_for(row)
+                    alarm_log.wait_for(row)
                     shard = 1 + KILLED_AT.index(row) % 2
                     processes[shard].kill()
                     processes[shard].wait()
                     crew_are(1)
                     processes[shard] = started(bus_config, tmp_path, f"{shard}/2", tmp_path / f"states{shard}")
                     crew_are(2)
-            told.wait_for(len(runs["alpha"]) // 3, sum(map(len, expected.values())))
+            alarm_log.wait_for(len(runs["alpha"]) // 3, sum(map(len, expected.values())))
             for process in processes.values():
                 process.terminate()
                 assert process.wait(WITHIN_S) == 0
@@ -297,4 +297,4 @@ def test_kills_of_monitors_neither_lose_an_alarm_nor_publish_one_twice(bus_confi
                 process.kill()
                 process.wait()
         assert all(expected.values())
-        assert told.changes == expected
+        assert alarm_log.changes == expected

@@ -1,4 +1,4 @@
-"""A subscriber hears what was published before, however long that is ago and however late publishers answer."""
+"""A subscriber receives the history, however old it is and however late publishers answer."""
 
 import contextlib
 import math

@@ -117,7 +117,7 @@ class Process:
             lines.append(self.line())
         return lines
 
-    def tell(self, line: str) -> None:
+    def send_line(self, line: str) -> None:
         """Give it a line."""
         assert self._process.stdin is not None
         self._process.stdin.write(line + "\n")
@@ -150,14 +150,14 @@ def test_two_routers_are_one_bus_and_a_cut_between_them_loses_and_disorders_noth
         listener = stack.enter_context(running(1, LISTENER, ENDPOINTS[1], str(BURST)))
         plant = stack.enter_context(running(0, PLANT, ENDPOINTS[0]))
         listener.until("came")
-        plant.tell(str(BURST))
+        plant.send_line(str(BURST))
         listener.until(f"in order {BURST}")
         ip("-n", NAMES[0], "link", "set", LINKS[0], "down")
         listener.until("went")  # when the lease of the link is over
         plant.until("published")
-        plant.tell(str(BURST))  # which nobody on the other side hears
+        plant.send_line(str(BURST))  # which nobody on the other side hears
         plant.until("published")
         ip("-n", NAMES[0], "link", "set", LINKS[0], "up")
         listener.until("came")
-        plant.tell(str(BURST))
+        plant.send_line(str(BURST))
         listener.until(f"in order {3 * BURST}")

@@ -1,4 +1,4 @@
-"""In a site each role finds another instance of its nodes, and nobody without the role can feign one."""
+"""In a site each role finds another instance of its nodes, and no client without the role can forge one."""
 
 from typing import TYPE_CHECKING
 

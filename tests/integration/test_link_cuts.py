@@ -1,4 +1,4 @@
-"""Nothing that was published is lost on the way: links are cut, routers killed, listeners late, stuck or started anew.
+"""No published message is lost: links are cut, routers killed, subscribers late, blocked or restarted.
 
 Thirty seconds and every pair of link and manner: `make cuts`.
 """
@@ -24,7 +24,7 @@ from benchmarks.link_cuts import (
     recorder_process,
     stick,
 )
-from benchmarks.recorder_kills import PATIENCE_S, SIGNALS, Publisher, Tokens, wait_for_a_flush
+from benchmarks.recorder_kills import BATCHES_PER_S, PATIENCE_S, SIGNALS, Publisher, Tokens
 from reactorwatch.cli.recording_reports import info_text
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
@@ -38,6 +38,16 @@ RATE_PER_S = 1000
 """A machine that has much else to do cannot keep up with the five thousand of `make cuts`."""
 KEPT = 60_000
 """On a key: what is published in five minutes, more than any cut lasts, also where processes are slow to start."""
+
+
+FLUSHED_BYTES = 20_000
+"""More than the beginning of a recording."""
+
+
+def wait_for_a_flush(folder: Path, publisher: Publisher) -> None:
+    """Wait until a file that is being written holds more than its beginning."""
+    while max((part.stat().st_size for part in folder.glob("*.part")), default=0) < FLUSHED_BYTES:
+        publisher.wait(publisher.sequence + BATCHES_PER_S // 10)
 
 
 @pytest.fixture
@@ -68,35 +78,35 @@ def test_a_router_that_is_killed_and_started_again_costs_no_sample(tmp_path: Pat
     assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
 
 
-def test_the_first_messages_on_keys_are_heard_though_the_router_was_gone_when_they_were_published(
+def test_the_first_messages_on_keys_are_received_though_the_router_was_down_when_they_were_published(
     router: Router,
 ) -> None:
     """Of streams that are new, and of one that is known: nobody has heard of these keys before the router is back."""
     listener, publisher = connect_client(router.config), connect_client(router.config)
     seen: SimpleQueue[bool] = SimpleQueue()
-    heard: SimpleQueue[str] = SimpleQueue()
-    listener.subscribe("reactor/*/alarm/**", lambda message: heard.put(message.key))
+    received: SimpleQueue[str] = SimpleQueue()
+    listener.subscribe("reactor/*/alarm/**", lambda message: received.put(message.key))
     publisher.subscribe_liveliness("reactor/known/alive/publisher", lambda _, is_alive: seen.put(is_alive))
     publisher.declare_token("reactor/known/alive/publisher")
     publisher.publish(Encoded("reactor/known/alarm/first", b"", ""))
-    assert (heard.get(timeout=PATIENCE_S), seen.get(timeout=PATIENCE_S)) == ("reactor/known/alarm/first", True)
+    assert (received.get(timeout=PATIENCE_S), seen.get(timeout=PATIENCE_S)) == ("reactor/known/alarm/first", True)
     router.kill()
     assert not seen.get(timeout=PATIENCE_S)
     published = [f"reactor/{plant}/alarm/{name}" for name in "xyz" for plant in ("known", "new", "newer")]
     for key in published:
         publisher.publish(Encoded(key, b"", ""))
     router.restart()
-    assert sorted(heard.get(timeout=PATIENCE_S) for _ in published) == sorted(published)
+    assert sorted(received.get(timeout=PATIENCE_S) for _ in published) == sorted(published)
     publisher.close()
     listener.close()
 
 
-def test_what_begins_while_the_link_of_a_listener_is_cut_is_heard_from_its_beginning(router: Router) -> None:
+def test_a_stream_that_starts_while_the_link_of_a_subscriber_is_cut_is_received_from_its_start(router: Router) -> None:
     """A stream that is new, and new keys of one that is known; both go on when the link is back."""
     proxy = Proxy(router.config.endpoint)
     listener, publisher = connect_client(BusConfig(endpoint=proxy.endpoint)), connect_client(router.config)
-    heard: SimpleQueue[tuple[str, bytes]] = SimpleQueue()
-    listener.subscribe("reactor/*/chart/**", lambda message: heard.put((message.key, message.payload)))
+    received: SimpleQueue[tuple[str, bytes]] = SimpleQueue()
+    listener.subscribe("reactor/*/chart/**", lambda message: received.put((message.key, message.payload)))
     published, arrived = list[tuple[str, bytes]](), list[tuple[str, bytes]]()
 
     def publish(*names: str) -> None:
@@ -105,7 +115,7 @@ def test_what_begins_while_the_link_of_a_listener_is_cut_is_heard_from_its_begin
             publisher.publish(Encoded(*published[-1], ""))
 
     publish("known/chart/old")
-    arrived.append(heard.get(timeout=PATIENCE_S))
+    arrived.append(received.get(timeout=PATIENCE_S))
     new = ("known/chart/old", "known/chart/new", "new/chart/T", "new/chart/C")
     with proxy.cut("closed"):
         for _ in range(50):
@@ -113,9 +123,9 @@ def test_what_begins_while_the_link_of_a_listener_is_cut_is_heard_from_its_begin
     while len(arrived) == 1:
         publish(*new)
         with contextlib.suppress(Empty):
-            arrived.append(heard.get(timeout=0.01))
+            arrived.append(received.get(timeout=0.01))
     while len(arrived) < len(published):
-        arrived.append(heard.get(timeout=PATIENCE_S))
+        arrived.append(received.get(timeout=PATIENCE_S))
     for plant in ("known", "new"):  # each in its order
         of_plant = [[item for item in items if item[0].split("/")[1] == plant] for items in (arrived, published)]
         assert of_plant[0] == of_plant[1]
@@ -137,34 +147,32 @@ def test_what_could_not_be_recovered_is_counted_and_named_in_the_file_and_by_inf
     assert f"lost on the way: {found.missing} messages of reactor/cstr/sample" in info_text(seen, tmp_path / "run.mcap")
 
 
-def test_who_begins_to_listen_late_hears_what_was_before(tmp_path: Path, router: Router) -> None:
-    bus, heard, enough = connect_client(router.config), list[int](), threading.Event()
+def test_a_late_subscriber_receives_the_history(tmp_path: Path, router: Router) -> None:
+    bus, received, enough = connect_client(router.config), list[int](), threading.Event()
     publisher = Publisher(bus, RATE_PER_S)
     publisher.wait(300)
     late = connect_client(router.config)
 
-    def hear(message: Encoded) -> None:
+    def receive(message: Encoded) -> None:
         sample = decode(message.payload, message.encoding)
         assert isinstance(sample, Sample)
-        heard.append(sample.sequence)
-        if len(heard) >= 600 * SIGNALS:
+        received.append(sample.sequence)
+        if len(received) >= 600 * SIGNALS:
             enough.set()
 
-    late.subscribe(keys.all_keys("cstr", keys.SAMPLE), hear, history_s=60.0)
+    late.subscribe(keys.all_keys("cstr", keys.SAMPLE), receive, history_s=60.0)
     assert enough.wait(PATIENCE_S)
     publisher.close()
     late.close()
     bus.close()
-    assert heard == [number // SIGNALS for number in range(len(heard))]
+    assert received == [number // SIGNALS for number in range(len(received))]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("killed", [False, True], ids=["stopped", "killed"])
-def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
-    tmp_path: Path, router: Router, killed: bool
-) -> None:
+def test_a_restarted_recorder_loses_nothing_and_repeats_nothing(tmp_path: Path, router: Router, killed: bool) -> None:
     bus = connect_client(BusConfig(endpoint=router.config.endpoint, cache_messages=KEPT))
-    tokens, heard = Tokens(bus), Heard(bus)
+    tokens, received = Tokens(bus), Heard(bus)
     publisher = Publisher(bus, RATE_PER_S)
     try:
         with recorder_process(tmp_path, router.config.endpoint, tokens) as first:
@@ -175,7 +183,7 @@ def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
         with recorder_process(tmp_path, router.config.endpoint, tokens):
             publisher.wait(publisher.sequence + 200)
             publisher.close()
-            assert heard.wait(publisher.sequence * SIGNALS), "the recorder does not keep up"
+            assert received.wait(publisher.sequence * SIGNALS), "the recorder does not keep up"
     finally:
         publisher.close()
         bus.close()
@@ -196,28 +204,28 @@ def test_a_handler_that_blocks_holds_up_neither_the_publisher_nor_another_listen
     """Until the other has heard all, the handler does not return; then it hears the same."""
     rows, released = 3000, threading.Event()
     bus, stuck, quick = (connect_client(router.config) for _ in range(3))
-    heard: dict[str, list[int]] = {"stuck": [], "quick": []}
-    complete = {name: threading.Event() for name in heard}
+    received: dict[str, list[int]] = {"stuck": [], "quick": []}
+    complete = {name: threading.Event() for name in received}
 
-    def hear(name: str, message: Encoded) -> None:
+    def receive(name: str, message: Encoded) -> None:
         sample = decode(message.payload, message.encoding)
         assert isinstance(sample, Sample)
-        heard[name].append(sample.sequence)
-        if len(heard[name]) == rows * SIGNALS:
+        received[name].append(sample.sequence)
+        if len(received[name]) == rows * SIGNALS:
             complete[name].set()
 
-    def hear_and_block(message: Encoded) -> None:
-        hear("stuck", message)
+    def receive_and_block(message: Encoded) -> None:
+        receive("stuck", message)
         released.wait(PATIENCE_S)
 
     everything = keys.all_keys("cstr", keys.SAMPLE)
-    stuck.subscribe(everything, hear_and_block)
-    quick.subscribe(everything, lambda message: hear("quick", message))
+    stuck.subscribe(everything, receive_and_block)
+    quick.subscribe(everything, lambda message: receive("quick", message))
     publisher = Publisher(bus, 5 * RATE_PER_S)
     try:
         publisher.wait(rows)
         assert complete["quick"].wait(PATIENCE_S)
-        assert len(heard["stuck"]) == 1
+        assert len(received["stuck"]) == 1
         released.set()
         assert complete["stuck"].wait(PATIENCE_S)
     finally:
@@ -225,4 +233,4 @@ def test_a_handler_that_blocks_holds_up_neither_the_publisher_nor_another_listen
         publisher.close()
         for each in (stuck, quick, bus):
             each.close()
-    assert heard["stuck"][: rows * SIGNALS] == heard["quick"][: rows * SIGNALS]
+    assert received["stuck"][: rows * SIGNALS] == received["quick"][: rows * SIGNALS]

@@ -36,12 +36,12 @@ def watched(record: Record, out: Path, run: Command) -> DiagnosisRunner:
         for said in monitor.on_message(item, 0):
             bus.publish(encode(said))
 
-    def hear(item: Encoded) -> None:
+    def forward(item: Encoded) -> None:
         node.on_message(item, 0)
 
     bus.subscribe(samples, watch)
-    bus.subscribe(samples, hear)
-    bus.subscribe(alarms, hear)
+    bus.subscribe(samples, forward)
+    bus.subscribe(alarms, forward)
     for publication in samples_of(record, "cstr", ZERO_NS):
         bus.publish(encode(publication))
         diagnoses.wait()
@@ -75,7 +75,7 @@ def test_after_an_alarm_there_is_a_report_that_names_the_leak(leaking: Record, t
     assert said["report"] == str(folder / "report.html")
 
 
-def test_a_diagnosis_that_fails_is_told_and_the_next_one_is_done(leaking: Record, tmp_path: Path) -> None:
+def test_a_diagnosis_that_fails_is_reported_and_the_next_one_is_done(leaking: Record, tmp_path: Path) -> None:
     class Failing(Command):
         def __call__(self, arguments: list[str]) -> tuple[int, str, str]:
             return 2, "", "warning: something\nreactorwatch: record.mcap: T must vary\n"
@@ -88,7 +88,7 @@ def test_a_diagnosis_that_fails_is_told_and_the_next_one_is_done(leaking: Record
     assert not diagnoses.busy
 
 
-def test_a_folder_that_cannot_be_made_is_told(leaking: Record, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_reported(leaking: Record, tmp_path: Path) -> None:
     (tmp_path / "reports").write_text("a file")
     with structlog.testing.capture_logs() as logs:
         watched(leaking, tmp_path / "reports", Command())

@@ -1,4 +1,4 @@
-"""A monitor that is killed goes on where it was: the alarms are those of one that was never stopped."""
+"""A monitor that is killed resumes where it was: the alarms equal those of one that never stopped."""
 
 from pathlib import Path
 from typing import Any

@@ -157,7 +157,9 @@ def test_an_endless_run_obeys_and_stops_when_asked(
     assert (last.received, last.refused) == (3, 1)
 
 
-def test_without_a_router_it_says_what_it_waits_for_and_can_be_stopped(tmp_path: Path, bus_config: BusConfig) -> None:
+def test_without_a_router_it_reports_what_it_waits_for_and_can_be_stopped(
+    tmp_path: Path, bus_config: BusConfig
+) -> None:
     process = start(tmp_path, bus_config, "speed = inf\nduration_min = 1.0")
     assert process.stderr is not None
     said = ""

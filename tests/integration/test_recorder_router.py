@@ -73,7 +73,7 @@ def test_a_burst_is_recorded_without_a_loss_and_in_order(tmp_path: Path, bus_con
     assert health.received >= len(sent)
 
 
-def test_strangers_on_the_bus_do_it_no_harm(tmp_path: Path, bus_config: BusConfig) -> None:
+def test_foreign_messages_on_the_bus_do_it_no_harm(tmp_path: Path, bus_config: BusConfig) -> None:
     path, stop = tmp_path / "run.mcap", StopSignal()
     strange = [
         Encoded("reactor/cstr/sample/T", b"\xff\xfe", "application/json"),
@@ -189,7 +189,7 @@ def test_a_replay_that_waits_in_vain_can_be_stopped(tmp_path: Path, bus_config: 
     assert heard == []
 
 
-def test_what_cannot_be_replayed_is_told_before_the_waiting_for_a_router(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_replayed_is_reported_before_the_wait_for_a_router(tmp_path: Path) -> None:
     empty, two, path = tmp_path / "empty.mcap", tmp_path / "two.mcap", tmp_path / "one.csv"
     path.write_text("time_min,qc,C,T\n0,1,2,3\n")
     with RecordingWriter(empty, {}), RecordingWriter(two, {}) as writer:

@@ -1,4 +1,4 @@
-"""The router of a site says in its log what it refuses, without being flooded itself."""
+"""The router of a site logs what it refuses, at a bounded rate."""
 
 import signal
 import subprocess
@@ -52,7 +52,7 @@ def test_what_is_no_refusal_of_a_message_is_not_logged_and_not_printed(line: byt
     assert refusals.report(0) is None
 
 
-def test_other_lines_go_on_to_standard_output() -> None:
+def test_other_lines_are_passed_to_standard_output() -> None:
     assert not RefusalLog().add(b"ERROR zenoh: something else")
 
 
@@ -117,7 +117,7 @@ def publish_until(bus: Bus, end: threading.Event) -> None:
 @pytest.mark.parametrize(
     ("typed", "code"), [("router site/router/router.json5", 0), ("up --site site", 0), ("demo --site site -o new", 130)]
 )
-def test_every_command_that_is_the_router_of_a_site_logs_whom_it_refused_what(
+def test_every_command_that_is_the_router_of_a_site_logs_the_client_and_the_key_that_it_refused(
     tmp_path: Path, typed: str, code: int
 ) -> None:
     """The nodes of `up` and `demo` are left out."""

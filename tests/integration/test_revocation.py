@@ -1,4 +1,4 @@
-"""A revoked certificate may do nothing, and its holder goes on with the new one; a site without plants has a router."""
+"""A revoked certificate grants nothing, and its owner continues with the new one; a site may have no plant."""
 
 import datetime
 import shutil
@@ -37,27 +37,27 @@ def test_a_revoked_certificate_publishes_nothing_and_the_new_one_does(tmp_path: 
             stolen.publish(Encoded(SAMPLE, b"forged", ""))
             stolen.close()
         site.join("cstr/plant").publish(Encoded(SAMPLE, b"measured", ""))
-        heard = site.heard_until(lambda message: message.payload == b"measured")
-        assert [message.payload for message in heard] == [b"measured"]
+        received = site.received_until(lambda message: message.payload == b"measured")
+        assert [message.payload for message in received] == [b"measured"]
 
 
 def test_a_revoked_certificate_reads_nothing(tmp_path: Path) -> None:
     with closing(Revoking(tmp_path / "site")) as site:
-        heard: dict[str, list[bytes]] = {"stolen": [], "viewer": []}
+        received: dict[str, list[bytes]] = {"stolen": [], "viewer": []}
         stolen = connect(settings(tmp_path, "stolen"), "thief", OneAttempt())
         viewer = site.join("cstr/viewer")
         plant = site.join("cstr/plant")
         if stolen is not None:
-            stolen.subscribe(SAMPLE, lambda message: heard["stolen"].append(message.payload))
-        viewer.subscribe(SAMPLE, lambda message: heard["viewer"].append(message.payload))
+            stolen.subscribe(SAMPLE, lambda message: received["stolen"].append(message.payload))
+        viewer.subscribe(SAMPLE, lambda message: received["viewer"].append(message.payload))
         number = 0
-        while not heard["viewer"]:
+        while not received["viewer"]:
             number += 1
             plant.publish(Encoded(SAMPLE, str(number).encode(), ""))
             plant.query(Encoded("reactorwatch/nobody", b"", ""), 1.0)  # comes back when what was before it is through
         if stolen is not None:
             stolen.close()
-        assert heard["stolen"] == []
+        assert received["stolen"] == []
 
 
 def test_a_site_without_a_plant_has_a_router_that_lets_nothing_pass(tmp_path: Path) -> None:
@@ -68,10 +68,10 @@ def test_a_site_without_a_plant_has_a_router_that_lets_nothing_pass(tmp_path: Pa
         shutil.rmtree(site / plant)
     renewed(site)
     with closing(router_from_file(site / "router" / "router.json5")) as router:
-        heard: list[bytes] = []
-        router.subscribe(SAMPLE, lambda message: heard.append(message.payload))
+        received: list[bytes] = []
+        router.subscribe(SAMPLE, lambda message: received.append(message.payload))
         bus = connect(settings(tmp_path, "old"), "plant", OneAttempt())
         if bus is not None:
             bus.publish(Encoded(SAMPLE, b"x", ""))
             bus.close()
-        assert heard == []
+        assert received == []

@@ -68,7 +68,7 @@ def test_without_certificates_all_plants_are_shown() -> None:
     assert rows == [["a", "plant"], ["b", "plant"]]
 
 
-def test_without_a_router_it_says_so_in_one_line() -> None:
+def test_a_missing_router_is_reported_in_one_line() -> None:
     done = status("--endpoint", free_endpoint())
     assert done.returncode == 2
     assert "no router at" in done.stderr

@@ -1,4 +1,4 @@
-"""The monitor's core says again what was recorded of it, value for value; and what it does not is found out."""
+"""The monitor's core reproduces its recorded output value for value, and every difference is reported."""
 
 import json
 from collections import Counter
@@ -23,7 +23,7 @@ from recorder.files.writer import RecordingWriter
 
 from .watched_hour import ROWS, START_NS, record_hour
 
-Told = dict[str, Any]
+Report = dict[str, Any]
 Change = Callable[[RecordedMessage], RecordedMessage | None]
 
 
@@ -35,7 +35,7 @@ def hour(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def verified(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, Told]:
+def verified(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, Report]:
     """The exit code, and the JSON object."""
     code = run(path, None, None, as_json=True)
     return code, json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -63,16 +63,22 @@ def first_after(path: Path, key: str, minutes: float) -> RecordedMessage:
     return next(e for e in read_messages(path) if e.key == key and e.publish_time_ns >= START_NS + minutes * 60e9)
 
 
-def test_an_hour_with_faults_is_said_again_value_for_value(hour: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, told = verified(hour, capsys)
-    assert (code, told["exact"], told["rows"], told["differing"], told["after_the_end"]) == (0, True, ROWS, 0, 0)
-    assert told["kinds"] == [
+def test_an_hour_with_faults_is_reproduced_value_for_value(hour: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, report = verified(hour, capsys)
+    assert (code, report["exact"], report["rows"], report["differing"], report["after_the_end"]) == (
+        0,
+        True,
+        ROWS,
+        0,
+        0,
+    )
+    assert report["kinds"] == [
         {"kind": kind, "recorded": recorded(hour, kind), "equal": recorded(hour, kind)}
         for kind in (keys.ALARM, keys.ALARM_KPIS, keys.CHART, keys.ESTIMATE, keys.INCIDENT, keys.MODEL, keys.PROMISE)
     ]
 
 
-def test_what_people_did_and_what_the_clock_told_is_said_again_too(hour: Path) -> None:
+def test_commands_and_alarms_of_the_clock_are_reproduced_too(hour: Path) -> None:
     """Else the test before would prove less than it says."""
     assert {
         ("ewma/T", "raised"),
@@ -89,11 +95,11 @@ def test_what_people_did_and_what_the_clock_told_is_said_again_too(hour: Path) -
 def test_a_rotated_run_is_exact_as_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record_hour(tmp_path, rotate_min=0.2, black_box_min=0.0).stop()
     assert len(recordings_in(tmp_path)) >= 4
-    code, told = verified(tmp_path, capsys)
-    assert (code, told["rows"], told["differing"]) == (0, ROWS, 0)
+    code, report = verified(tmp_path, capsys)
+    assert (code, report["rows"], report["differing"]) == (0, ROWS, 0)
 
 
-def test_its_second_file_alone_cannot_be_verified_and_says_why(tmp_path: Path) -> None:
+def test_its_second_file_alone_cannot_be_verified_and_the_reason_is_reported(tmp_path: Path) -> None:
     record_hour(tmp_path, rotate_min=0.5, black_box_min=0.0).stop()
     with pytest.raises(InputError, match=r"the monitor was running before this recording begins.*verify the folder"):
         run(recordings_in(tmp_path)[1], None, None, as_json=False)
@@ -104,12 +110,12 @@ def test_a_recovered_run_is_exact_up_to_where_it_was_cut_off(
 ) -> None:
     record_hour(tmp_path / "run.mcap", black_box_min=0.0).kill()
     recover(tmp_path / "run.mcap.part", tmp_path / "saved.mcap")
-    code, told = verified(tmp_path / "saved.mcap", capsys)
-    assert (code, told["differing"]) == (0, 0)
-    assert ROWS - 10 < told["rows"] < ROWS + 1
+    code, report = verified(tmp_path / "saved.mcap", capsys)
+    assert (code, report["differing"]) == (0, 0)
+    assert ROWS - 10 < report["rows"] < ROWS + 1
 
 
-def test_a_recording_that_ends_between_a_sample_and_what_was_said_of_it_is_exact(
+def test_a_recording_that_ends_between_a_sample_and_its_results_is_exact(
     hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     last = list(read_messages(hour))[:-5][-1]
@@ -122,9 +128,9 @@ def test_a_recording_that_ends_between_a_sample_and_what_was_said_of_it_is_exact
         lambda e: e if e.log_time_ns < last.log_time_ns or keys.SAMPLE in e.key else None,
     )
     assert verified(cut_off, capsys)[0] == 0
-    code, told = verified(more, capsys)
-    assert (code, told["differing"]) == (0, 0)
-    assert told["after_the_end"] > 0
+    code, report = verified(more, capsys)
+    assert (code, report["differing"]) == (0, 0)
+    assert report["after_the_end"] > 0
 
 
 OWN = build_metadata()
@@ -146,7 +152,7 @@ def of_build(hour: Path, out: Path, build: dict[str, str], settings: str | None 
 
 
 @pytest.mark.parametrize("build", OTHER_BUILDS)
-def test_another_build_s_recording_is_said_to_be_one_before_all_else_also_if_only_a_later_file_is(
+def test_a_recording_of_another_build_is_reported_before_all_else_also_if_only_a_later_file_is_one(
     build: str, hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "run"
@@ -161,12 +167,12 @@ def test_another_build_s_recording_is_said_to_be_one_before_all_else_also_if_onl
         assert expected in (printed.err if as_json else printed.out).splitlines()[0]
 
 
-def test_a_verification_of_another_build_s_recording_says_so_in_its_first_note(
+def test_a_verification_of_another_build_s_recording_states_it_in_its_first_note(
     hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, told = verified(of_build(hour, tmp_path / "other.mcap", OTHER_BUILDS["another commit"]), capsys)
-    assert (code, told["exact"]) == (0, True)
-    assert "another build" in told["notes"][0]
+    code, report = verified(of_build(hour, tmp_path / "other.mcap", OTHER_BUILDS["another commit"]), capsys)
+    assert (code, report["exact"]) == (0, True)
+    assert "another build" in report["notes"][0]
     assert not [note for note in verified(hour, capsys)[1]["notes"] if "build" in note]
 
 
@@ -213,34 +219,34 @@ def test_what_was_recovered_after_a_cut_link_is_exact_whatever_the_order_of_the_
     cut_link = as_after_a_cut(hour, tmp_path / "cut.mcap")
     kinds = [entry.key.split("/")[2] for entry in read_messages(cut_link)]
     assert kinds != [entry.key.split("/")[2] for entry in read_messages(hour)]
-    code, told = verified(cut_link, capsys)
-    assert (code, told["rows"], told["differing"]) == (0, ROWS, 0)
+    code, report = verified(cut_link, capsys)
+    assert (code, report["rows"], report["differing"]) == (0, ROWS, 0)
 
 
-def test_samples_that_only_the_recorder_lost_make_a_difference_and_the_gap_is_told_with_it(
+def test_samples_that_only_the_recorder_lost_make_a_difference_and_the_gap_is_reported_with_it(
     hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     key, first = keys.key("cstr", keys.SAMPLE, "T"), START_NS + 26 * 60 * 10**9
     lost = as_after_a_cut(
         hour, tmp_path / "x.mcap", lambda e: e.key == key and first <= e.publish_time_ns < first + 10**10
     )
-    code, told = verified(lost, capsys)
-    assert (code, told["exact"]) == (1, False)
-    assert told["differences"][0]["at_min"] == 26.0
-    assert told["notes"][-1].startswith("2 messages of reactor/cstr/sample never reached this recording")
+    code, report = verified(lost, capsys)
+    assert (code, report["exact"]) == (1, False)
+    assert report["differences"][0]["at_min"] == 26.0
+    assert report["notes"][-1].startswith("2 messages of reactor/cstr/sample never reached this recording")
 
 
-def test_what_the_monitor_said_and_the_recorder_lost_is_as_many_differences(
+def test_each_message_of_the_monitor_that_the_recorder_lost_is_a_difference(
     hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     at_ns = START_NS + 26 * 60 * 10**9
     lost = as_after_a_cut(
         hour, tmp_path / "x.mcap", lambda e: f"/{keys.ESTIMATE}/" in e.key and e.publish_time_ns == at_ns
     )
-    code, told = verified(lost, capsys)
-    assert (code, told["differing"]) == (1, 4)  # of each output by the reference and by the identified model
-    assert {item["what"] for item in told["differences"]} == {"not recorded"}
-    assert told["notes"][-1].startswith("4 messages of reactor/cstr/estimate never reached this recording")
+    code, report = verified(lost, capsys)
+    assert (code, report["differing"]) == (1, 4)  # of each output by the reference and by the identified model
+    assert {item["what"] for item in report["differences"]} == {"not recorded"}
+    assert report["notes"][-1].startswith("4 messages of reactor/cstr/estimate never reached this recording")
 
 
 def test_a_sample_that_was_changed_in_its_last_digit_is_found_out(
@@ -257,9 +263,9 @@ def test_a_sample_that_was_changed_in_its_last_digit_is_found_out(
         sample.value *= 1.0 + 1e-15
         return entry._replace(payload=encode_message(sample)[0])
 
-    code, told = verified(rewritten(hour, tmp_path / "x.mcap", change), capsys)
-    assert (code, told["exact"]) == (1, False)
-    assert told["differences"][0]["at_min"] == 20.0
+    code, report = verified(rewritten(hour, tmp_path / "x.mcap", change), capsys)
+    assert (code, report["exact"]) == (1, False)
+    assert report["differences"][0]["at_min"] == 20.0
 
 
 def test_an_estimate_that_was_changed_is_named_with_both_values(
@@ -275,9 +281,9 @@ def test_an_estimate_that_was_changed_is_named_with_both_values(
         estimate.prediction = 438.0
         return entry._replace(payload=encode_message(estimate)[0])
 
-    code, told = verified(rewritten(hour, tmp_path / "x.mcap", change), capsys)
-    assert (code, told["differing"]) == (1, 1)
-    difference = told["differences"][0]
+    code, report = verified(rewritten(hour, tmp_path / "x.mcap", change), capsys)
+    assert (code, report["differing"]) == (1, 1)
+    difference = report["differences"][0]
     assert (difference["topic"], difference["at_min"]) == ("reactor/cstr/estimate/T", 25.0)
     assert (difference["what"], difference["recorded"]) == ("prediction", "438.0")
 
@@ -286,8 +292,8 @@ def test_an_alarm_that_was_taken_out_or_put_in_is_found_out(
     hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     alarm = first_after(hour, keys.key("cstr", keys.ALARM, "ewma/T"), 0.0)
-    code, told = verified(rewritten(hour, tmp_path / "a.mcap", lambda e: None if e == alarm else e), capsys)
-    assert (code, told["differing"], told["differences"][0]["what"]) == (1, 1, "not recorded")
+    code, report = verified(rewritten(hour, tmp_path / "a.mcap", lambda e: None if e == alarm else e), capsys)
+    assert (code, report["differing"], report["differences"][0]["what"]) == (1, 1, "not recorded")
     other = alarm._replace(key=alarm.key.replace("ewma", "cusum"))
     forged = rewritten(hour, tmp_path / "b.mcap", lambda e: e)
     with RecordingWriter(tmp_path / "c.mcap", read_metadata(forged)) as writer:
@@ -295,18 +301,20 @@ def test_an_alarm_that_was_taken_out_or_put_in_is_found_out(
             writer.write(entry)
             if entry == alarm:
                 writer.write(other)
-    code, told = verified(tmp_path / "c.mcap", capsys)
-    assert (code, told["differing"], told["differences"][0]["what"]) == (1, 1, "not said again")
+    code, report = verified(tmp_path / "c.mcap", capsys)
+    assert (code, report["differing"], report["differences"][0]["what"]) == (1, 1, "not said again")
 
 
-def test_a_monitor_that_was_started_anew_is_verified_as_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_monitor_that_was_restarted_is_verified_as_two_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     record_hour(tmp_path / "run.mcap", restart_at=250, black_box_min=0.0).stop()
-    code, told = verified(tmp_path / "run.mcap", capsys)
-    assert (code, told["rows"], told["differing"]) == (0, ROWS, 0)
-    assert "the monitor was started 2 times; 2 of these runs were verified" in told["notes"]
+    code, report = verified(tmp_path / "run.mcap", capsys)
+    assert (code, report["rows"], report["differing"]) == (0, ROWS, 0)
+    assert "the monitor was started 2 times; 2 of these runs were verified" in report["notes"]
 
 
-def test_a_cut_from_the_middle_says_that_it_cannot_be_verified(hour: Path, tmp_path: Path) -> None:
+def test_a_cut_from_the_middle_is_reported_as_not_verifiable(hour: Path, tmp_path: Path) -> None:
     window = sample_window([hour], START_NS + 20 * 60 * 10**9, START_NS + 40 * 60 * 10**9)
     cut([hour], tmp_path / "cut.mcap", window, read_metadata(hour))
     with pytest.raises(InputError, match="was running before this recording begins"):

@@ -53,7 +53,7 @@ class Counter:
         self._changed = threading.Condition()
         self.count = 0
 
-    def hear(self, _: object) -> None:
+    def add(self, _: object) -> None:
         with self._changed:
             self.count += 1
             self._changed.notify_all()
@@ -74,9 +74,9 @@ def test_a_run_that_was_recorded_over_a_cut_link_is_exact(tmp_path: Path, capsys
         proxy = Proxy(endpoint)
         watching, recording = StopSignal(), StopSignal()
         heard = Heard(bus)
-        bus.subscribe(keys.key("cstr", keys.SAMPLE, "T"), published.hear)
-        bus.subscribe(keys.key("cstr", keys.ESTIMATE, "T"), judged.hear)
-        bus.subscribe("reactor/cstr/**", lambda message: None if message.key == OF_RECORDER else said.hear(message))
+        bus.subscribe(keys.key("cstr", keys.SAMPLE, "T"), published.add)
+        bus.subscribe(keys.key("cstr", keys.ESTIMATE, "T"), judged.add)
+        bus.subscribe("reactor/cstr/**", lambda message: None if message.key == OF_RECORDER else said.add(message))
         with (
             contextlib.closing(proxy),
             running(lambda: record(config, BusConfig(endpoint=proxy.endpoint), recording), recording),

@@ -1,8 +1,8 @@
-"""An hour of a plant with faults in it, watched and recorded within this process, on a clock that is told.
+"""An hour of a plant with faults, monitored and recorded within this process, on a simulated clock.
 
 The plant is sixty times as fast as the clock. A quarter of an hour the monitor learns; a leak sets in at 30 minutes; an
-operator acknowledges and shelves what is raised; the thermometer says nothing for two minutes; and at 50 minutes
-nothing comes for longer than the clock of receipt has patience, so the monitor raises a silence that no sample tells.
+operator acknowledges and shelves what is raised; the thermometer is silent for two minutes; and at 50 minutes
+nothing comes for longer than the timeout on the clock of receipt, so the monitor raises a silence without a sample.
 """
 
 from collections.abc import Iterable
@@ -46,7 +46,7 @@ class Hour:
 
     def record(self, publications: Iterable[Publication]) -> None:
         """Publish to the recorder."""
-        self.fed.hear(publications, 0)
+        self.fed.receive(publications, 0)
 
     def publish(self, publication: Publication) -> None:
         """Publish to both."""

@@ -51,7 +51,7 @@ def test_whatever_is_accepted_leaves_finite_numbers(
 
 @settings(max_examples=200)
 @given(rows_of(ANY), FORGETTING, st.data())
-def test_stored_at_any_row_it_goes_on_with_the_same_bits(
+def test_stored_at_any_row_it_resumes_with_the_same_bits(
     rows: NDArray[np.float64], forgetting: float, data: st.DataObject
 ) -> None:
     stop = data.draw(st.integers(0, len(rows)))

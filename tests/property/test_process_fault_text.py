@@ -46,7 +46,7 @@ def test_units_of_time_are_the_same_time(minutes: float, unit: tuple[str, float]
 
 @settings(max_examples=500)
 @given(st.text(alphabet="coolant_flow:step=-0.5@3min,eE+ \n\t'\"\u0664\u00b2", max_size=40) | st.text(max_size=20))
-def test_any_text_is_a_fault_or_one_line_that_says_why_not(text: str) -> None:
+def test_any_text_is_a_fault_or_is_refused_in_one_line_with_the_reason(text: str) -> None:
     for start, end in (
         ("", ""),
         ("coolant_flow:step:", ""),

@@ -1,4 +1,4 @@
-"""What balances of mass and energy promise for any input, and what no choice of times may change."""
+"""Balances of mass and energy hold for any input, and results do not depend on the choice of times."""
 
 import numpy as np
 from hypothesis import given, settings

@@ -23,7 +23,7 @@ def test_it_has_time_version_file_hash_and_the_settings_that_were_chosen(tmp_pat
     assert "SHA-256 of the file" not in report_origin(tmp_path, {})
 
 
-def test_the_page_shows_it_as_text_and_without_it_says_nothing() -> None:
+def test_the_page_shows_it_as_text_and_omits_it_where_there_is_none() -> None:
     arguments = (CASES["named"], cstr(), EFFECTS, "a.csv", "extended.json")
     page = as_page(*arguments, origin={"file": "<a>.csv"})
     assert '<tr><th>file</th><td class="any">&lt;a&gt;.csv</td></tr>' in page

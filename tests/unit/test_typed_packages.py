@@ -1,4 +1,4 @@
-"""The wheel says of each of its packages that it carries types, so that mypy of its users sees them."""
+"""The wheel marks each of its packages as typed, so that mypy of its users sees the types."""
 
 import tomllib
 from pathlib import Path

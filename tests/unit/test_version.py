@@ -67,7 +67,7 @@ def test_the_option_version_prints_version_and_commit(
     assert re.fullmatch(rf"{re.escape(NUMBER)} \(commit ({COMMIT}|{UNKNOWN})\)", this_build())
 
 
-def test_a_version_without_commit_is_said_to_be_of_an_unknown_one() -> None:
+def test_a_version_without_commit_is_stated_as_unknown() -> None:
     assert describe_build("1.0", UNKNOWN) == "1.0 (commit unknown)"
 
 

@@ -2,7 +2,15 @@
 
 import pytest
 
-from tests.words import EXCEPTIONS, baseline, entries, is_participle, violations
+from tests.words import (
+    EXCEPTIONS,
+    baseline,
+    entries,
+    entries_of_tests,
+    is_participle,
+    violations,
+    violations_of_test,
+)
 
 HINT = "rename it; if it was moved by a merge or renamed for good, see tests/README.md"
 
@@ -22,6 +30,32 @@ def test_the_baseline_has_no_entry_that_no_longer_applies(now: set[str]) -> None
 
 def test_every_exception_is_needed(now: set[str]) -> None:
     assert sorted(EXCEPTIONS.keys() - now) == []
+
+
+def test_names_and_first_lines_of_the_tests_break_no_rule() -> None:
+    assert entries_of_tests() == []
+
+
+@pytest.mark.parametrize(
+    ("source", "entry"),
+    [
+        ("def test_who_joins_late_is_served(): ...", "test_who_joins_late_is_served: people"),
+        ("class Fed:\n    def hear(self): ...", "Fed.hear: people"),
+        ("class Told: ...", "Told: people"),
+        ("def test_it_goes_on(): ...", "test_it_goes_on: people"),
+        ('"""What is told."""', "module: head"),
+        ('"""Ports that nobody has."""', "module: head"),
+    ],
+)
+def test_a_breach_in_a_test_is_found_with_its_name(source: str, entry: str) -> None:
+    assert violations_of_test(source) == [entry]
+
+
+@pytest.mark.parametrize(
+    "source", ["def test_a_whole_number_is_sheared(): ...", '"""Delivery."""\n\n# nobody', "told = 1"]
+)
+def test_other_names_in_a_test_pass(source: str) -> None:
+    assert violations_of_test(source) == []
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from itertools import islice
+from math import inf
 from typing import NamedTuple
 
 from reactorwatch.contract.codec import Encoded
@@ -46,7 +47,8 @@ class Delivery:
     Args:
         handler: called with the messages, as many at a time as can be delivered.
         on_gap: called with messages that never arrived.
-        query_stream: returns the messages published in a stream in the last so many seconds, from publishers' caches.
+        query_stream: returns the messages published in a stream in the last so many seconds, from publishers' caches;
+            infinite: all that are there.
     """
 
     def __init__(
@@ -150,4 +152,18 @@ class Delivery:
                 self._deliver(self._buffer.release_overdue(now_ns, only_queried=True))
                 overdue = self._buffer.take_overdue(now_ns)
             for stream, after_ns in islice(overdue.items(), MAX_STREAMS_QUERIED):
-                self.receive(list(self._query_stream(stream, (now_ns - after_ns) / 1e9)))
+                self.receive(self._query_missing(stream, (now_ns - after_ns) / 1e9))
+
+    def _query_missing(self, stream: str, since_s: float) -> list[SequencedMessage]:
+        """Query what is missing in a stream.
+
+        Messages that waited long on their way, because this process was too busy to take them, were published longer
+        ago than their arrival tells. The replies then begin behind the gap, and all that is cached is queried.
+        """
+        replies = list(self._query_stream(stream, since_s))
+        oldest: dict[int, int] = {}
+        for reply in replies:
+            oldest[reply.publisher] = min(reply.number, oldest.get(reply.publisher, reply.number))
+        with self._changed:
+            begins_behind = self._buffer.is_missing_before(stream, oldest)
+        return list(self._query_stream(stream, inf)) if begins_behind else replies

@@ -23,7 +23,7 @@ with the oldest number, when nothing older has arrived for `START_WINDOW_NS`.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import accumulate
 from typing import Generic, NamedTuple
 
@@ -226,6 +226,18 @@ class ReorderBuffer(Generic[Item]):
             after_ns = self._starts_known_ns.get(stream, self._start_ns) if is_start else hold.after_ns
             overdue[stream] = min(overdue.get(stream, after_ns), after_ns, hold.first_arrival_ns)
         return overdue
+
+    def is_missing_before(self, stream: str, oldest: Mapping[int, int]) -> bool:
+        """True if a message is missing before the oldest number that a publisher's cache returned, by publisher."""
+        states = {publisher: self._streams.get((publisher, stream)) for publisher in oldest}
+        return any(
+            state is not None
+            and state.hold is not None
+            and state.hold.held
+            and state.expected is not None
+            and state.expected < oldest[publisher]
+            for publisher, state in states.items()
+        )
 
     def _stream(self, publisher: int, stream: str) -> StreamState[Item]:
         return self._streams.get((publisher, stream)) or self._add_stream((publisher, stream), 0)

@@ -63,7 +63,7 @@ def test_the_confusion_table_counts_what_each_truth_was_called() -> None:
     assert found == {"a": [("a", 2), ("b", 1)], "nominal": [("nominal", 1)]}
 
 
-def test_a_failure_is_told_with_its_seed() -> None:
+def test_a_failure_is_reported_with_its_seed() -> None:
     (line,) = failures({"medium": [one("a", "a"), one("a", "b")]})
     assert "seed 1" in line
     assert "a step 2 " in line

@@ -67,7 +67,7 @@ def test_until_the_onset_the_fault_changes_nothing_and_a_ramp_then_reaches_its_s
     assert truth.faulty[-1] - truth.nominal[-1] == pytest.approx([0.0, -8.0], abs=1e-9)
 
 
-def test_a_run_goes_on_for_the_time_in_which_faults_are_to_be_found(ramp: tuple[Case, Record]) -> None:
+def test_a_run_lasts_for_the_time_in_which_faults_are_to_be_found(ramp: tuple[Case, Record]) -> None:
     case, record = ramp
     assert case.onset_min >= ONSET_MIN
     assert 0 <= case.onset_min + AFTER_MIN - record.time_min[-1] < 0.1

@@ -1,4 +1,4 @@
-"""Detections, delays and rates are counted as the benchmark says."""
+"""Detections, delays and rates are counted as the benchmark defines them."""
 
 from math import inf
 

@@ -63,7 +63,7 @@ def test_limits_are_learned_from_the_watched_rows_alone() -> None:
     assert {name: item.size for name, item in fault_free_statistics(5, rows=1200).items()} == {"ARX": 200, "OE": 200}
 
 
-def test_the_table_and_the_summary_tell_what_was_found(result: CaseResult, quiet: FaultFreeResult) -> None:
+def test_the_table_and_the_summary_list_the_results(result: CaseResult, quiet: FaultFreeResult) -> None:
     console = Console(file=io.StringIO(), width=200)
     print_table(console, [result], BUDGET)
     print_summary(console, [result], BUDGET, WIDTHS)

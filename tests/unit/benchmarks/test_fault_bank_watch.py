@@ -1,4 +1,4 @@
-"""What is read from the monitor's messages: when alarms stood, and whom it suspected."""
+"""Intervals of alarms and suspects, read from the monitor's messages."""
 
 from math import inf
 
@@ -30,7 +30,7 @@ def watched(alarms: list[Alarm], *incidents: Incident) -> Watched:
     return Watched(alarms, list(incidents), 0.0, 450.0)
 
 
-def test_an_alarm_stands_from_raised_to_cleared_whatever_is_said_between() -> None:
+def test_an_alarm_is_active_from_raised_to_cleared_whatever_is_published_between() -> None:
     messages = [
         alarm("raised", 301.0),
         alarm("raised", 302.0, "ewma/C"),
@@ -72,6 +72,6 @@ def test_a_suspect_of_little_probability_is_not_among_the_likely() -> None:
     assert suspicion(messages, "coolant_flow", 301.0, 400.0) == Suspicion()
 
 
-def test_without_a_detection_nobody_is_suspected() -> None:
+def test_without_a_detection_there_is_no_suspect() -> None:
     messages = watched([alarm("raised", 200.0)], suspected(200.0, coolant_flow=1.0))
     assert suspicion(messages, "coolant_flow", detected_min=inf, until_min=450.0) == Suspicion()

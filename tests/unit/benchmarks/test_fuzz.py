@@ -1,4 +1,4 @@
-"""A sample of `make fuzz`: nothing that is sent or written makes a node fall over, and no stranger raises an alarm."""
+"""A sample of `make fuzz`: no input crashes a node, and no foreign message raises an alarm."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -1,4 +1,4 @@
-"""`scale` on a busy machine: its parts start, and one that does not says why."""
+"""`scale` on a busy machine: its parts start, and one that does not reports the reason."""
 
 import itertools
 from pathlib import Path
@@ -23,7 +23,7 @@ def short_record() -> list[Encoded]:
     ]
 
 
-def test_the_part_without_a_bus_takes_a_clock_that_goes_on_while_others_have_the_machine(
+def test_the_part_without_a_bus_uses_a_clock_that_runs_while_other_processes_have_the_machine(
     short_record: list[Encoded], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A monitor that did not run for more than five seconds asks its bus for the router."""

@@ -33,7 +33,7 @@ def test_memory_is_level_if_the_median_does_not_grow_after_the_warm_up(memory_mb
     assert (growth_mb <= GROWTH_MB) == is_level
 
 
-def test_nothing_is_said_of_a_process_that_was_restarted_after_the_warm_up() -> None:
+def test_no_growth_is_reported_of_a_process_that_was_restarted_after_the_warm_up() -> None:
     assert find_growth_mb(taken(*[100.0] * 9, pids=(1, 2, 2)), ROWS) == 0.0
     assert find_growth_mb(taken(*[100.0] * 9, pids=(1, 1, 2)), ROWS) is None
     assert find_growth_mb(taken(*[100.0] * 9)[:6], ROWS) is None

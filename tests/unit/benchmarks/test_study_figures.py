@@ -1,4 +1,4 @@
-"""The study draws every figure of the report, says what it found with numbers that are known, and repeats itself."""
+"""The study draws every figure of the report, prints its results with known numbers, and is reproducible."""
 
 import re
 import sys

@@ -36,7 +36,7 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
 
 
 @pytest.mark.parametrize("what", ["accept", "relearn", "restore"])
-def test_a_command_carries_who_and_why(sent: list[tuple[Any, ...]], what: str) -> None:
+def test_a_command_carries_its_author_and_reason(sent: list[tuple[Any, ...]], what: str) -> None:
     words = ["baseline", what, "--plant", "north", "--by", "Anna", "--why", "new pump"]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output

@@ -1,4 +1,4 @@
-"""A plant that only its columns describe is watched live, too: by `up --record` and `monitor`."""
+"""A plant that only its columns describe is monitored live, too: by `up --record` and `monitor`."""
 
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ def test_the_monitor_takes_its_signals_from_columns(
 ) -> None:
     started: list[MonitorConfig] = []
 
-    def start(config: MonitorConfig, *_: Any) -> None:
+    def start(config: MonitorConfig, *_: Any, **__: Any) -> None:
         started.append(config)
 
     monkeypatch.setattr("monitor_node.__main__.run", start)

@@ -1,4 +1,4 @@
-"""What is no mistake of a person's: one line, the path of a report, exit code 70; and no known input comes to that."""
+"""Internal errors: one line, the path of a report, exit code 70; no known input leads to one."""
 
 import re
 import shlex

@@ -1,4 +1,4 @@
-"""What diagnoses after alarms take from the settings, the flags and the monitor."""
+"""Settings of diagnoses after alarms, from the settings file, the flags and the monitor."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ def test_plant_and_model_are_those_of_the_monitor(tmp_path: Path) -> None:
     assert found == DiagnosisConfig(plant="unit_2", out=str(tmp_path / "reports"), process=monitor.process)
 
 
-def test_settings_say_otherwise_and_a_flag_says_more(tmp_path: Path) -> None:
+def test_settings_override_the_default_and_a_flag_overrides_both(tmp_path: Path) -> None:
     table = {"out": "here", "after_min": 12.0}
     assert diagnosis_settings({"diagnosis": table}, MonitorConfig(), None) == DiagnosisConfig(out="here", after_min=12)
     assert diagnosis_settings({"diagnosis": table}, MonitorConfig(), tmp_path).out == str(tmp_path)
@@ -35,7 +35,7 @@ def test_settings_say_otherwise_and_a_flag_says_more(tmp_path: Path) -> None:
         ({"window_min": 10.0}, r"window_min must be in \[20, 1e\+06\], got 10"),
     ],
 )
-def test_what_cannot_be_is_told_before_anything_runs(
+def test_an_impossible_setting_is_reported_before_anything_runs(
     table: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

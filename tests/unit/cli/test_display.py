@@ -1,4 +1,4 @@
-"""Rows for people: aligned, cut to a terminal, and plain elsewhere."""
+"""Table rows: aligned, cut to a terminal, and plain elsewhere."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""What `monitor` says of a fleet that cannot be: one line, and exit code 2, before it waits for a router."""
+"""`monitor` refuses an impossible fleet in one line with exit code 2, before it waits for a router."""
 
 import sys
 from pathlib import Path
@@ -11,7 +11,7 @@ NOT_PLANTS = "plants must be reactor/ and a name with or without '*'"
 NO_SHARD = "shard must be like 2/5, the second of five"
 
 
-def said_of(options: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+def error_line(options: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
     """The line that the command ends with."""
     monkeypatch.setattr(sys, "argv", ["reactorwatch", "monitor", "--endpoint", "tcp/127.0.0.1:1", *options])
     with pytest.raises(SystemExit) as ended:
@@ -27,14 +27,14 @@ def said_of(options: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 def test_plants_that_are_no_key_expression_of_plants(
     plants: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    line = said_of(["--plants", plants], monkeypatch, capsys)
+    line = error_line(["--plants", plants], monkeypatch, capsys)
     assert NOT_PLANTS in line
     assert f"got {plants!r}" in line
 
 
 @pytest.mark.parametrize("shard", ["", "2", "0/5", "6/5", "-1/5", "1/0", "two/five", "1/2/3", "1/1001", "1 /2"])
 def test_a_shard_that_is_none(shard: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    line = said_of(["--plants", "reactor/*", "--shard", shard], monkeypatch, capsys)
+    line = error_line(["--plants", "reactor/*", "--shard", shard], monkeypatch, capsys)
     assert NO_SHARD in line
     assert f"got {shard!r}" in line
 
@@ -50,7 +50,7 @@ def test_a_shard_that_is_none(shard: str, monkeypatch: pytest.MonkeyPatch, capsy
 def test_options_that_do_not_go_together(
     options: list[str], why: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert why in said_of(options, monkeypatch, capsys)
+    assert why in error_line(options, monkeypatch, capsys)
 
 
 @pytest.mark.parametrize("options", [["--plants", "reactor/*"], []])
@@ -58,7 +58,7 @@ def test_a_folder_for_states_that_cannot_be_made(
     options: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").touch()
-    line = said_of([*options, "--state", str(tmp_path / "file")], monkeypatch, capsys)
+    line = error_line([*options, "--state", str(tmp_path / "file")], monkeypatch, capsys)
     assert f"--state {tmp_path / 'file'}: is a file, the name of a folder was expected" in line
 
 
@@ -67,7 +67,7 @@ def test_a_file_that_can_hold_but_one_plants_state(
 ) -> None:
     settings = tmp_path / "settings.toml"
     settings.write_text("[monitor]\nstate_file = 'x'\n")
-    line = said_of(["--config", str(settings), "--plants", "reactor/*"], monkeypatch, capsys)
+    line = error_line(["--config", str(settings), "--plants", "reactor/*"], monkeypatch, capsys)
     assert "holds what is known of one plant; a fleet takes [fleet] state, a folder" in line
 
 
@@ -78,4 +78,4 @@ def test_settings_that_make_no_monitor(
     settings.write_text(
         "[monitor]\noutputs = ['p']\npriorities = {}\nreference = 'process'\n[fleet]\nplants = 'reactor/*'\n"
     )
-    assert "reference" in said_of(["--config", str(settings)], monkeypatch, capsys)
+    assert "reference" in error_line(["--config", str(settings)], monkeypatch, capsys)

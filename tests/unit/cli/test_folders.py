@@ -1,4 +1,4 @@
-"""What a folder stands for where many files may be named."""
+"""Expansion of folders where many files may be named."""
 
 from pathlib import Path
 
@@ -51,7 +51,7 @@ def test_a_pattern_is_the_files_that_are_like_it_in_order_of_their_names(
     assert expand_files([tmp_path / "*.csv"])[0] == tmp_path / "[x].csv"
 
 
-def test_what_nothing_is_like_is_told(tmp_path: Path) -> None:
+def test_a_pattern_without_a_match_is_reported(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"run-\*.csv: no file is called like this"):
         expand_files([tmp_path / "run-*.csv"])
 

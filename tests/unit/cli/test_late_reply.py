@@ -1,4 +1,4 @@
-"""A node that is too busy to answer is told from one that does not run."""
+"""A busy node is distinguished from one that does not run."""
 
 import json
 import threading

@@ -13,7 +13,7 @@ THREADS = "OPENBLAS_NUM_THREADS"
 
 
 @pytest.mark.parametrize(("given", "then"), [(None, "1"), ("3", "3")])
-def test_linear_algebra_has_one_thread_unless_somebody_wants_more(
+def test_linear_algebra_has_one_thread_unless_more_are_set(
     given: str | None, then: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(THREADS, given or "")

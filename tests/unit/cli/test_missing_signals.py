@@ -96,7 +96,7 @@ def test_identify_names_the_signal_that_has_no_value_and_the_file(
     assert f"{record}.csv: {signal} has no measured value, so no model of {output} can be fitted" in told
 
 
-def test_backtest_says_why_no_training_was_fit_and_blames_no_length(
+def test_backtest_reports_why_no_training_was_fit_and_does_not_blame_its_length(
     main: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Rows at random times, watched by the identified model, which needs one period."""

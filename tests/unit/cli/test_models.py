@@ -1,4 +1,4 @@
-"""`identify` and `linearise` say what the contract promises, for machines and for people."""
+"""`identify` and `linearise` print what the contract promises, as text and as JSON."""
 
 import json
 from pathlib import Path
@@ -68,7 +68,7 @@ def test_row_by_row_gives_what_all_rows_at_once_give(measured: Record) -> None:
     assert by_row["recursive"] is True
 
 
-def test_compare_says_which_and_why(measured: Record) -> None:
+def test_compare_names_the_chosen_model_and_the_reason(measured: Record) -> None:
     text = identification.compare(measured, ("qc",), ("C",), TWO, as_json=False)
     assert text.splitlines()[-1].endswith(".")
     said = json.loads(identification.compare(measured, ("qc",), ("C",), TWO, as_json=True))
@@ -93,7 +93,7 @@ def test_options_that_make_no_model_are_refused(measured: Record, options: dict[
         identified(measured, **options)
 
 
-def test_linearise_tells_the_table_of_the_plant() -> None:
+def test_linearise_prints_the_table_of_the_plant() -> None:
     """Eigenvalues as published for qc = 100 and 85 l/min."""
     points = json.loads(describe(cstr(), [100.0], 1.0, as_json=True))["steady_states"]
     assert [point["kind"] for point in points] == ["stable node", "saddle", "stable focus"]

@@ -1,4 +1,4 @@
-"""A disk that is full, for every command with an output: one line, exit code 2, nothing left, and the answer is said.
+"""A full disk, for every command with an output: one line, exit code 2, no file left, and the result is printed.
 
 The limit on the size of files stands for the disk: the system refuses what goes beyond it, to every writer there is.
 """
@@ -107,7 +107,7 @@ class Full(io.TextIOWrapper):
         *("simulate good.csv -o new.csv", "export plant0.mcap -o new.csv", "diagnose good.csv"),
     ],
 )
-def test_where_nothing_can_be_printed_the_exit_code_says_so(
+def test_where_nothing_can_be_printed_the_exit_code_reports_it(
     folder: Path, typed: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(diagnosis, "find_causes", lambda *_: CASES["ambiguous"])
@@ -117,7 +117,7 @@ def test_where_nothing_can_be_printed_the_exit_code_says_so(
     assert said == "reactorwatch: standard output cannot be written: No space left on device\n"
 
 
-def test_a_process_of_its_own_says_the_same_and_nothing_more() -> None:
+def test_a_process_of_its_own_prints_the_same_and_nothing_more() -> None:
     code = "from reactorwatch.cli.main import main; main()"
     with Path("/dev/full").open("wb") as full:
         done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Where no file can be watched, diagnosed or identified, the exit code is 3, and each line states why."""
+"""Exit code 3 if no file can be monitored, diagnosed or identified; each line states the reason."""
 
 import csv
 import json
@@ -122,7 +122,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         *cases(NOTHING_TO_IDENTIFY, "identify"),
     ],
 )
-def test_a_record_that_holds_too_little_ends_with_3_and_one_line_that_says_why(
+def test_a_record_that_holds_too_little_ends_with_3_and_one_line_with_the_reason(
     command: str, columns: Columns, options: tuple[str, ...], why: str, folder: Path, called: Command
 ) -> None:
     write(folder / "run.csv", columns)
@@ -142,7 +142,7 @@ def test_a_record_that_holds_too_little_ends_with_3_and_one_line_that_says_why(
         assert not (folder / "rows.csv").exists()
 
 
-def test_of_several_files_each_line_says_whether_it_was_watched_and_one_that_was_is_enough(
+def test_of_several_files_each_line_states_whether_it_was_monitored_and_one_that_was_is_enough(
     folder: Path, called: Command
 ) -> None:
     write(folder / "irregular.csv", irregular())

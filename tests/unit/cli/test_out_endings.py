@@ -1,4 +1,4 @@
-"""A name that an option such as `-o` gives says by its ending what is written, or is refused."""
+"""The ending of a name that an option such as `-o` gives selects the format, or is refused."""
 
 import shlex
 import sys

@@ -285,7 +285,7 @@ FOREIGN = {
 
 @pytest.mark.parametrize("content", FOREIGN.values(), ids=FOREIGN.keys())
 @pytest.mark.parametrize("case", [case for case in ALL if not case.never_overwrites], ids=lambda case: case.typed)
-def test_a_file_of_another_kind_than_its_name_says_is_kept_unless_force_is_given(
+def test_a_file_of_another_kind_than_its_name_implies_is_kept_unless_force_is_given(
     folder: Path, case: Case, content: bytes, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in case.written or ((case.out,) if case in OF_FILES else ()):

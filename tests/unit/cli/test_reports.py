@@ -1,4 +1,4 @@
-"""`backtest` says what judged the rows and by which noise levels."""
+"""`backtest` prints the reference in use and its noise levels."""
 
 import dataclasses
 import re
@@ -91,7 +91,7 @@ SILENCE = Suspect(cause="silence", probability=1.0, kind="sensor")
 SILENT = "the plant is silent: no sample of it comes"
 
 
-def test_the_headline_of_an_incident_says_what_it_is_since_when_and_how_sure() -> None:
+def test_the_headline_of_an_incident_states_its_cause_onset_and_probability() -> None:
     alarms = [raised("ewma/T", 150.3, 160.0, 1), raised("mewma/all", 151.0, None, 1, LEAK)]
     assert headline(alarms, 0) == [
         "Detected since 150 min: 15 % of the coolant lost (94 %); 2 alarms, the first ewma/T at 150.3 min"
@@ -99,7 +99,7 @@ def test_the_headline_of_an_incident_says_what_it_is_since_when_and_how_sure() -
     assert headline([], 0) == ["no alarms"]
 
 
-def test_an_incident_without_a_named_cause_says_what_deviates() -> None:
+def test_an_incident_without_a_named_cause_lists_what_deviates() -> None:
     alarm = raised("shewhart/T", 150.3, None, 1, text="T is 7 K above the model; Q1 is at its upper bound")
     assert headline([alarm], 0) == [
         "Detected since 150.3 min: T is 7 K above the model, no cause named; 1 alarm, shewhart/T at 150.3 min"
@@ -172,7 +172,7 @@ def test_whatever_is_raised_there_is_one_line_an_incident_and_none_states_the_al
     assert shown == sorted(shown, reverse=True)
 
 
-def test_the_promise_that_a_training_cannot_keep_is_said_before_the_alarms_and_they_are_no_detections() -> None:
+def test_the_promise_that_a_training_cannot_keep_is_reported_before_the_alarms_and_they_are_no_detections() -> None:
     result = judged("arx")
     assert result.promise is not None
     weak = type(result.promise)()

@@ -48,7 +48,7 @@ def test_a_named_process_is_the_plant_s_and_the_monitor_s_and_names_both(name: s
     assert load_source({}, {"process": name, "name": "north"}, None).plant == "north"
 
 
-def test_the_process_of_the_plant_s_settings_is_the_monitor_s_unless_its_own_settings_say_more() -> None:
+def test_the_process_of_the_plant_s_settings_is_the_monitor_s_unless_its_own_settings_name_one() -> None:
     tables: dict[str, dict[str, Any]] = {"plant": {"process": "three_tanks", "name": "north"}}
     source = load_source(tables, {}, None)
     assert source.monitor_flags(tables) == {"plant": "north", "process": "three_tanks"}

@@ -1,4 +1,4 @@
-"""Commands that take a record take one of several runs, and say so."""
+"""Commands that take a record take one of several runs, and report it."""
 
 import json
 from dataclasses import replace

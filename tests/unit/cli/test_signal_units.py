@@ -98,7 +98,7 @@ def test_units_go_into_recordings_and_drawings_and_back(rig: Path, tmp_path: Pat
     assert signal_title("T", "K") != "T" == signal_title("T", "degC")
 
 
-def test_identification_speaks_of_the_unit_that_is_known(rig: Path) -> None:
+def test_identification_uses_the_known_unit(rig: Path) -> None:
     measured = read_csv(rig, COLUMNS)
     form = ModelForm(order=2)
     text = identification.fit(measured, ("qc",), ("C", "T"), form, as_json=False)

@@ -1,4 +1,4 @@
-"""What `status` shows is what was said: rates counted by hand, alarms in sight, nodes that are there or not."""
+"""`status` shows what was published: rates counted by hand, active alarms, nodes that are present or not."""
 
 from google.protobuf.message import Message
 
@@ -12,7 +12,7 @@ S = 10**9
 START_NS = 1_000 * S
 
 
-def said(key: str, message: Message, at_s: float = 0.0) -> Encoded:
+def encoded(key: str, message: Message, at_s: float = 0.0) -> Encoded:
     return Encoded(f"reactor/{key}", *encode_message(message), START_NS + round(at_s * S))
 
 
@@ -24,7 +24,7 @@ def test_a_rate_is_samples_over_the_last_ten_whole_seconds() -> None:
     board = StatusBoard(START_NS)
     for tenth in range(300):  # three samples each tenth of a second
         for signal in ("qc", "C", "T"):
-            board.on_message(said(f"a/sample/{signal}", Sample(time_ns=1), tenth / 10))
+            board.on_message(encoded(f"a/sample/{signal}", Sample(time_ns=1), tenth / 10))
     assert board.plant("a", START_NS + 30 * S)["samples_per_s"] == 30.0
     assert board.plant("a", START_NS + 35 * S)["samples_per_s"] == 15.0
     assert board.plant("a", START_NS + 60 * S)["samples_per_s"] == 0.0
@@ -33,20 +33,20 @@ def test_a_rate_is_samples_over_the_last_ten_whole_seconds() -> None:
 def test_the_second_in_which_listening_began_is_not_counted() -> None:
     board = StatusBoard(START_NS + S // 2)
     for tenth in range(5, 40):
-        board.on_message(said("a/sample/T", Sample(time_ns=1), tenth / 10))
+        board.on_message(encoded("a/sample/T", Sample(time_ns=1), tenth / 10))
     assert board.plant("a", START_NS + 3 * S)["samples_per_s"] == 10.0
 
 
 def test_without_a_whole_second_there_is_no_rate() -> None:
     board = StatusBoard(START_NS)
-    board.on_message(said("a/sample/T", Sample(time_ns=1)))
+    board.on_message(encoded("a/sample/T", Sample(time_ns=1)))
     assert board.plant("a", START_NS + S // 2)["samples_per_s"] is None
 
 
-def test_plants_are_told_apart() -> None:
+def test_plants_are_distinguished() -> None:
     board = StatusBoard(START_NS)
     board.on_token("reactor/b/alive/plant", True)
-    board.on_message(said("a/health/plant", Health(time_ns=START_NS)))
+    board.on_message(encoded("a/health/plant", Health(time_ns=START_NS)))
     assert board.plants == ["a", "b"]
     assert [node["alive"] for node in board.plant("a", START_NS)["nodes"]] == [False]
     assert [node["alive"] for node in board.plant("b", START_NS)["nodes"]] == [True]
@@ -54,7 +54,7 @@ def test_plants_are_told_apart() -> None:
 
 def test_a_node_that_goes_is_not_there() -> None:
     board = StatusBoard(START_NS)
-    board.on_message(said("a/health/plant", Health(time_ns=START_NS, phase="running")))
+    board.on_message(encoded("a/health/plant", Health(time_ns=START_NS, phase="running")))
     board.on_token("reactor/a/alive/plant", True)
     board.on_token("reactor/a/alive/plant", False)
     (node,) = board.plant("a", START_NS + 3 * S)["nodes"]
@@ -72,21 +72,21 @@ def test_alarms_in_sight_are_shown_the_most_urgent_first() -> None:
             (AlarmState.ALARM_STATE_SHELVED, Priority.PRIORITY_CRITICAL),
         ]
     ):
-        board.on_message(said(f"a/alarm/x/{number}", alarm(f"x/{number}", state, priority)))
+        board.on_message(encoded(f"a/alarm/x/{number}", alarm(f"x/{number}", state, priority)))
     alarms = board.plant("a", START_NS)["alarms"]
     assert [(item["alarm"], item["state"]) for item in alarms] == [("x/1", "acknowledged"), ("x/0", "unacknowledged")]
 
 
 def test_what_was_published_is_newer_than_what_was_listed() -> None:
     board = StatusBoard(START_NS)
-    board.on_message(said("a/alarm/x/T", alarm("x/T", AlarmState.ALARM_STATE_ACKNOWLEDGED)))
+    board.on_message(encoded("a/alarm/x/T", alarm("x/T", AlarmState.ALARM_STATE_ACKNOWLEDGED)))
     board.on_alarms("a", [alarm("x/T", AlarmState.ALARM_STATE_UNACKNOWLEDGED)])
     assert [item["state"] for item in board.plant("a", START_NS)["alarms"]] == ["acknowledged"]
 
 
 def test_what_comes_from_the_bus_is_shown_as_it_is() -> None:
     board = StatusBoard(START_NS)
-    board.on_message(said("a/health/plant", Health(time_ns=START_NS, phase="[/b]")))
+    board.on_message(encoded("a/health/plant", Health(time_ns=START_NS, phase="[/b]")))
     board.on_token("reactor/a/alive/plant", True)
     assert "[/b]" in board.text(START_NS)
 
@@ -101,7 +101,7 @@ def test_an_alarm_of_a_priority_or_state_that_this_version_does_not_know_is_show
     """`status` and `alarm list` go on beside a newer monitor."""
     odd = Alarm(alarm="x/T", priority=99, state=AlarmState.ALARM_STATE_UNACKNOWLEDGED)  # type: ignore[arg-type]
     board = StatusBoard(START_NS)
-    board.on_message(said("a/alarm/x/T", odd))
+    board.on_message(encoded("a/alarm/x/T", odd))
     assert [item["priority"] for item in board.plant("a", START_NS)["alarms"]] == ["99"]
     odd.state = 88  # type: ignore[assignment]
     assert alarm_line(odd).startswith("x/T (99): 88")
@@ -111,9 +111,9 @@ def test_each_signal_has_its_newest_value_and_unit_and_a_missing_one_of_the_proc
     board = StatusBoard(START_NS, find_process("three_tanks"))
     good = Quality.QUALITY_GOOD
     for value in (1.5, 2.5):
-        board.on_message(said("a/sample/h1", Sample(value=value, unit="mm", quality=good)))
-    board.on_message(said("a/sample/h2", Sample(value=7.0, quality=Quality.QUALITY_BAD)))
-    board.on_message(said("a/sample/pH", Sample(value=6.0, quality=good)))
+        board.on_message(encoded("a/sample/h1", Sample(value=value, unit="mm", quality=good)))
+    board.on_message(encoded("a/sample/h2", Sample(value=7.0, quality=Quality.QUALITY_BAD)))
+    board.on_message(encoded("a/sample/pH", Sample(value=6.0, quality=good)))
     assert board.plant("a", START_NS)["signals"] == {
         "Q1": {"value": None, "unit": "cm3/s", "role": "input"},
         "Q2": {"value": None, "unit": "cm3/s", "role": "input"},
@@ -129,12 +129,12 @@ def test_it_shows_values_training_the_age_of_alarms_their_cause_and_the_command_
     board = StatusBoard(START_NS)
     good = Quality.QUALITY_GOOD
     board.on_token("reactor/a/alive/monitor", True)
-    board.on_message(said("a/health/monitor", Health(time_ns=START_NS, phase="training", training=0.431)))
-    board.on_message(said("a/sample/T", Sample(time_ns=START_NS + 900 * S, value=438.54, unit="K", quality=good)))
+    board.on_message(encoded("a/health/monitor", Health(time_ns=START_NS, phase="training", training=0.431)))
+    board.on_message(encoded("a/sample/T", Sample(time_ns=START_NS + 900 * S, value=438.54, unit="K", quality=good)))
     leak = alarm("ewma/T", AlarmState.ALARM_STATE_UNACKNOWLEDGED, Priority.PRIORITY_HIGH)
     leak.raised_ns, leak.incident = START_NS + 180 * S, 7
     leak.suspects.append(Suspect(cause="coolant_flow", probability=0.93, text="15 % of the coolant lost"))
-    board.on_message(said("a/alarm/ewma/T", leak))
+    board.on_message(encoded("a/alarm/ewma/T", leak))
     values, node, header, row, advice = board.text(START_NS + 5 * S).splitlines()
     assert "T 438.54 K" in values
     assert " ".join(node.split()) == "monitor training 43 % 5 s ago lost 0 refused 0 lag 0.0 ms"
@@ -151,7 +151,7 @@ def test_alarms_are_sorted_by_priority_and_incident_and_each_line_fits() -> None
     for name, priority, incident in (("a/1", 2, 1), ("a/2", 3, 1), ("a/3", 3, 2)):
         item = alarm(name, AlarmState.ALARM_STATE_UNACKNOWLEDGED, Priority.Name(priority))  # type: ignore[arg-type]
         item.incident, item.text = incident, "a sentence that is much longer than a terminal is wide " * 3
-        board.on_message(said(f"p/alarm/{name}", item))
+        board.on_message(encoded(f"p/alarm/{name}", item))
     lines = board.text(START_NS, width=80).splitlines()
     shown = [line for line in lines if "…" in line]
     assert [line.split()[2] for line in shown] == ["a/3", "a/2", "a/1"]

@@ -75,7 +75,7 @@ def test_times_in_another_unit_are_named_where_they_matter(case: str, tmp_path: 
         assert "check the unit of the times" in said[command], command
 
 
-def test_of_a_sound_record_nothing_is_said(tmp_path: Path) -> None:
+def test_of_a_sound_record_nothing_is_reported(tmp_path: Path) -> None:
     assert {command: "unit" in said for command, said in remarks_of(SOUND, tmp_path).items()} == dict.fromkeys(
         ("backtest", "identify", "simulate", "diagnose"), False
     )

@@ -62,7 +62,7 @@ def test_without_a_usable_sample_there_is_one_line_and_an_exit_code(
         ("--from 51min --to 52min", "from 51 min to 52 min"),
     ],
 )
-def test_a_replay_of_nothing_says_from_where_to_where(
+def test_a_replay_of_nothing_states_its_start_and_end(
     folder: Path, options: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "nothing.csv").write_text("time_min,qc,C,T\n50,1,2,3\n60,1,2,3\n")

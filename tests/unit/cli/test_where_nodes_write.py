@@ -1,4 +1,4 @@
-"""Where nodes write and what they take without settings: defaults hold for any process, folders are made."""
+"""Paths and inputs of nodes without settings: defaults hold for any process, folders are made."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -45,7 +45,7 @@ def test_a_recorder_makes_the_folder_that_it_writes_to(tmp_path: Path, out: str)
         ("[recorder]\nout = 'set/run.mcap'\n", None, "set"),
     ],
 )
-def test_up_records_where_flag_then_settings_then_default_say(
+def test_up_records_in_the_folder_of_flag_then_settings_then_default(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: str, flag: str | None, expected: str
 ) -> None:
     def stop_here(*_arguments: object) -> None:

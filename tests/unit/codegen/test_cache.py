@@ -30,7 +30,7 @@ def test_another_name_is_other_code(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [b"", b"short", bytes(32) + b"code", bytes(40)])
-def test_what_is_damaged_is_made_anew_and_then_kept(tmp_path: Path, damage: bytes) -> None:
+def test_a_damaged_entry_is_rebuilt_and_then_kept(tmp_path: Path, damage: bytes) -> None:
     store, make = CodeCache(tmp_path), Maker()
     store.get_or_make("name", make)
     (tmp_path / "name").write_bytes(damage)

@@ -1,4 +1,4 @@
-"""Machine code of a function says what CasADi itself says of it, to the last bit."""
+"""Machine code of a function equals CasADi's own result, to the last bit."""
 
 import casadi as ca
 import numpy as np

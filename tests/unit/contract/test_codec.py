@@ -1,4 +1,4 @@
-"""The contract: what is encoded is decoded, what is not ours is refused, and yesterday's bytes still read."""
+"""The contract: messages decode as they were encoded, foreign ones are refused, and yesterday's bytes still read."""
 
 import re
 import subprocess
@@ -122,7 +122,7 @@ def test_an_encoding_names_its_message_and_no_other() -> None:
         (b"\xff\xff\xff", "application/protobuf;reactorwatch.v1.Sample", "payload"),
     ],
 )
-def test_what_is_not_ours_is_refused_with_a_reason(payload: bytes, encoding: str, reason: str) -> None:
+def test_a_foreign_message_is_refused_with_a_reason(payload: bytes, encoding: str, reason: str) -> None:
     with pytest.raises(DecodeError) as caught:
         decode(payload, encoding)
     assert caught.value.reason == reason
@@ -147,7 +147,7 @@ def test_a_plant_name_that_cannot_is_taken(name: str) -> None:
 
 
 @pytest.mark.parametrize("key", ["", "reactor", "reactor/cstr/sample", "reactor//sample/T", "other/cstr/sample/T"])
-def test_a_key_that_is_not_ours_has_no_topic(key: str) -> None:
+def test_a_foreign_key_has_no_topic(key: str) -> None:
     assert keys.parse(key) is None
 
 

@@ -83,13 +83,13 @@ def test_the_image_of_nodes_leaves_out_rerun_and_nothing_else() -> None:
     assert len(lines) == len(LINES) - 1
 
 
-def test_nodes_run_without_rerun_and_a_dashboard_says_what_is_missing() -> None:
+def test_nodes_run_without_rerun_and_a_dashboard_names_the_missing_package() -> None:
     program = (
         "import sys\n"
         "from importlib import machinery\n"
         "find = machinery.PathFinder.find_spec\n"
         "machinery.PathFinder.find_spec = lambda name, *rest: None if name.startswith('rerun') else find(name, *rest)\n"
-        "import diagnosis_node.__main__, monitor_node.__main__, monitor_node.fleet.node\n"
+        "import diagnosis_node.__main__, monitor_node.__main__\n"
         "import plant_node.__main__, recorder.__main__\n"
         "import reactorwatch.cli.diagnosis\n"
         "try:\n"

@@ -1,4 +1,4 @@
-"""A process is found by its name or in a file; what is wrong with a file is said with its path."""
+"""A process is found by its name or in a file; an error in a file is reported with its path."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A process is described once, and what is wrong with a description is said in one line."""
+"""A process is described once, and an error in a description is reported in one line."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Diagnoses made up by hand, for what is said and drawn of them."""
+"""Diagnoses constructed by hand, for tests of reports and drawings."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""A tank that is linear in everything, so that what an experiment tells is known in closed form."""
+"""A linear tank, for which the information of an experiment is known in closed form."""
 
 from math import exp
 

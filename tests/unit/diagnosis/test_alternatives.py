@@ -62,7 +62,7 @@ def test_of_a_linear_plant_the_expected_evidence_is_the_noncentrality_of_the_lik
     assert gain.noncentrality(truth) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_with_noise_the_evidence_scatters_about_what_is_expected_as_the_probability_says() -> None:
+def test_with_noise_the_evidence_scatters_about_its_expectation_as_the_probability_implies() -> None:
     gain, shift, truth = alternatives(4.0)
     expected = 2.0 * (shift.loss(truth) - gain.own_loss(truth))
     profiles = (Constant(truth.time_min),)
@@ -97,7 +97,7 @@ def test_what_has_set_in_stays_as_large_as_it_was_at_the_end(
     np.testing.assert_allclose(later.signal(numbers).sample_value, 2.0)
 
 
-def test_what_swings_goes_on_swinging() -> None:
+def test_an_oscillation_persists() -> None:
     parameters, later_min = np.array([0.6, -0.8, 7.0]), np.arange(81.3, 95.0, 0.1)
     later, numbers = extrapolate(Sine(np.arange(2.0, 50.0, 0.1)), parameters, later_min, 60.0)
     angle = 2.0 * np.pi * (later_min - 2.0) / 7.0

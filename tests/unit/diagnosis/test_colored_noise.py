@@ -1,4 +1,4 @@
-"""Sensors whose noise remembers: told from noise that does not, and from what moves the plant; and learned."""
+"""Coloured sensor noise is distinguished from white noise and from disturbances of the plant, and is estimated."""
 
 from math import exp, log, sqrt
 

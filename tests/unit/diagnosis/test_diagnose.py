@@ -18,13 +18,13 @@ from tests.tables import read_csv
 from tests.unit.diagnosis.runs import record_of
 
 
-def test_where_nothing_is_wrong_it_says_so() -> None:
+def test_a_sound_record_is_reported_as_nominal() -> None:
     found = diagnose(record_of(rows=2000), cstr())
     assert (found.verdict, found.causes, found.significant, found.practical) == (NOMINAL, (), False, False)
     assert found.gain.held_out["T"].rmse_before == pytest.approx(0.3, rel=0.15)
 
 
-def test_it_tells_which_values_its_errors_are_of() -> None:
+def test_the_curves_mark_the_values_of_the_held_out_errors() -> None:
     record = record_of(rows=2000)
     record.columns["T"][990:1010] = np.nan
     found = diagnose(record, cstr())
@@ -104,7 +104,7 @@ def changed(record: Record, **columns: Array) -> Record:
         (lambda r: Record(r.time_min, {"qc": r.columns["qc"], "T": r.columns["T"]}, r.name), "C is not there"),
     ],
 )
-def test_what_cannot_be_diagnosed_is_said_in_a_line(spoil: Callable[[Record], Record], said: str) -> None:
+def test_a_record_that_cannot_be_diagnosed_is_refused_in_one_line(spoil: Callable[[Record], Record], said: str) -> None:
     with pytest.raises(InputError, match=said):
         diagnose(spoil(record_of(rows=400)), cstr())
 
@@ -131,7 +131,7 @@ def test_a_tolerance_has_to_be_of_an_output_and_positive(tolerance: dict[str, fl
         ),
     ],
 )
-def test_another_unit_is_said_with_its_cure(spoil: Callable[[Record], Record], said: str) -> None:
+def test_another_unit_is_reported_with_its_cure(spoil: Callable[[Record], Record], said: str) -> None:
     with pytest.raises(InputError, match=said):
         diagnose(spoil(record_of(rows=400)), cstr())
 

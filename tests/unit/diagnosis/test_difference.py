@@ -18,7 +18,7 @@ def of(error: Array, qc: Array | None = None) -> Difference:
     return compute_difference(error + noise, noise / NOISE, NOISE, "K", T_MIN, {"qc": (flow, "l/min")})
 
 
-def test_noise_alone_is_told_as_noise() -> None:
+def test_noise_alone_is_reported_as_noise() -> None:
     """The root mean square of 8,000 rows has a standard error of 0.8 %."""
     found = of(np.zeros(ROWS))
     assert found.rmse == pytest.approx(NOISE, rel=0.04)
@@ -53,7 +53,7 @@ def test_all_rows_lie_in_some_range() -> None:
         assert sum(part.rows for part in ranges) == ROWS
 
 
-def test_a_run_that_ran_away_has_no_ranges_and_says_so() -> None:
+def test_a_run_that_diverged_has_no_ranges_and_reports_it() -> None:
     nothing = np.full(ROWS, np.nan)
     found = compute_difference(nothing, nothing, NOISE, "K", T_MIN, {"T": (nothing, "K")})
     assert found.worst("T") is None

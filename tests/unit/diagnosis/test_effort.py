@@ -1,4 +1,4 @@
-"""A diagnosis takes no more filter runs and linearisations than people wait for; seconds depend on the machine."""
+"""A diagnosis takes a bounded number of filter runs and linearisations; seconds depend on the machine."""
 
 from collections import Counter
 from dataclasses import dataclass

@@ -87,7 +87,7 @@ def test_the_plant_does_under_each_rival_what_was_predicted_and_what_its_sensors
     assert np.mean(outside) < 0.002  # three standard deviations away at the most extreme
 
 
-def test_the_proposed_input_tells_more_than_the_same_time_of_random_steps_within_the_limits(
+def test_the_proposed_input_is_more_informative_than_the_same_time_of_random_steps_within_the_limits(
     run: Run, experiment: Experiment
 ) -> None:
     both = [alternative(run, coolant_flow=-0.02), alternative(run, feed_temperature=1.8)]
@@ -102,7 +102,7 @@ def test_the_proposed_input_tells_more_than_the_same_time_of_random_steps_within
     assert experiment.expected_delta_bic * 120.0 / experiment.span_min > 1.5 * max(found)
 
 
-def test_twins_are_said_to_be_such(run: Run) -> None:
+def test_twins_are_reported_as_such(run: Run) -> None:
     """C measured (1 + m) C is what a feed richer by the factor 1 + m gives, if as much less heat comes of it."""
     m = 0.03
     both = [
@@ -115,7 +115,7 @@ def test_twins_are_said_to_be_such(run: Run) -> None:
     assert "not even in 480 min" in found
 
 
-def test_a_twin_among_others_does_not_keep_these_from_being_told_apart(run: Run) -> None:
+def test_a_twin_among_others_does_not_keep_these_from_being_distinguished(run: Run) -> None:
     m = 0.03
     three = [
         alternative(run, concentration_gain=m),
@@ -129,14 +129,14 @@ def test_a_twin_among_others_does_not_keep_these_from_being_told_apart(run: Run)
     assert [item.probability > 0.9 for item in found.separations] == [False, True, True]
 
 
-def test_limits_that_leave_no_room_are_said_to_be_such(run: Run) -> None:
+def test_limits_that_leave_no_room_are_reported_as_such(run: Run) -> None:
     both = [alternative(run, coolant_flow=-0.02), alternative(run, feed_temperature=1.8)]
     found = propose_experiment(both, run, cstr(), SENSORS, {"T": (440.0, 441.0)})
     assert isinstance(found, str)
     assert "leave qc no room to move" in found
 
 
-def test_nothing_in_it_knows_the_reactor() -> None:
+def test_nothing_in_it_refers_to_the_reactor() -> None:
     record = tank_record(np.repeat(5.0 + np.random.default_rng(1).uniform(-1.0, 1.0, 60), 10))
     both = [explained(Gain(), 0.02, record), explained(Shift(), 0.1, record)]
     found = propose_experiment(both, record, tank(), NOISE, {"u": (1.0, 9.0), "h": (0.0, 10.0)})
@@ -161,7 +161,7 @@ def test_limits_that_cannot_be_meant_are_refused_in_a_line(limits: dict[str, tup
         check_limits(cstr(), limits)
 
 
-def test_without_limits_the_record_says_them_with_some_room_but_never_beyond_the_model(run: Run) -> None:
+def test_without_limits_they_follow_from_the_record_with_a_margin_but_never_beyond_the_model(run: Run) -> None:
     found = limits_of(run, cstr(), {"T": (430.0, 450.0)})
     assert found["T"] == (430.0, 450.0)
     low, high = found["qc"]

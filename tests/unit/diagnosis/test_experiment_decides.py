@@ -49,7 +49,7 @@ def test_the_experiment_decides(cause: str, size: float, alternative: str, seed:
     assert np.mean((measured.columns["T"] < 425.0) | (measured.columns["T"] > 455.0)) < 0.002
 
 
-def test_where_no_experiment_is_possible_a_remark_says_so_and_nothing_is_proposed() -> None:
+def test_where_no_experiment_is_possible_a_remark_states_it_and_nothing_is_proposed() -> None:
     config = PlantConfig(seed=2, faults=("coolant_flow:step:-0.02@60min",), scenario=NARROW)
     found = diagnose(simulate_record(config, 1200), cstr(), limits={"T": (440.0, 440.5)})
     assert found.alternatives

@@ -40,7 +40,7 @@ def test_a_size_is_found_between_the_two_moves_that_it_lies_between() -> None:
 
 
 @pytest.mark.parametrize("onset_min", [0.0, 12.34, 99.95, 149.9])
-def test_a_filter_that_goes_on_where_a_later_onset_makes_no_difference_says_the_same(onset_min: float) -> None:
+def test_a_filter_that_resumes_where_a_later_onset_makes_no_difference_gives_the_same_output(onset_min: float) -> None:
     run = make_run("valve_stiction:step:6.0@50.23min", rows=1500)
     hypothesis = Hypothesis(FaultFilter(cstr(), (STICKS,), NOISE), (Step(run.time_min),))
     later = hypothesis.evaluate(run, (np.array([6.0, 149.9]),))

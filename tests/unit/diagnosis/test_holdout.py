@@ -27,7 +27,7 @@ def without_changes(run: Run) -> Run:
     return Run(run.time_min[there], run.inputs[there], run.measured[there], tuple(breaks.tolist()))
 
 
-def test_where_nobody_knows_when_the_input_changed_no_model_is_blamed_for_it() -> None:
+def test_where_the_time_of_an_input_change_is_unknown_no_model_is_blamed_for_it() -> None:
     run = without_changes(make_run("coolant_flow:step:-0.03@100.37min", rows=6000))
     profile, truth = Step(run.time_min), np.array([-0.03, 100.37])
     nominal = Hypothesis(FaultFilter(cstr(), (), SENSORS), ())

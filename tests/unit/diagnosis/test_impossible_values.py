@@ -78,7 +78,7 @@ def test_values_at_the_bounds_are_no_sentinels(signal: str) -> None:
     make_run(record, MODELS[signal])
 
 
-def test_where_lines_are_no_rows_the_time_is_told_alone(tmp_path: Path) -> None:
+def test_where_lines_are_no_rows_only_the_time_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     write_table(path, spoiled(sound("qc"), "T", [2], 9999.0))
     lines = path.read_text().split("\n")

@@ -1,4 +1,4 @@
-"""A free curve has as many knots as the record tells of."""
+"""A free curve has as many knots as the record supports."""
 
 import numpy as np
 import pytest

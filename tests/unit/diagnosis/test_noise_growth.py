@@ -52,7 +52,7 @@ def test_a_noisier_sensor_is_named_with_its_further_noise_and_onset(noisier: Dia
     assert extended.parameter("h.noise.size").value == cause.parameters["size"].value
 
 
-def test_its_report_says_so(noisier: Diagnosis) -> None:
+def test_its_report_states_it(noisier: Diagnosis) -> None:
     page = as_page(noisier, tank(), effects_of(tank()), "a.csv", "m.json", "x.csv", on_the_bus=False)
     assert "noisier sensor of h" in page
 

@@ -29,7 +29,7 @@ def test_outliers_are_found_and_nothing_else_is(share: float, sds: float, caught
     assert np.count_nonzero(found & ~off) <= 2  # of ten thousand
 
 
-def test_a_gross_one_is_told_without_a_model_in_the_first_row_too() -> None:
+def test_a_gross_one_is_detected_without_a_model_in_the_first_row_too() -> None:
     moving = noise(sd=0.05) + 5.0 * np.abs(np.sin(0.3 * np.arange(ROWS)))[:, None]  # with a sharp turn in ten rows
     assert not np.any(find_gross_outliers(moving))
     for row in (0, 700, ROWS - 1):

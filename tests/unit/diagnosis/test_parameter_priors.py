@@ -127,7 +127,7 @@ def test_a_share_of_a_temperature_in_celsius_is_refused() -> None:
         ("", "parameter=tolerance"),
     ],
 )
-def test_what_cannot_be_stated_is_said_in_a_line(text: str, said: str) -> None:
+def test_an_impossible_prior_is_refused_in_one_line(text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         parse_priors(text, cstr())
 

@@ -39,14 +39,14 @@ def step_of(cause: str, size: float, onset_min: float, begun_min: float) -> tupl
 
 
 @pytest.mark.parametrize("onset_min", [30.005, 30.05, 30.095])
-def test_a_sensor_tells_between_which_rows_it_went_wrong_and_no_more(onset_min: float) -> None:
+def test_the_interval_of_a_sensor_s_onset_ends_at_neighbouring_rows(onset_min: float) -> None:
     """A time that is uniform in an interval has the interval's length over the root of 12 as its standard deviation."""
     onset, _, _ = step_of("temperature_bias", 4.0, onset_min, 30.3)
     assert onset.value == pytest.approx(30.05, abs=0.02)
     assert onset.sd == pytest.approx(PERIOD_MIN / np.sqrt(12.0), rel=0.2)
 
 
-def test_a_lag_tells_between_which_moves_of_the_input_it_began() -> None:
+def test_the_interval_of_a_lag_s_onset_ends_at_moves_of_the_input() -> None:
     """The input moves every minute: within one nothing shows when the valve became slow."""
     onset, _, _ = step_of("valve_lag", 0.2, 30.35, 30.35)
     assert onset.value == pytest.approx(30.5, abs=0.15)
@@ -59,7 +59,7 @@ def test_a_lag_is_found_from_an_onset_that_is_far_off() -> None:
     assert onset.value == pytest.approx(30.5, abs=0.15)
 
 
-def test_a_valve_that_sticks_says_between_which_sizes_it_does_the_same() -> None:
+def test_the_interval_of_a_sticking_valve_spans_the_sizes_with_the_same_response() -> None:
     """The interval of its size holds the truth, and is not without bounds."""
     onset, size, _ = step_of("valve_stiction", 3.0, 30.35, 30.35)
     assert abs(size.value - 3.0) < 2.0 * size.sd < 1.0

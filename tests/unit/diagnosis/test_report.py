@@ -113,13 +113,13 @@ def test_an_ambiguous_verdict_shows_all_rivals_with_their_sizes_and_the_experime
     assert "which is not certain" not in page("named")
 
 
-def test_an_ambiguous_verdict_without_an_experiment_says_so() -> None:
+def test_an_ambiguous_verdict_without_an_experiment_states_it() -> None:
     text = as_page(replace(CASES["ambiguous"], experiment=None), cstr(), EFFECTS, "a.csv", "extended.json")
     assert "No experiment within the limits separates them." in text.partition("<h2>")[0]
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_what_is_said_of_colours_holds_on_a_dark_ground_too_and_plots_are_as_wide_as_the_page(case: str) -> None:
+def test_the_described_colours_hold_on_a_dark_ground_too_and_plots_are_as_wide_as_the_page(case: str) -> None:
     text = page(case)
     assert "dark" not in text.partition("</style>")[2]
     assert "min-width" not in text
@@ -138,13 +138,13 @@ def test_something_unknown_is_drawn_over_time_as_what_would_do_the_same() -> Non
     assert "Estimated as the size of: heat loss, 1/min" in text
 
 
-def test_the_page_tells_how_the_extended_model_is_used() -> None:
+def test_the_page_explains_how_the_extended_model_is_used() -> None:
     text = page("named")
     for command in ("simulate", "diagnose", "monitor", "plant"):
         assert re.search(rf"reactorwatch {command} .*--model out/extended.json", text)
 
 
-def test_the_page_tells_what_is_known_now_of_uncertain_parameters() -> None:
+def test_the_page_lists_the_posterior_of_uncertain_parameters() -> None:
     text = as_page(ADJUSTED, cstr(), EFFECTS, "plant.csv", "extended.json")
     assert "<tr><th>K3</th><td>711 ± 3 l/min; stated: 700 ± 30 l/min" in text
 

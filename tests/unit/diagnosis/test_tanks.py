@@ -79,7 +79,7 @@ def test_each_other_cause_is_named(rig: Rig, name: str, size: float) -> None:
     assert gain.rmse_after < 1.15 * NOISE_V < gain.rmse_before
 
 
-def test_its_report_speaks_of_tanks(overflowing: Diagnosis) -> None:
+def test_its_report_describes_tanks(overflowing: Diagnosis) -> None:
     found = overflowing
     catalogue = effects_of(tanks())
     assert describe_verdict(found).startswith("The simulation is wrong: overflow of the upper tank, ")

@@ -64,7 +64,7 @@ def test_a_number_has_the_digits_that_its_95_percent_interval_allows(estimate: E
 
 @pytest.mark.parametrize("effect", [*EFFECTS, *TANK_EFFECTS], ids=lambda effect: effect.name)
 @pytest.mark.parametrize("profile", ["constant", "ramp", "decay", "sine", "free"])
-def test_the_size_of_every_cause_is_said_in_its_unit_and_meaning(effect: Effect, profile: str) -> None:
+def test_the_size_of_every_cause_is_stated_with_its_unit_and_meaning(effect: Effect, profile: str) -> None:
     for sign in (1.0, -1.0) if effect.lower < 0.0 else (1.0,):
         size = Estimate(sign * abs(effect.typical), 0.01 * abs(effect.typical), effect.unit)
         constants = {item.name: Estimate(item.value, item.sd, item.unit) for item in effect.constants}
@@ -85,7 +85,7 @@ def test_the_size_of_every_cause_is_said_in_its_unit_and_meaning(effect: Effect,
             assert all(part.strip() in said for part in words.split("{}"))
 
 
-def test_more_and_less_are_told_in_different_words() -> None:
+def test_more_and_less_have_different_words() -> None:
     for effect in (*EFFECTS, *TANK_EFFECTS):
         assert bool(effect.smaller) == (effect.lower < 0.0), effect.name
         assert effect.larger.count("{}") == 1
@@ -164,7 +164,7 @@ def test_the_object_holds_what_was_found() -> None:
     assert said["adequacy"]["T"] == {"minus_log10_p": 0.35}
 
 
-def test_what_was_stated_to_be_uncertain_is_told_as_it_is_known_now() -> None:
+def test_an_uncertain_parameter_is_reported_with_its_posterior() -> None:
     assert describe_verdict(ADJUSTED) == (
         "The simulation is right within what was stated of its parameters: K3 is a little off, "
         "and the rest of the record is noise."

@@ -1,4 +1,4 @@
-"""When an alarm is diagnosed, and on which samples."""
+"""The time and the samples of a diagnosis after an alarm."""
 
 import pytest
 
@@ -103,7 +103,7 @@ def test_a_plant_that_ends_is_diagnosed_by_what_there_is() -> None:
     assert live.spans() == [(4.0, 54.0)]
 
 
-def test_a_plant_that_begins_anew_has_no_past() -> None:
+def test_a_plant_that_restarts_has_no_past() -> None:
     live = Live()
     live.samples(1000, 1050)
     live.alarm(1050)

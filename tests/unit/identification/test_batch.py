@@ -43,7 +43,7 @@ def test_the_report_row_choice_of_the_daisy_record_is_that_of_lapack(daisy: Dais
     np.testing.assert_allclose(model.parameters, np.linalg.lstsq(regressors, y[k])[0], rtol=1e-7)
 
 
-def test_the_report_row_choice_cannot_tell_order_3_from_steps_of_ten_samples(daisy: Daisy) -> None:
+def test_the_report_row_choice_cannot_distinguish_order_3_from_steps_of_ten_samples(daisy: Daisy) -> None:
     """The record's input moves every 10 rows, so in every 6th row from the 100th on u[k-2] = u[k-3]."""
     k = np.arange(99, 3750, 6)
     np.testing.assert_array_equal(daisy.qc[k - 2], daisy.qc[k - 3])
@@ -105,7 +105,7 @@ def test_the_free_run_is_the_recursion_on_its_own_output() -> None:
     np.testing.assert_allclose(run[4:], recursion(parameters, u, structure, y[:4])[4:], rtol=1e-12)
 
 
-def test_a_free_run_goes_over_missing_outputs_and_starts_anew_after_gaps() -> None:
+def test_a_free_run_bridges_missing_outputs_and_restarts_after_gaps() -> None:
     """Outputs missing in rows 10-12, an input in row 20, a gap before row 30; order 1 starts from one row."""
     rng = np.random.default_rng(7)
     u, y = rng.standard_normal(40), rng.standard_normal(40)

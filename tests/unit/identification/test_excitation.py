@@ -97,7 +97,7 @@ def test_a_sampling_rate_that_is_too_fast_gets_a_decimation_that_is_good(noise_s
     assert sampling(ScaledRecord.of(Structure.of_order(2), u, y)).passed
 
 
-def test_a_good_sampling_rate_passes_and_a_slow_one_is_told() -> None:
+def test_a_good_sampling_rate_passes_and_a_slow_one_is_reported() -> None:
     assert sampling(ScaledRecord.of(Structure.of_order(2), *sampled_plant(0.1, 0.05))).passed
     check = sampling(ScaledRecord.of(Structure.of_order(2), *sampled_plant(1.0, 0.05)))
     assert "too slow" in check.result
@@ -135,7 +135,7 @@ def test_the_amplitude_is_held_against_the_noise(noisy_plant: NoisyPlant) -> Non
     assert amplitude(ScaledRecord.of(structure, noisy_plant.inputs, noisy_plant.clean)).passed
 
 
-def test_dependent_regressors_are_told_by_their_condition_number() -> None:
+def test_dependent_regressors_are_detected_by_their_condition_number() -> None:
     rng = np.random.default_rng(7)
     check = conditioning(ScaledRecord.of(Structure.of_order(1), np.ones(100), rng.standard_normal(100)))
     assert check.value == np.inf

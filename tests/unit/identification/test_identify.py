@@ -12,7 +12,7 @@ from reactorwatch.identification.linear_model import fit_percent
 from tests.unit.identification.truth import Daisy, NoisyPlant, identify
 
 
-def test_it_tells_the_parameters_and_fits_of_the_daisy_record(daisy: Daisy) -> None:
+def test_it_prints_the_parameters_and_fits_of_the_daisy_record(daisy: Daisy) -> None:
     """Every number against LAPACK and the recursion written out, from the unscaled columns."""
     told = identify(daisy.time, daisy.qc, daisy.T, order=3, name="T")
     half, u, y = 3750, daisy.qc, daisy.T
@@ -42,7 +42,7 @@ def test_its_json_has_the_promised_names(daisy: Daisy) -> None:
     assert len(told["a"]) == len(told["b"]) == len(told["sd"]["a"]) == 2
 
 
-def told_parameters(told: Identification) -> list[float]:
+def parameters_of(told: Identification) -> list[float]:
     return [*told.a, *told.b, told.offset]
 
 
@@ -52,7 +52,7 @@ def test_row_by_row_it_finds_what_it_finds_at_once(noisy_plant: NoisyPlant) -> N
     batch = identify(time, noisy_plant.inputs, noisy_plant.measured, order=2)
     recursive = identify(time, noisy_plant.inputs, noisy_plant.measured, order=2, recursive=True)
     deviations = np.array([*batch.sd.a, *batch.sd.b, batch.sd.offset])
-    difference = np.abs(np.subtract(told_parameters(recursive), told_parameters(batch)))
+    difference = np.abs(np.subtract(parameters_of(recursive), parameters_of(batch)))
     assert np.all(difference < deviations * 1e-9)
     assert recursive.recursive
     assert not batch.recursive
@@ -73,9 +73,9 @@ def test_gaps_and_missing_rows_are_left_out_where_that_is_asked_for(noisy_plant:
     time[1000:] += 40.0
     for recursive in (False, True):
         told = identify(time, u, y, order=2, missing="leave out", recursive=recursive)
-        np.testing.assert_allclose(told_parameters(told), noisy_plant.parameters, atol=1e-8)
+        np.testing.assert_allclose(parameters_of(told), noisy_plant.parameters, atol=1e-8)
     batch = identify(time, u, y, model="oe", order=2, missing="leave out")
-    np.testing.assert_allclose(told_parameters(batch), noisy_plant.parameters, atol=1e-3)
+    np.testing.assert_allclose(parameters_of(batch), noisy_plant.parameters, atol=1e-3)
 
 
 def test_a_record_that_determines_nothing_is_refused_with_the_cause(noisy_plant: NoisyPlant) -> None:

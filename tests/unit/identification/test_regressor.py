@@ -77,7 +77,7 @@ def test_a_row_that_cannot_be_is_refused_and_changes_nothing() -> None:
     assert buffer == before
 
 
-def test_a_stored_buffer_goes_on_where_it_was() -> None:
+def test_a_stored_buffer_resumes_where_it_was() -> None:
     structure = Structure(3, 2, delay=2, inputs=2)
     buffer = RegressorBuffer(structure, RowChoice(1, 2))
     rng = np.random.default_rng(2)

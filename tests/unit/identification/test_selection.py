@@ -30,7 +30,7 @@ def test_with_measurement_noise_the_output_error_model_of_the_plants_order_is_ch
     assert marked[0].split()[1:3] == ["oe", "2"]
 
 
-def test_the_table_says_what_the_models_do_on_the_held_out_half(daisy: Daisy) -> None:
+def test_the_table_lists_the_fits_of_the_models_on_the_held_out_half(daisy: Daisy) -> None:
     """One row recomputed by hand: ARX 2 of T."""
     selection = select(daisy.qc, daisy.T, daisy.time, orders=(2,))
     half = 3750
@@ -72,7 +72,7 @@ class Persistence:
         return np.asarray(outputs, dtype=np.float64) - self.predict(inputs, outputs, time)
 
 
-def test_another_family_joins_the_table_like_ours(noisy_plant: NoisyPlant) -> None:
+def test_another_family_joins_the_table_like_a_shipped_one(noisy_plant: NoisyPlant) -> None:
     selection = select(
         noisy_plant.inputs, noisy_plant.measured, families=(*LINEAR_FAMILIES, Persistence()), orders=(2,)
     )
@@ -122,7 +122,7 @@ DIFFERENT_HALVES: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Ar
 
 
 @pytest.mark.parametrize("case", DIFFERENT_HALVES)
-def test_where_no_model_fits_it_recommends_none_and_says_why(case: str) -> None:
+def test_where_no_model_fits_it_recommends_none_and_reports_the_reason(case: str) -> None:
     moved, seen, why = DIFFERENT_HALVES[case]
     u = moved(np.repeat(np.random.default_rng(1).standard_normal(400), 10))
     y = seen(second_order(u, np.ones(4000))) + 0.01 * np.random.default_rng(3).standard_normal(4000)

@@ -1,4 +1,4 @@
-"""Standard deviations of parameters are numbers, infinite where the data tell nothing, and never NaN."""
+"""Standard deviations of parameters are numbers, infinite where the data are uninformative, and never NaN."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Filters that go through their records together say what each would say alone, to the last bit."""
+"""Filters run as a batch give the output of each alone, to the last bit."""
 
 from collections.abc import Sequence
 
@@ -40,7 +40,7 @@ def at_once(records: Sequence[FilterRecord]) -> list[FilterResult]:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 6])
-def test_each_says_what_it_would_say_alone(count: int) -> None:
+def test_each_filter_gives_the_output_it_gives_alone(count: int) -> None:
     records = [record(seed) for seed in range(count)]
     assert same(at_once(records), alone(records))
 

@@ -225,7 +225,7 @@ def test_a_record_at_once_and_row_by_row_are_the_same_to_the_last_bit() -> None:
 
 
 @pytest.mark.parametrize("since", [1, 100, 129, 299])
-def test_over_the_rest_of_a_record_it_goes_on_bit_for_bit(since: int) -> None:
+def test_over_the_rest_of_a_record_it_resumes_bit_for_bit(since: int) -> None:
     time_min, inputs, measured = record_of(PlantConfig(seed=7), 300)
     time_min = time_min + np.where(np.arange(300) > 200, 2.0, 0.0)
     model = parse_fault("coolant_flow:step:-0.2@12.37min").extend(cstr())
@@ -237,7 +237,7 @@ def test_over_the_rest_of_a_record_it_goes_on_bit_for_bit(since: int) -> None:
         np.testing.assert_array_equal(getattr(rest, field), getattr(whole, field)[since:])
 
 
-def test_from_a_stored_state_it_goes_on_bit_for_bit() -> None:
+def test_from_a_stored_state_it_resumes_bit_for_bit() -> None:
     time_min, inputs, measured = record_of(PlantConfig(seed=8), 100)
     one, other = Filter(cstr(), SENSORS), Filter(cstr(), SENSORS)
     one.run(FilterRecord(time_min[:60], inputs[:60], measured[:60]))
@@ -312,7 +312,7 @@ def test_over_rows_without_any_measurement_it_predicts_alone() -> None:
     assert np.all(found.log_likelihood == 0.0)
 
 
-def test_a_gap_is_walked_through_and_one_that_is_too_long_begins_anew() -> None:
+def test_a_gap_is_bridged_and_one_that_is_too_long_restarts_the_filter() -> None:
     quiet = NoiseLevels(NOISE.measurement_sd, (0.0, 0.0))
     kalman = Filter(linear_model(), quiet)
     kalman.state = FilterState(0.0, (2.0,), (1.0, -2.0), (0.5, 0.1, 0.1, 0.4))
@@ -327,7 +327,7 @@ def test_a_gap_is_walked_through_and_one_that_is_too_long_begins_anew() -> None:
         assert np.all(np.isfinite(kalman.update(later + 0.1, (0.0,), (1.0, 2.0)).prediction))
 
 
-def test_where_the_equations_leave_all_bounds_or_explode_it_begins_anew_at_once() -> None:
+def test_where_the_equations_leave_all_bounds_or_explode_it_restarts_at_once() -> None:
     model = linear_model(bound=50.0)
     x = model.states[0].symbol
     for rhs in (x * x * x * 1e6, ca.SX(2e3), ca.sqrt(1.5 - x)):

@@ -19,7 +19,7 @@ from reactorwatch.process.steady_state import steady_states
 SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
 
 
-def test_it_waits_while_nothing_is_measured_and_says_nothing_of_its_first_row() -> None:
+def test_it_waits_while_nothing_is_measured_and_gives_no_output_in_its_first_row() -> None:
     kalman = Filter(cstr(), SENSORS)
     for t in (0.0, 0.1):
         assert np.all(np.isnan(kalman.update(t, (100.0,), (np.nan, np.nan))))
@@ -65,7 +65,7 @@ def test_it_begins_where_outputs_grow_without_bound_with_a_state_all_the_same() 
     assert np.all(np.isfinite(run.x))
 
 
-def test_it_begins_anew_after_a_row_whose_input_nobody_knows() -> None:
+def test_it_restarts_after_a_row_with_an_unknown_input() -> None:
     record = simulate_record(PlantConfig(seed=3), 60)
     time_min, inputs = record.time_min, record.columns["qc"].copy()
     measured = np.column_stack([record.columns["C"], record.columns["T"]])

@@ -1,4 +1,4 @@
-"""Ways on which an input changed, and nobody knows when."""
+"""Intervals in which an input changed at an unknown time."""
 
 from dataclasses import replace
 
@@ -109,7 +109,7 @@ def test_the_equations_of_the_errors_expect_of_a_way_in_doubt_what_the_filter_ex
     np.testing.assert_allclose(ways.w, found.normalized[2:], atol=0.03)
 
 
-def test_innovations_behind_holes_are_as_large_as_the_filter_says() -> None:
+def test_innovations_behind_holes_are_as_large_as_the_filter_states() -> None:
     """Mean squares of 600 and more, whose standard deviation is 0.06; without doubt they are far larger."""
     time_min, qc, measured, there = with_holes(seed=3)
     inputs, missing = qc[there][:, None], missing_of(time_min[there], qc[there])
@@ -154,7 +154,7 @@ def test_a_sticking_valve_keeps_its_place_behind_a_hole() -> None:
     np.testing.assert_allclose(found.x[20:, 2], stands[there][20:], atol=0.5)
 
 
-def test_with_rows_put_in_a_filter_says_what_it_says_row_by_row() -> None:
+def test_with_inserted_rows_a_filter_gives_the_output_it_gives_row_by_row() -> None:
     time_min, qc, measured, there = with_holes(seed=6)
     inputs, missing = qc[there][:, None], missing_of(time_min[there], qc[there])
     uncertainty = InputUncertainty.for_missing_rows(time_min[there], inputs, missing)

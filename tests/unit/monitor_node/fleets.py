@@ -1,4 +1,4 @@
-"""Fleets that a test makes: plants, monitors, and what each plant's own monitor would have said."""
+"""Fleets of a test: plants, monitors, and the output of each plant's own monitor."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -56,7 +56,7 @@ def alone(plant: str, messages: Iterable[Encoded], config: MonitorConfig = QUICK
 
 
 def of(plant: str, said: Iterable[Publication]) -> list[Publication]:
-    """What was said of a plant, without how its monitor does."""
+    """The messages about a plant, without the health of its monitor."""
     begin = f"{keys.ROOT}/{plant}/"
     return [item for item in said if item.key.startswith(begin) and not isinstance(item.message, Health)]
 

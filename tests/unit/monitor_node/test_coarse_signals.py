@@ -1,4 +1,4 @@
-"""Signals in steps: none is taken for outliers, and one that cannot be watched does not keep the others from it."""
+"""Quantised signals: none is taken for outliers, and one that cannot be monitored does not affect the others."""
 
 import numpy as np
 import pytest

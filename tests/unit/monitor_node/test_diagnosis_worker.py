@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from monitor_node.__main__ import MonitorNode
 from monitor_node.diagnosis_worker import DiagnosisWorker, PlantFinding
 from monitor_node.learn.process_reference import ProcessReference
 from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, read_equations
 from monitor_node.learn.training_rows import TrainingRows
+from monitor_node.node import MonitorNode
 from reactorwatch.contract.codec import Publication
 from reactorwatch.diagnosis.result import NAMED
 from reactorwatch.runtime.parallel.jobs import SerialExecutor
@@ -69,21 +69,22 @@ def test_where_no_process_can_be_started_each_diagnosis_has_failed_and_the_next_
 
 
 @pytest.mark.slow
-def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_model_at_the_next_row(
-    warm: Run,
+def test_a_live_monitor_continues_while_its_training_is_diagnosed_and_changes_the_model_at_the_next_row(
+    warm: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("monitor_node.node.DiagnosisWorker", lambda: DiagnosisWorker(SerialExecutor()))
     node, published = MonitorNode(CONFIG, 0), list[Publication]()
-    node._worker = DiagnosisWorker(SerialExecutor())
     for message in warm.messages[:TRAINED]:
         published += node.on_message(message, 0)
+    monitor = node.monitor(CONFIG.plant)
     assert not node._worker.is_busy
-    assert node.equations is node.model
+    assert monitor.equations is monitor.model
     for message in warm.messages[TRAINED:LATE]:
         published += node.on_message(message, 0)
-    assert node.rows == LATE // 3
+    assert monitor.rows == LATE // 3
     assert not changes(published)
     now_ns, until_s = 0, time.monotonic() + 5.0 * WITHIN_S  # a diagnosis computes for two seconds on an idle machine
-    while node.awaits_diagnosis:
+    while monitor.awaits_diagnosis:
         assert time.monotonic() < until_s
         assert node.next_tick_ns() <= now_ns + 100_000_000  # it looks for the finding soon
         now_ns += 100_000_000
@@ -96,6 +97,6 @@ def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_
     assert change == changes(warm.published)[0]
     assert warm.finding.verdict == NAMED
     assert not node._worker.is_busy
-    reference = node.pipeline.evaluation.reference
+    reference = monitor.pipeline.evaluation.reference
     assert isinstance(reference, ProcessReference)
-    assert reference.model is node.equations is read_equations(change.model)  # the one that was prepared
+    assert reference.model is monitor.equations is read_equations(change.model)  # the one that was prepared

@@ -80,10 +80,11 @@ def test_an_error_in_one_plant_of_a_fleet_changes_nothing_for_the_others(
     health = health_message(monitors.on_stop(0), BROKEN)
     assert health.failures[stage] >= 1
     assert health.rows == 401
-    notes = [line for plant, line in monitors.reports(0) if plant == BROKEN]
+    notes = monitors.monitor(BROKEN).notes
     assert len([line for line in notes if "ZeroDivisionError" in line and "a number that was" in line]) == 1
     assert all("\n" not in line for line in notes)
-    assert [plant for plant, text in monitors.tracebacks() if "Traceback" in text] == [BROKEN]
+    assert [plant for plant in monitors.plants if monitors.monitor(plant).failures.tracebacks] == [BROKEN]
+    assert all("Traceback" in text for text in monitors.monitor(BROKEN).failures.tracebacks)
 
 
 def test_alarms_stay_when_the_plant_is_learned_again_and_are_cleared_when_they_are_over(

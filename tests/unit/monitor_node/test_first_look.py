@@ -13,8 +13,8 @@ from monitor_node.causes.window import MOST_PIECES, Row, newest_rows
 from monitor_node.charts import drift
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet import node as fleet_node
 from monitor_node.fleet.config import FleetConfig
+from monitor_node.node import MonitorNode
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.codegen.array_function import ArrayFunction
@@ -135,7 +135,9 @@ def test_an_error_in_what_is_prepared_is_left_to_the_first_look(monkeypatch: pyt
     assert monitor.failures.by_stage["isolation"] >= 1
 
 
-def test_a_monitor_prepares_part_by_part_once_it_listens_and_then_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_monitor_prepares_part_by_part_once_it_is_subscribed_and_then_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     prepared: list[int] = []
 
     def preparation(*_: object) -> Iterator[None]:
@@ -145,10 +147,10 @@ def test_a_monitor_prepares_part_by_part_once_it_listens_and_then_no_more(monkey
 
     def run(loop: EventLoop) -> None:
         node = loop._node
-        assert isinstance(node, monitor_main.MonitorNode)
+        assert isinstance(node, MonitorNode)
         assert prepared == []
         for parts in (1, 2, 3, 3, 3):
-            now_ns = max(node.next_tick_ns(), node._prepare_ns)
+            now_ns = max(node.next_tick_ns(), node._poll_ns)
             node.on_tick(now_ns)
             node.on_tick(now_ns)  # within the tenth of a second
             assert len(prepared) == parts
@@ -171,7 +173,7 @@ def test_a_fleet_prepares_before_it_joins_the_bus(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(stage, "preparation", preparation)
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", lambda *_, **__: done.append("connected"))
-    fleet_node.run(CONFIG, FleetConfig(plants="reactor/*"), BusConfig())
+    monitor_main.run(CONFIG, BusConfig(), fleet=FleetConfig(plants="reactor/*"))
     assert done == ["prepared", "connected"]
 
 

@@ -1,4 +1,4 @@
-"""Of a row that is lost the input is unknown, and so is what it did until it shows: a sound plant raises no alarm."""
+"""Lost rows: their inputs and the effects are unknown, so a sound plant raises no alarm."""
 
 from math import nan
 from typing import Literal, get_args

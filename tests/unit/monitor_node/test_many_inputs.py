@@ -1,4 +1,4 @@
-"""Plants with no, one or several inputs: watched, resumed, replayed and back-tested alike, whatever is missing."""
+"""Plants with no, one or several inputs: monitored, resumed, replayed and back-tested alike, whatever is missing."""
 
 from dataclasses import dataclass, replace
 
@@ -144,7 +144,7 @@ def test_a_fault_of_one_output_is_seen_with_any_number_of_inputs(inputs: int, ou
     assert raised[f"shewhart/y{outputs - 1}"] < START_NS + (FAULT_ROW + 6) * ROW_NS
 
 
-def test_models_with_too_few_rows_for_their_parameters_lose_lags_then_inputs_and_the_training_says_so() -> None:
+def test_models_with_too_few_rows_for_their_parameters_lose_lags_then_inputs_and_the_training_reports_it() -> None:
     """80 rows suffice for seven parameters: three lags of the output, one of three inputs, and the constant."""
     few, many = (linear_plant(inputs, 2, seed=1) for inputs in (3, 8))
     notes = [
@@ -163,7 +163,7 @@ def test_models_with_too_few_rows_for_their_parameters_lose_lags_then_inputs_and
 
 
 @pytest.mark.parametrize("kind", ["constant", "collinear", "few values", "never there", "rare", "gone"])
-def test_an_input_that_says_nothing_hinders_no_watch(kind: str) -> None:
+def test_an_uninformative_input_hinders_no_monitor(kind: str) -> None:
     """The outputs are watched, and a fault of one is seen."""
     plant = linear_plant(2, 3, seed=5)
     u = plant.values[:, 1]

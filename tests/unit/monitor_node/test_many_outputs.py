@@ -117,7 +117,7 @@ def test_outputs_of_which_one_follows_from_the_others_have_no_chart_of_all() -> 
 
 
 @pytest.mark.parametrize(("outputs", "period_s"), [(10, 1.0), (2, 0.001), (52, 0.1), (1, 86_400.0), (2, 6e5), (2, 6.0)])
-def test_the_default_promise_is_refused_at_no_period_and_what_is_promised_is_said(
+def test_the_default_promise_is_refused_at_no_period_and_the_promise_is_published(
     outputs: int, period_s: float
 ) -> None:
     config = msgspec.structs.replace(config_of(outputs, 10), training_min=min(150 * period_s / 60, 1e6))

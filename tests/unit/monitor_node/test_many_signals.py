@@ -87,7 +87,7 @@ def test_the_alarm_names_the_signal_at_which_the_disturbance_enters(faulty: int)
     assert len(suspected[-1].suspects) == 3
 
 
-def test_a_monitor_that_resumes_says_the_same_bit_for_bit() -> None:
+def test_a_monitor_that_resumes_publishes_the_same_bit_for_bit() -> None:
     """Stored before and in the alarm."""
     values = plant(TRAINING + 140, TRAINING + 100)
     whole = Monitor(settings(), 0)

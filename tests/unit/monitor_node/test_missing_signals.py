@@ -1,4 +1,4 @@
-"""A signal that does not come raises an alarm, is left out with the reason, and the others are watched."""
+"""A missing signal raises an alarm, is left out with the reason, and the others are monitored."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def raised_min(result: Backtest) -> dict[str, float]:
 
 @pytest.mark.parametrize("reference", ["auto", "process", "arx"])
 @pytest.mark.parametrize("signal", SIGNALS)
-def test_without_one_signal_its_silence_is_told_and_the_others_are_watched(
+def test_without_one_signal_its_silence_is_reported_and_the_others_are_monitored(
     signal: str, reference: str, leak: Run
 ) -> None:
     config = replace(CONFIG, reference=reference)
@@ -72,7 +72,7 @@ def test_a_signal_that_ends_in_the_training_ends_no_training(signal: str, last: 
     assert set(result.left_out) == ({signal} if last < 50 else set())
 
 
-def test_a_signal_that_comes_after_the_training_ends_its_silence_and_is_said_not_to_be_watched(leak: Run) -> None:
+def test_a_signal_that_arrives_after_the_training_ends_its_silence_and_is_reported_as_not_monitored(leak: Run) -> None:
     result = watch(leak, "T", 500, 801)
     ends = {alarm.alarm: cleared_ns for alarm, cleared_ns in result.raised_alarms}
     assert ends["silence/T"] == 50 * MINUTE_NS
@@ -95,7 +95,7 @@ def test_a_slow_sensor_is_not_silent_from_its_first_value_on(every: int) -> None
 
 
 @pytest.mark.parametrize("signal", ["T", "qc"])
-def test_a_monitor_without_a_signal_goes_on_from_its_stored_state(signal: str, leak: Run) -> None:
+def test_a_monitor_without_a_signal_resumes_from_its_stored_state(signal: str, leak: Run) -> None:
     run = messages(leak, signal, 0, 0)
     monitor, said = Monitor(CONFIG, 0), list[Publication]()
     expected = [item for message in run for item in monitor.on_message(message, 0)]

@@ -41,24 +41,24 @@ def leak() -> list[Encoded]:
 
 def watch(messages: Iterable[Encoded], config: MonitorConfig = CONFIG) -> tuple[Monitor, list[Publication]]:
     monitor = Monitor(config, 0)
-    said = [publication for message in messages for publication in monitor.on_message(message, 0)]
-    return monitor, said + monitor.finish()
+    published = [publication for message in messages for publication in monitor.on_message(message, 0)]
+    return monitor, published + monitor.finish()
 
 
 @pytest.fixture(scope="module")
-def said(leak: list[Encoded]) -> list[Publication]:
+def published(leak: list[Encoded]) -> list[Publication]:
     """Publications of a monitor of that run."""
     return watch(leak)[1]
 
 
 @pytest.fixture(scope="module")
-def encoded(said: list[Publication]) -> list[Encoded]:
+def encoded(published: list[Publication]) -> list[Encoded]:
     """The same as bytes."""
-    return [encode(item) for item in said]
+    return [encode(item) for item in published]
 
 
-def told(said: list[Publication], kind: type[M]) -> list[M]:
-    return [item.message for item in said if isinstance(item.message, kind)]
+def messages_of(published: list[Publication], kind: type[M]) -> list[M]:
+    return [item.message for item in published if isinstance(item.message, kind)]
 
 
 def health(monitor: Monitor) -> Health:
@@ -67,8 +67,8 @@ def health(monitor: Monitor) -> Health:
     return publication.message
 
 
-def test_a_leak_raises_an_alarm_soon_after_it_and_none_before(said: list[Publication]) -> None:
-    raised = [alarm for alarm in told(said, Alarm) if alarm.state == AlarmState.ALARM_STATE_UNACKNOWLEDGED]
+def test_a_leak_raises_an_alarm_soon_after_it_and_none_before(published: list[Publication]) -> None:
+    raised = [alarm for alarm in messages_of(published, Alarm) if alarm.state == AlarmState.ALARM_STATE_UNACKNOWLEDGED]
     assert raised
     assert "shewhart/T" in {alarm.alarm for alarm in raised}
     assert to_time_ns(ONSET_MIN) <= raised[0].time_ns <= to_time_ns(ONSET_MIN + 1)
@@ -86,15 +86,15 @@ def test_a_sound_plant_raises_none_in_ten_runs() -> None:
     assert expected == pytest.approx(1000 / (30 * 24 * 60), rel=0.01)
 
 
-def test_limits_are_in_standard_deviations_of_the_residual(said: list[Publication]) -> None:
+def test_limits_are_in_standard_deviations_of_the_residual(published: list[Publication]) -> None:
     """Before the fault the charted residual has the variance one, and the estimate's limits are its own in kelvin."""
     sound = [
-        point for item, point in ((item, item.message) for item in said)
+        point for item, point in ((item, item.message) for item in published)
         if isinstance(point, ChartPoint) and item.key.endswith("shewhart/T") and point.time_ns < to_time_ns(ONSET_MIN)
     ]  # fmt: skip
     assert np.std([point.statistic for point in sound]) == pytest.approx(1.0, rel=0.15)
     estimates = [
-        item.message for item in said if isinstance(item.message, Estimate) and item.key.endswith("estimate/T")
+        item.message for item in published if isinstance(item.message, Estimate) and item.key.endswith("estimate/T")
     ]
     by_time = {estimate.time_ns: estimate for estimate in estimates}
     for point in sound:
@@ -105,13 +105,13 @@ def test_limits_are_in_standard_deviations_of_the_residual(said: list[Publicatio
         assert off == pytest.approx(point.statistic / point.upper_limit, abs=1e-9)
 
 
-def test_predictions_are_made_before_the_sample_is_seen(leak: list[Encoded], said: list[Publication]) -> None:
+def test_predictions_are_made_before_the_sample_is_seen(leak: list[Encoded], published: list[Publication]) -> None:
     """What is predicted for a row does not change when that row's own value does."""
     _, other = watch([*leak[: 3 * 900 - 1], sample("T", 899, 89.9, 500.0)])
     last = [item for item in other if isinstance(item.message, Estimate)][-1]
     (plain,) = (
         item.message
-        for item in said
+        for item in published
         if isinstance(item.message, Estimate) and (item.key, item.message.time_ns) == (last.key, last.message.time_ns)
     )
     assert isinstance(last.message, Estimate)
@@ -119,8 +119,8 @@ def test_predictions_are_made_before_the_sample_is_seen(leak: list[Encoded], sai
     assert last.message.residual != plain.residual
 
 
-def test_estimates_carry_limits_only_when_they_are_known(said: list[Publication]) -> None:
-    estimates = [item.message for item in said if item.key.endswith("estimate/T")]
+def test_estimates_carry_limits_only_when_they_are_known(published: list[Publication]) -> None:
+    estimates = [item.message for item in published if item.key.endswith("estimate/T")]
     known = [not math.isnan(e.lower_limit) for e in estimates if isinstance(e, Estimate)]
     first = known.index(True)
     assert all(known[first:])
@@ -130,15 +130,15 @@ def test_estimates_carry_limits_only_when_they_are_known(said: list[Publication]
 def test_models_are_published_in_the_units_of_the_samples(leak: list[Encoded]) -> None:
     """The parameters after a row predict what the estimate of the next says, from the samples as they are."""
     time_min, columns = leaking_run(-0.1, ONSET_MIN, 160.0, seed=1)
-    _, said = watch(leak, MonitorConfig(reference="arx"))
-    models = [item.message for item in said if item.key.endswith("model/T")]
+    _, published = watch(leak, MonitorConfig(reference="arx"))
+    models = [item.message for item in published if item.key.endswith("model/T")]
     reference = next(model for model in models if isinstance(model, ModelSnapshot) and model.reference)
     p = {item.name: item.value for item in reference.parameters}
     row = 1001
     T, qc = columns["T"], columns["qc"]
     by_hand = p["c"] + sum(p[f"a{lag}"] * T[row - lag] + p[f"b{lag}"] * qc[row - lag] for lag in (1, 2, 3))
     estimate = next(
-        item.message for item in said
+        item.message for item in published
         if item.key.endswith("estimate/T") and item.message.time_ns == to_time_ns(float(time_min[row]))
     )  # fmt: skip
     assert isinstance(estimate, Estimate)
@@ -147,9 +147,9 @@ def test_models_are_published_in_the_units_of_the_samples(leak: list[Encoded]) -
     assert reference.rows >= 500
 
 
-def reference_of(said: list[Publication]) -> ModelSnapshot:
+def reference_of(published: list[Publication]) -> ModelSnapshot:
     """The identified model of T that is held since the training."""
-    models = [item.message for item in said if item.key.endswith("model/T")]
+    models = [item.message for item in published if item.key.endswith("model/T")]
     return next(model for model in models if isinstance(model, ModelSnapshot) and model.held)
 
 
@@ -157,11 +157,11 @@ def reference_of(said: list[Publication]) -> ModelSnapshot:
     ("setting", "judge"),
     [("auto", "equations"), ("process", "equations"), ("black-box", "black-box"), ("arx", "arx")],
 )
-def test_what_judges_is_published_with_its_noise_levels_and_nothing_else_says_that_it_judges(
+def test_the_reference_in_use_is_published_with_its_noise_levels_and_no_other_is_marked_as_in_use(
     leak: list[Encoded], setting: Literal["auto", "process", "black-box", "arx"], judge: str
 ) -> None:
-    monitor, said = watch(leak, MonitorConfig(reference=setting, isolation=False))
-    models = [(item.key, item.message) for item in said if isinstance(item.message, ModelSnapshot)]
+    monitor, published = watch(leak, MonitorConfig(reference=setting, isolation=False))
+    models = [(item.key, item.message) for item in published if isinstance(item.message, ModelSnapshot)]
     since_ns = monitor.memory.watching_since_ns
     assert since_ns is not None
     for key in ("reactor/cstr/model/C", "reactor/cstr/model/T"):
@@ -180,36 +180,36 @@ def test_what_judges_is_published_with_its_noise_levels_and_nothing_else_says_th
         assert levels["sensors"]["T"] == pytest.approx(0.3, rel=0.2)  # as the plant was made
 
 
-def test_health_says_how_far_the_training_is_and_what_judges_then(leak: list[Encoded]) -> None:
+def test_health_reports_the_progress_of_the_training_and_then_the_reference(leak: list[Encoded]) -> None:
     """In a training of 100 min."""
     monitor = Monitor(MonitorConfig(isolation=False), 0)
-    told: list[tuple[float, str]] = []
+    progress: list[tuple[float, str]] = []
     for number, message in enumerate(leak, start=1):
         monitor.on_message(message, 0)
         if number % 300 == 0:
             now = [item.message for item in monitor.on_tick(number * 10**9) if isinstance(item.message, Health)]
-            told += [(report.training, report.reference) for report in now]
-    shares = [share for share, _ in told]
+            progress += [(report.training, report.reference) for report in now]
+    shares = [share for share, _ in progress]
     assert shares == sorted(shares)
     assert shares[4] == pytest.approx(0.49, abs=0.03)
-    assert {reference for share, reference in told if share < 1.0} == {""}
-    assert told[-1] == (1.0, "equations")
+    assert {reference for share, reference in progress if share < 1.0} == {""}
+    assert progress[-1] == (1.0, "equations")
 
 
-def test_the_reference_says_that_its_rows_were_fit_to_learn_from(said: list[Publication]) -> None:
-    checks = {check.name: check.result for check in reference_of(said).checks}
+def test_the_reference_reports_that_its_rows_were_fit_to_learn_from(published: list[Publication]) -> None:
+    checks = {check.name: check.result for check in reference_of(published).checks}
     assert {"variation", "excitation", "sampling", "conditioning", "amplitude", "whiteness", "independence"} <= set(
         checks
     )
     assert checks["excitation"] == checks["variation"] == "ok"
 
 
-def test_the_reference_says_that_a_single_sinusoid_does_not_excite_it() -> None:
+def test_the_reference_reports_that_a_single_sinusoid_does_not_excite_it() -> None:
     """A sinusoid excites order 2; three lags of the output and three of the input need 6."""
     time_min, columns = leaking_run(0.0, 1.0, 110.0, seed=3)
     columns["qc"] = 100.0 + 5.0 * np.sin(2 * np.pi * time_min / 8.0)
-    _, said = watch(samples(time_min, columns))
-    checks = {check.name: check.result for check in reference_of(said).checks}
+    _, published = watch(samples(time_min, columns))
+    checks = {check.name: check.result for check in reference_of(published).checks}
     assert checks["excitation"] != "ok"
 
 
@@ -217,8 +217,8 @@ def test_the_same_samples_give_the_same_bytes_whatever_the_clock_shows(
     leak: list[Encoded], encoded: list[Encoded]
 ) -> None:
     monitor = Monitor(CONFIG, 10**18)
-    said = [item for index, message in enumerate(leak) for item in monitor.on_message(message, 10**18 + 7 * index)]
-    assert [encode(item) for item in said] == encoded
+    published = [item for index, message in enumerate(leak) for item in monitor.on_message(message, 10**18 + 7 * index)]
+    assert [encode(item) for item in published] == encoded
 
 
 def test_order_of_arrival_within_the_reordering_changes_nothing(leak: list[Encoded], encoded: list[Encoded]) -> None:
@@ -266,7 +266,7 @@ def test_garbage_is_counted_by_reason_and_harms_nothing(leak: list[Encoded], enc
         dirty.append(message)
         if index % 300 == 0:
             dirty += [item for _, item in garbage()]
-    monitor, said = watch(dirty)
+    monitor, published = watch(dirty)
     times = sum(index % 300 == 0 for index in range(len(leak)))
     counted = health(monitor)
     reasons: dict[str, int] = {}
@@ -275,10 +275,10 @@ def test_garbage_is_counted_by_reason_and_harms_nothing(leak: list[Encoded], enc
     assert dict(counted.refused_by_reason) == reasons
     assert counted.refused == sum(reasons.values())
     assert counted.received == len(dirty)
-    assert [encode(item) for item in said] == encoded
+    assert [encode(item) for item in published] == encoded
 
 
-def test_a_stranger_on_the_plant_s_keys_is_counted_and_harms_nothing(
+def test_foreign_messages_on_the_plant_s_keys_are_counted_and_harm_nothing(
     leak: list[Encoded], encoded: list[Encoded]
 ) -> None:
     """A second plant of the same name, with a clock and numbers of its own, from the training until after the fault."""
@@ -288,12 +288,12 @@ def test_a_stranger_on_the_plant_s_keys_is_counted_and_harms_nothing(
     for place in range(len(theirs) - 600):
         mixed += [leak[600 + place], theirs[place]]
     mixed += leak[600 + len(theirs) - 600 :]
-    monitor, said = watch(mixed)
-    assert [encode(item) for item in said] == encoded
+    monitor, published = watch(mixed)
+    assert [encode(item) for item in published] == encoded
     assert health(monitor).refused_by_reason["out_of_place"] == len(theirs) - 600
 
 
-def test_what_a_stranger_names_does_not_fill_the_log() -> None:
+def test_foreign_names_do_not_fill_the_log() -> None:
     monitor = Monitor(CONFIG, 0)
     monitor.on_message(sample("T", 0, 0.0, 440.0)._replace(key="reactor/" + "x" * 1_000_000), 0)
     report = monitor.rejects.report(0)
@@ -329,8 +329,8 @@ def test_a_run_with_missing_rows_still_finds_the_leak() -> None:
     time_min, columns = leaking_run(-0.1, ONSET_MIN, 160.0, seed=1)
     lost = random.Random(6)
     messages = [message for message in samples(time_min, columns) if lost.random() > 0.02]
-    monitor, said = watch(messages)
-    raised = [alarm for alarm in told(said, Alarm) if alarm.state == AlarmState.ALARM_STATE_UNACKNOWLEDGED]
+    monitor, published = watch(messages)
+    raised = [alarm for alarm in messages_of(published, Alarm) if alarm.state == AlarmState.ALARM_STATE_UNACKNOWLEDGED]
     assert raised
     assert raised[0].time_ns >= to_time_ns(ONSET_MIN)
     counted = health(monitor)
@@ -341,11 +341,11 @@ def test_a_run_with_missing_rows_still_finds_the_leak() -> None:
 def test_a_gap_is_a_silence_and_nothing_else() -> None:
     time_min, columns = leaking_run(0.0, 1.0, 160.0, seed=2)
     keep = (time_min < 120) | (time_min > 125)
-    _, said = watch(samples(time_min[keep], {name: values[keep] for name, values in columns.items()}))
-    assert {alarm.alarm for alarm in told(said, Alarm)} == {"silence/plant"}
+    _, published = watch(samples(time_min[keep], {name: values[keep] for name, values in columns.items()}))
+    assert {alarm.alarm for alarm in messages_of(published, Alarm)} == {"silence/plant"}
     after = [
         item.message.time_ns
-        for item in said
+        for item in published
         if isinstance(item.message, ChartPoint) and item.message.time_ns > to_time_ns(120)
     ]
     assert min(after) >= to_time_ns(125.1)  # the first row only tells where the plant is
@@ -355,20 +355,20 @@ def test_a_gap_is_a_silence_and_nothing_else() -> None:
 def test_a_publisher_that_begins_again_later_or_earlier_is_watched_on(starts_min: float, alarms: set[str]) -> None:
     time_min, columns = leaking_run(0.0, 1.0, 160.0, seed=2)
     again = samples(time_min[:300] + starts_min, {name: values[:300] for name, values in columns.items()})
-    monitor, said = watch([*samples(time_min, columns), *again])
-    assert {alarm.alarm for alarm in told(said, Alarm)} == alarms
+    monitor, published = watch([*samples(time_min, columns), *again])
+    assert {alarm.alarm for alarm in messages_of(published, Alarm)} == alarms
     counted = health(monitor)
     assert counted.rows == time_min.size + 300
     assert counted.late == counted.lost == 0
-    assert told(said, Estimate)[-1].time_ns == to_time_ns(float(time_min[299]) + starts_min)
+    assert messages_of(published, Estimate)[-1].time_ns == to_time_ns(float(time_min[299]) + starts_min)
 
 
 def test_a_constant_plant_neither_fails_nor_alarms() -> None:
     time_min = np.arange(2000) / 10
     columns = {"qc": np.full(2000, 100.0), "C": np.full(2000, 0.1), "T": np.full(2000, 438.54)}
-    monitor, said = watch(samples(time_min, columns))
+    monitor, published = watch(samples(time_min, columns))
     assert monitor.phase == "watching"
-    assert told(said, Alarm) == []
+    assert messages_of(published, Alarm) == []
 
 
 @pytest.mark.parametrize("constant", ["C", "T"])
@@ -377,9 +377,9 @@ def test_a_sensor_that_never_moves_neither_ends_the_watch_nor_alarms(constant: s
     time_min, columns = leaking_run(0.0, 1.0, 60.0, seed=7)
     columns[constant] = np.full(time_min.size, columns[constant][0])
     config = MonitorConfig(training_min=30.0, charts=("shewhart", "ewma", "mewma", "t2"))
-    monitor, said = watch(samples(time_min, columns), config)
+    monitor, published = watch(samples(time_min, columns), config)
     assert monitor.phase == "watching"
-    assert told(said, Alarm) == []
+    assert messages_of(published, Alarm) == []
 
 
 def test_a_record_shorter_than_the_training_is_never_judged() -> None:
@@ -404,12 +404,12 @@ def test_settings_that_break_a_rule_are_refused(setting: dict[str, object], text
         MonitorConfig(**setting)  # type: ignore[arg-type]
 
 
-def test_a_training_full_of_holes_is_told_and_harms_nothing() -> None:
+def test_a_training_full_of_holes_is_reported_and_harms_nothing() -> None:
     time_min, columns = leaking_run(0.0, 1.0, 160.0, seed=4)
     kept = np.arange(time_min.size) % 9 != 0
-    monitor, said = watch(samples(time_min[kept], {name: values[kept] for name, values in columns.items()}))
+    monitor, published = watch(samples(time_min[kept], {name: values[kept] for name, values in columns.items()}))
     assert monitor.phase == "watching"
-    assert [check.name for check in reference_of(said).checks] == ["record", "training"]
+    assert [check.name for check in reference_of(published).checks] == ["record", "training"]
 
 
 @pytest.mark.parametrize("reference", ["process", "arx"])
@@ -421,7 +421,7 @@ def test_whether_points_are_published_or_not_the_alarms_are_the_same(
     alarms = []
     for points in (True, False):
         monitor = Monitor(config, 0, points=points)
-        said = [item for message in leak for item in monitor.on_message(message, 0)]
-        alarms.append([item.message for item in said if isinstance(item.message, Alarm)])
+        published = [item for message in leak for item in monitor.on_message(message, 0)]
+        alarms.append([item.message for item in published if isinstance(item.message, Alarm)])
     assert alarms[0] == alarms[1]
     assert alarms[0]

@@ -4,11 +4,10 @@ from itertools import combinations_with_replacement
 
 import pytest
 
-from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet.config import FleetConfig, parse_shard, shard_of
-from monitor_node.fleet.node import FleetNode
+from monitor_node.fleet.config import FleetConfig, shard_of
 from monitor_node.health import GONE, MOST_GROUPS, NOTICED, OtherMonitors
+from monitor_node.node import MonitorNode
 from reactorwatch.contract import keys
 from tests.memory_bus import Exchange, MemoryBus
 
@@ -26,28 +25,22 @@ class Process:
 
     def __init__(self, kind: str, exchange: Exchange, start_ns: int) -> None:
         self.bus = MemoryBus(exchange)
-        self.node: MonitorNode | FleetNode
         if kind == SINGLE:
             self.node = MonitorNode(MonitorConfig(plant=PLANT), start_ns)
         else:
             plants, _, shard = kind.partition(" ")
-            of = parse_shard(shard)
-            token = keys.fleet_token(plants, str(of.of), str(of.number), str(start_ns))
-            self.node = FleetNode(QUICK, FleetConfig(plants=plants, shard=shard), self.bus, start_ns, token=token)
+            self.node = MonitorNode(QUICK, start_ns, FleetConfig(plants=plants, shard=shard))
         for expression in self.node.tokens:
             self.bus.subscribe_liveliness(expression, lambda token, is_alive: self.on_token(token, is_alive=is_alive))
-        if isinstance(self.node, MonitorNode):
-            self.bus.declare_token(keys.key(PLANT, keys.ALIVE, "monitor"))
-            self.bus.declare_token(self.node.token)
-        else:
-            self.bus.declare_token(token)
+        self.node.declare_tokens(self.bus)
+        self.bus.declare_token(self.node.token)
 
     def on_token(self, token: str, *, is_alive: bool) -> None:
         self.node.on_alive(token, is_alive, SECOND_NS)
 
     def watches(self) -> bool:
         """True if it watches the plant."""
-        return isinstance(self.node, MonitorNode) or PLANT in self.node.plants
+        return PLANT in self.node.plants
 
 
 def start(*kinds: str) -> tuple[list[Process], MemoryBus]:

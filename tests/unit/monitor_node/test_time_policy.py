@@ -1,8 +1,8 @@
-"""What the monitor does with samples that are late, missing, doubled or irregular, and with a clock that jumps.
+"""Samples that are late, missing, doubled or irregular, and a clock that jumps.
 
 The policy: what happened to samples on their way is counted, and nothing of it is taken for a fault of the process.
 Each test feeds a run as the bus would, and looks at what is counted, what is alarmed, and whether a fault is still
-found. A gap may be told as a silence of the plant; that is no false alarm.
+found. The silence alarm of a gap is no false alarm.
 """
 
 import random
@@ -29,8 +29,8 @@ EVENT = 800  # the row at which something happens to the time
 ONSET_MIN = 90.0  # of the leak, in runs that have one
 
 
-class Said(NamedTuple):
-    """What a monitor said of a run.
+class RunOutput(NamedTuple):
+    """The output of a monitor for a run.
 
     Attributes:
         published: everything but health, as bytes.
@@ -53,7 +53,7 @@ class Run(NamedTuple):
     rows: list[tuple[int, float, tuple[float, ...]]]
 
     def messages(self, without: Callable[[int, str], bool] = lambda _row, _signal: False) -> list[Encoded]:
-        """The run as the plant publishes it, but for samples that are told to be missing."""
+        """The run as the plant publishes it, but for the samples left out."""
         return [
             sample(signal, number, time_min, value)
             for number, time_min, values in self.rows
@@ -82,14 +82,14 @@ def run(size: float, seed: int) -> Run:
     )
 
 
-def watched(messages: Iterable[Encoded], now_ns: Callable[[int], int] = lambda _index: 0) -> Said:
+def watched(messages: Iterable[Encoded], now_ns: Callable[[int], int] = lambda _index: 0) -> RunOutput:
     monitor = Monitor(CONFIG, now_ns(0))
-    said = [item for index, message in enumerate(messages) for item in monitor.on_message(message, now_ns(index))]
-    said += monitor.finish()
-    alarms = [item.message for item in said if isinstance(item.message, Alarm)]
+    output = [item for index, message in enumerate(messages) for item in monitor.on_message(message, now_ns(index))]
+    output += monitor.finish()
+    alarms = [item.message for item in output if isinstance(item.message, Alarm)]
     health = next(item.message for item in monitor.on_stop(1) if isinstance(item.message, Health))
-    return Said(
-        published=[encode(item) for item in said],
+    return RunOutput(
+        published=[encode(item) for item in output],
         raised=[
             (alarm.alarm, alarm.raised_ns)
             for alarm in alarms
@@ -97,7 +97,7 @@ def watched(messages: Iterable[Encoded], now_ns: Callable[[int], int] = lambda _
         ],
         estimated={
             (item.key.rsplit("/", 1)[1], item.message.time_ns): item.message
-            for item in said
+            for item in output
             if isinstance(item.message, Estimate) and not item.key.endswith("/arx")  # of the reference that judges
         },
         health=health,
@@ -118,11 +118,11 @@ def leaking() -> Run:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(leaking: Run) -> Said:
+def undisturbed(leaking: Run) -> RunOutput:
     return watched(leaking.messages())
 
 
-def test_without_any_disturbance_only_the_leak_is_alarmed(undisturbed: Said) -> None:
+def test_without_any_disturbance_only_the_leak_is_alarmed(undisturbed: RunOutput) -> None:
     assert undisturbed.phase == "watching"
     assert undisturbed.raised
     assert min(time_ns for _, time_ns in undisturbed.raised) >= to_time_ns(ONSET_MIN)
@@ -134,17 +134,17 @@ def test_without_any_disturbance_only_the_leak_is_alarmed(undisturbed: Said) -> 
 
 
 @pytest.mark.parametrize("rows_later", [0, 7])
-def test_a_sample_that_comes_twice_changes_nothing(leaking: Run, undisturbed: Said, rows_later: int) -> None:
+def test_a_sample_that_comes_twice_changes_nothing(leaking: Run, undisturbed: RunOutput, rows_later: int) -> None:
     messages = leaking.messages()
     doubled: list[Encoded] = []
     for index, message in enumerate(messages):
         doubled.append(message)
         if index % 5 == 0 and index >= 3 * rows_later:
             doubled.append(messages[index - 3 * rows_later])
-    said = watched(doubled)
-    assert said.published == undisturbed.published
-    assert said.health.duplicated == len(doubled) - len(messages)
-    assert said.health.late == said.health.lost == 0
+    output = watched(doubled)
+    assert output.published == undisturbed.published
+    assert output.health.duplicated == len(doubled) - len(messages)
+    assert output.health.late == output.health.lost == 0
 
 
 def test_a_sample_that_comes_after_its_row_was_given_up_changes_nothing_but_the_count(leaking: Run) -> None:
@@ -161,25 +161,25 @@ def test_a_sample_that_comes_after_its_row_was_given_up_changes_nothing_but_the_
             for signal, value in zip(SIGNALS, values, strict=True)
             if not held_back(number, signal)
         ]
-    without, said = watched(never), watched(tardy)
-    assert said.published == without.published
+    without, output = watched(never), watched(tardy)
+    assert output.published == without.published
     assert without.health.late == 0
-    assert said.health.late == len(tardy) - len(never)
-    assert said.health.late > 20
-    assert said.health.incomplete_rows == without.health.incomplete_rows
+    assert output.health.late == len(tardy) - len(never)
+    assert output.health.late > 20
+    assert output.health.incomplete_rows == without.health.incomplete_rows
 
 
-def test_samples_out_of_order_by_a_few_rows_change_nothing_but_the_count(leaking: Run, undisturbed: Said) -> None:
+def test_samples_out_of_order_by_a_few_rows_change_nothing_but_the_count(leaking: Run, undisturbed: RunOutput) -> None:
     messages, order = leaking.messages(), random.Random(5)
     shuffled = messages[:3]
     for start in range(3, len(messages), 12):
         part = messages[start : start + 12]
         order.shuffle(part)
         shuffled += part
-    said = watched(shuffled)
-    assert said.published == undisturbed.published
-    assert said.health.out_of_order > 0
-    assert said.health.late == said.health.lost == 0
+    output = watched(shuffled)
+    assert output.published == undisturbed.published
+    assert output.health.out_of_order > 0
+    assert output.health.late == output.health.lost == 0
 
 
 # --- missing -------------------------------------------------------------------------------------------------
@@ -187,27 +187,27 @@ def test_samples_out_of_order_by_a_few_rows_change_nothing_but_the_count(leaking
 
 def test_a_missing_sample_leaves_its_row_incomplete_and_the_other_signal_judged(sound: Run) -> None:
     row = EVENT
-    said = watched(sound.messages(lambda number, signal: (number, signal) == (row, "T")))
-    assert said.health.incomplete_rows == said.health.lost == 1
-    assert said.health.rows == ROWS
+    output = watched(sound.messages(lambda number, signal: (number, signal) == (row, "T")))
+    assert output.health.incomplete_rows == output.health.lost == 1
+    assert output.health.rows == ROWS
     time_ns = to_time_ns(sound.rows[row][1])
-    assert ("C", time_ns) in said.estimated
-    assert ("T", time_ns) not in said.estimated
-    assert said.raised == []
+    assert ("C", time_ns) in output.estimated
+    assert ("T", time_ns) not in output.estimated
+    assert output.raised == []
 
 
 @pytest.mark.parametrize("signal", ["C", "T"])
 def test_after_a_missing_sample_the_plant_is_expected_where_it_was_expected_with_it(
-    leaking: Run, undisturbed: Said, signal: str
+    leaking: Run, undisturbed: RunOutput, signal: str
 ) -> None:
     """One measurement more or less moves a prediction by a fraction of its standard deviation. Nothing begins anew."""
     missing = range(620, 890, 30)
-    said = watched(leaking.messages(lambda row, name: name == signal and row in missing))
+    output = watched(leaking.messages(lambda row, name: name == signal and row in missing))
     moved = [
-        (said.estimated[key].prediction - estimate.prediction) / estimate.residual_sd
+        (output.estimated[key].prediction - estimate.prediction) / estimate.residual_sd
         for row in missing
         for key, estimate in undisturbed.estimated.items()
-        if 0 < key[1] - to_time_ns(leaking.rows[row][1]) < to_time_ns(0.35) and key in said.estimated
+        if 0 < key[1] - to_time_ns(leaking.rows[row][1]) < to_time_ns(0.35) and key in output.estimated
     ]
     assert len(moved) >= 3 * len(missing)  # of the other signal at least
     assert np.sqrt(np.mean(np.square(moved))) < 0.5
@@ -215,26 +215,26 @@ def test_after_a_missing_sample_the_plant_is_expected_where_it_was_expected_with
 
 @pytest.mark.parametrize("signal", ["qc", "T"])
 def test_a_signal_that_is_missing_for_three_rows_raises_no_alarm(sound: Run, signal: str) -> None:
-    said = watched(sound.messages(lambda row, name: name == signal and EVENT <= row < EVENT + 3))
-    assert said.health.incomplete_rows == 3
-    assert said.raised == []
+    output = watched(sound.messages(lambda row, name: name == signal and EVENT <= row < EVENT + 3))
+    assert output.health.incomplete_rows == 3
+    assert output.raised == []
 
 
 def test_a_tenth_of_the_samples_may_get_lost_and_is_counted_and_raises_no_alarm(sound: Run) -> None:
     lost = random.Random(6)
     kept = [message for index, message in enumerate(sound.messages()) if index < 3 or lost.random() > 0.1]
-    said = watched(kept)
-    assert said.raised == []
-    assert said.phase == "watching"
+    output = watched(kept)
+    assert output.raised == []
+    assert output.phase == "watching"
     last_rows = 3  # a loss at the very end is not noticed: no number follows that jumps
-    assert 0 <= 3 * ROWS - len(kept) - said.health.lost <= last_rows
+    assert 0 <= 3 * ROWS - len(kept) - output.health.lost <= last_rows
 
 
 def test_a_leak_is_found_though_a_tenth_of_the_samples_is_lost(leaking: Run) -> None:
     lost = random.Random(7)
-    said = watched(message for message in leaking.messages() if lost.random() > 0.1)
-    assert said.raised
-    first_ns = min(time_ns for _, time_ns in said.raised)
+    output = watched(message for message in leaking.messages() if lost.random() > 0.1)
+    assert output.raised
+    first_ns = min(time_ns for _, time_ns in output.raised)
     assert to_time_ns(ONSET_MIN) <= first_ns <= to_time_ns(ONSET_MIN + 10)
 
 
@@ -252,10 +252,10 @@ def test_irregular_intervals_raise_no_alarm_in_a_sound_plant(spread: float) -> N
     outputs = outputs + generator.normal(size=outputs.shape) * (0.002, 0.3)
     values = zip(qc.tolist(), *outputs.T.tolist(), strict=True)
     rows = zip(range(ROWS), time_min.tolist(), values, strict=True)
-    said = watched(Run(list(rows)).messages())
-    assert said.raised == []
-    assert said.health.rows == ROWS
-    assert said.health.incomplete_rows == 0
+    output = watched(Run(list(rows)).messages())
+    assert output.raised == []
+    assert output.health.rows == ROWS
+    assert output.health.incomplete_rows == 0
 
 
 # --- the plant's clock ---------------------------------------------------------------------------------------
@@ -263,41 +263,41 @@ def test_irregular_intervals_raise_no_alarm_in_a_sound_plant(spread: float) -> N
 
 @pytest.mark.parametrize("by_min", [0.05, 60.0])
 def test_a_clock_that_is_set_forward_raises_no_alarm_and_the_plant_is_watched_on(sound: Run, by_min: float) -> None:
-    said = watched(sound.moved(EVENT, by_min).messages())
-    assert said.raised == []
-    assert said.phase == "watching"
-    assert said.health.rows == ROWS
-    assert said.health.lost == 0
-    assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= said.estimated.keys()
+    output = watched(sound.moved(EVENT, by_min).messages())
+    assert output.raised == []
+    assert output.phase == "watching"
+    assert output.health.rows == ROWS
+    assert output.health.lost == 0
+    assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= output.estimated.keys()
 
 
 @pytest.mark.parametrize("by_min", [-0.5, -3.0, -10.0, -79.0])
 def test_a_clock_that_is_set_back_raises_no_alarm_and_the_plant_is_watched_on(sound: Run, by_min: float) -> None:
     """The numbers go on, so the samples are new, however old their times."""
-    said = watched(sound.moved(EVENT, by_min).messages())
-    assert said.raised == []
-    assert said.health.rows == ROWS
-    assert said.health.late == said.health.lost == said.health.duplicated == 0
-    assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= said.estimated.keys()
+    output = watched(sound.moved(EVENT, by_min).messages())
+    assert output.raised == []
+    assert output.health.rows == ROWS
+    assert output.health.late == output.health.lost == output.health.duplicated == 0
+    assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= output.estimated.keys()
 
 
 @pytest.mark.parametrize("rows", [5, 100])
 def test_a_gap_in_the_samples_is_counted_and_raises_no_alarm(sound: Run, rows: int) -> None:
-    said = watched(sound.lacking(EVENT, EVENT + rows - 1).messages())
-    assert said.raised == []
-    assert said.health.lost == 3 * rows
-    assert said.health.incomplete_rows == 0
-    assert {("C", to_time_ns(109.0)), ("T", to_time_ns(109.0))} <= said.estimated.keys()
+    output = watched(sound.lacking(EVENT, EVENT + rows - 1).messages())
+    assert output.raised == []
+    assert output.health.lost == 3 * rows
+    assert output.health.incomplete_rows == 0
+    assert {("C", to_time_ns(109.0)), ("T", to_time_ns(109.0))} <= output.estimated.keys()
 
 
 @pytest.mark.parametrize("by_min", [-79.0, -3.0, 500.0])
 def test_a_publisher_that_begins_again_at_any_time_raises_no_alarm_and_is_watched_on(sound: Run, by_min: float) -> None:
-    said = watched(sound.moved(EVENT, by_min, numbered_from_0=True).messages())
-    assert said.raised == []
-    assert said.phase == "watching"
-    assert said.health.rows == ROWS
-    assert said.health.late == said.health.lost == said.health.duplicated == 0
-    assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= said.estimated.keys()
+    output = watched(sound.moved(EVENT, by_min, numbered_from_0=True).messages())
+    assert output.raised == []
+    assert output.phase == "watching"
+    assert output.health.rows == ROWS
+    assert output.health.late == output.health.lost == output.health.duplicated == 0
+    assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= output.estimated.keys()
 
 
 @pytest.mark.parametrize(
@@ -310,17 +310,17 @@ def test_a_publisher_that_begins_again_at_any_time_raises_no_alarm_and_is_watche
     ids=["clock set forward", "begun again earlier", "a gap of five minutes"],
 )
 def test_a_leak_that_sets_in_after_it_is_still_found(leaking: Run, change: Callable[[Run], Run], by_min: float) -> None:
-    said = watched(change(leaking).messages())
-    assert said.raised
-    first_ns = min(time_ns for _, time_ns in said.raised)
+    output = watched(change(leaking).messages())
+    assert output.raised
+    first_ns = min(time_ns for _, time_ns in output.raised)
     assert to_time_ns(ONSET_MIN + by_min) <= first_ns <= to_time_ns(ONSET_MIN + by_min + 10)
 
 
 # --- the monitor's clock -------------------------------------------------------------------------------------
 
 
-def test_the_monitors_own_clock_may_jump_as_it_likes(leaking: Run, undisturbed: Said) -> None:
+def test_the_monitors_own_clock_may_jump_as_it_likes(leaking: Run, undisturbed: RunOutput) -> None:
     jumps = random.Random(9)
     times = [jumps.randrange(10**18) for _ in range(3 * ROWS)]
-    said = watched(leaking.messages(), lambda index: times[index])
-    assert said.published == undisturbed.published
+    output = watched(leaking.messages(), lambda index: times[index])
+    assert output.published == undisturbed.published

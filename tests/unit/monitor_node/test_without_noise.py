@@ -1,4 +1,4 @@
-"""A plant whose sensors have no noise is watched, though no smallest level was stated."""
+"""A plant whose sensors have no noise is monitored, though no smallest level was stated."""
 
 import pytest
 

@@ -15,22 +15,22 @@ from .samples import Rows, leaking_run, samples
 
 @dataclass
 class Watched:
-    """A monitor that was run over a record, and what it said."""
+    """A monitor that was run over a record, and its output."""
 
     monitor: Monitor
-    said: list[Publication] = field(default_factory=list)
+    published: list[Publication] = field(default_factory=list)
 
     @property
     def alarms(self) -> list[Alarm]:
         """Every change of an alarm."""
-        return [item.message for item in self.said if isinstance(item.message, Alarm)]
+        return [item.message for item in self.published if isinstance(item.message, Alarm)]
 
     @property
     def suspected(self) -> list[Incident]:
         """Every incident as it was published with other suspects than before."""
         newest: dict[int, list[Suspect]] = {}
         found = []
-        for item in self.said:
+        for item in self.published:
             incident = item.message
             if isinstance(incident, Incident) and incident.suspects:
                 if list(incident.suspects) != newest.get(incident.number):
@@ -47,7 +47,9 @@ class Watched:
         """Of a chart, such as `shewhart/T`."""
         suffix = f"/chart/{chart}"
         return [
-            item.message for item in self.said if isinstance(item.message, ChartPoint) and item.key.endswith(suffix)
+            item.message
+            for item in self.published
+            if isinstance(item.message, ChartPoint) and item.key.endswith(suffix)
         ]
 
 
@@ -66,8 +68,8 @@ def watched(
     if not compiled:
         run.monitor.pipeline.evaluation.find_ordinary = lambda *_: False  # type: ignore[method-assign]
     for message in samples(time_min, columns):
-        run.said += run.monitor.on_message(message, 0)
-    run.said += run.monitor.finish()
+        run.published += run.monitor.on_message(message, 0)
+    run.published += run.monitor.finish()
     return run
 
 

@@ -1,4 +1,4 @@
-"""Rows of a plant, and what is read in them; a plant whose sensors have no noise."""
+"""Rows of a plant and their columns; a plant whose sensors have no noise."""
 
 import numpy as np
 

@@ -58,7 +58,7 @@ def test_the_default_gain_is_stable_with_a_margin_of_four(flow_l_min: float) -> 
 
 
 @pytest.mark.parametrize("flow_l_min", [85.0, 111.0])
-def test_the_plant_under_control_settles_as_fast_as_the_eigenvalues_say(flow_l_min: float) -> None:
+def test_the_plant_under_control_settles_as_fast_as_its_eigenvalues(flow_l_min: float) -> None:
     rest = resting(flow_l_min)
     running = plant(at(flow_l_min), start={"C": float(rest[0]), "T": float(rest[1]) + 0.2})
     error = np.abs(column(rows(running, 120), "T") - rest[1])

@@ -90,7 +90,7 @@ def test_a_given_record_drives_instead_of_the_scenario() -> None:
 @pytest.mark.parametrize(
     ("start", "temperature"), [("operating", 438.5417), ("extinguished", 353.553), ({"C": 0.5, "T": 400.0}, 400.0)]
 )
-def test_run_starts_where_it_is_told(start: object, temperature: float) -> None:
+def test_run_starts_at_the_given_state(start: object, temperature: float) -> None:
     """The published steady states at 103.41 l/min; in them the plant stays."""
     scenario = {"kind": "constant", "level_l_min": 103.41}
     found = column(rows(plant(start=start, scenario=scenario), 100), "T")
@@ -168,7 +168,7 @@ def test_a_fault_injected_is_the_same_as_one_configured() -> None:
     assert injected == configured
 
 
-def test_no_fault_is_told_before_its_onset() -> None:
+def test_no_fault_is_published_before_its_onset() -> None:
     found = rows(plant(faults=("coolant_flow:step:-0.05@1.02min", "heat_transfer:constant:0.01")), 20)
     told = {str(change.specification): row.time_min for row in found for change in row.changes}
     assert told == {"coolant_flow:step:-0.05@1.02min": 1.1, "heat_transfer:constant:0.01": 0.0}
@@ -209,7 +209,7 @@ def test_faults_that_the_model_cannot_have_are_refused() -> None:
     assert running.next_row() == plant(only_concentration, noise_sd={"C": 0.0}).next_row()
 
 
-def test_it_goes_out_ignites_again_and_goes_on() -> None:
+def test_it_extinguishes_ignites_again_and_continues() -> None:
     running = plant()
     rows(running, 10)
     running.set_input("qc", 135.0)
@@ -231,7 +231,7 @@ def explosive() -> ProcessModel:
     return replace(model, rhs=(ca.SX(0), ca.if_else(qc > 150, T**2, 0)))
 
 
-def test_where_the_equations_end_the_state_is_held_and_marked_until_they_go_on() -> None:
+def test_where_the_equations_end_the_state_is_held_and_marked_until_they_resume() -> None:
     running = plant(explosive(), start={"C": 0.1, "T": 400.0})
     good = rows(running, 3)
     running.set_input("qc", 160.0)

@@ -1,6 +1,7 @@
 """Process noise: of the size asked for, a stream of its own, and carried on by the plant."""
 
 from dataclasses import replace
+from math import sqrt
 from typing import Any
 
 import casadi as ca
@@ -17,7 +18,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.controllers import LevelControl
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.linearise import linearise
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import ProcessModel, variable
 from reactorwatch.process.steady_state import steady_states
 from tests.unit.plant_node.rows import QUIET
 
@@ -78,7 +79,7 @@ def test_the_first_row_is_the_start_and_the_rows_do_not_depend_on_how_many_there
     np.testing.assert_array_equal(long.columns["T"][:50], short.columns["T"])
 
 
-def test_the_plant_carries_it_on_as_its_linear_model_says() -> None:
+def test_the_plant_propagates_it_as_its_linear_model_does() -> None:
     """The stationary covariance P = Phi P Phi' + Q of the sampled linear model, here for small noise."""
     sd, qc, period_min = np.array([1e-5, 0.02]), np.array([95.0]), 0.1
     point = steady_states(cstr(), qc)[-1]
@@ -103,7 +104,7 @@ def test_a_concentration_does_not_go_below_nothing() -> None:
 
 @pytest.mark.parametrize(("value", "farthest"), [(710.0, max), (240.0, min)])
 def test_a_state_that_is_out_of_its_bounds_by_itself_is_not_pulled_back(value: float, farthest: Any) -> None:
-    noise = ProcessNoise("T", 1.0, 0.1, 250.0, 700.0, seed=0)
+    noise = ProcessNoise(variable("T", "K", (250.0, 700.0), 1.0, "temperature"), sqrt(0.1), seed=0)
     moved = [noise.add_to(value, row) for row in range(200)]
     assert farthest(moved) == value
     assert 0.0 < abs(np.mean(moved) - value) < 1.0

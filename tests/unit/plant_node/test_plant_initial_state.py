@@ -1,4 +1,4 @@
-"""How a state goes over into a model that has other states."""
+"""Transfer of a state into a model that has other states."""
 
 from dataclasses import replace
 from typing import ClassVar
@@ -53,7 +53,7 @@ def test_new_states_begin_at_rest_and_known_ones_go_over_by_name() -> None:
     np.testing.assert_allclose(found, [0.1, 431.0, 431.0], rtol=1e-12)
 
 
-def test_steady_states_are_told_apart_by_temperature_whatever_the_last_state_is() -> None:
+def test_steady_states_are_distinguished_by_temperature_whatever_the_last_state_is() -> None:
     """Against the published three at 103.41 l/min."""
     model, qc = Thermowell().extend(cstr()), np.array([103.41])
     reversed_ = replace(model, states=model.states[::-1], rhs=model.rhs[::-1])

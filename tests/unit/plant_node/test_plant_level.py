@@ -80,7 +80,7 @@ def test_it_starts_at_the_level_that_a_fault_of_always_keeps() -> None:
     np.testing.assert_allclose(temperatures, temperatures[0], rtol=0, atol=1e-5)
 
 
-def test_a_start_that_does_not_say_the_level_has_it_at_rest() -> None:
+def test_a_start_without_a_level_has_it_at_rest() -> None:
     running = plant(start={"C": 0.1, "T": 438.54})
     assert running.state == pytest.approx({"C": 0.1, "T": 438.54, "V": 100.0})
     assert plant(start={"C": 0.1, "T": 438.54, "V": 90.0}).state["V"] == 90.0

@@ -35,8 +35,8 @@ class Bench:
 
     def __init__(self, **settings: object) -> None:
         self.config = PlantConfig(**settings)  # type: ignore[arg-type]
-        self.said: list[str] = []
-        self.node = PlantNode(plant_from(self.config), self.config, self.said.append)
+        self.logged: list[str] = []
+        self.node = PlantNode(plant_from(self.config), self.config, self.logged.append)
 
     def ask(self, name: str, message: Message, now_ns: int = START_NS) -> CommandReply:
         question = Encoded(f"reactor/{self.config.name}/command/{name}", *encode_message(message))
@@ -113,7 +113,7 @@ def test_rows_come_when_they_are_due() -> None:
     assert len(of_kind(node.on_tick(START_NS + SECOND_NS // 10), "sample")) == 3
 
 
-def test_a_plant_that_is_behind_leaves_no_row_out_and_says_how_far() -> None:
+def test_a_plant_that_is_behind_leaves_no_row_out_and_reports_its_lag() -> None:
     """After 10 s without a tick the last of the rows now due is on time; a batch short of that it is not."""
     bench = Bench(speed=60.0)
     bench.node.on_tick(START_NS)
@@ -123,7 +123,7 @@ def test_a_plant_that_is_behind_leaves_no_row_out_and_says_how_far() -> None:
     far_behind = bench.node.on_tick(START_NS + 70 * SECOND_NS)
     assert len(of_kind(far_behind, "sample")) == 3 * BATCH
     assert health_in(far_behind)[0].lag_ms == 40_000
-    assert bench.said == ["behind its pace by 40.0 s; no row is left out"]
+    assert bench.logged == ["behind its pace by 40.0 s; no row is left out"]
     assert bench.node.next_tick_ns() <= START_NS + 70 * SECOND_NS
 
 
@@ -135,7 +135,7 @@ def test_it_is_finished_after_its_duration() -> None:
     assert of_kind(bench.node.on_tick(START_NS + SECOND_NS), "sample") == []
 
 
-def test_health_is_told_every_period_and_at_the_end() -> None:
+def test_health_is_published_every_period_and_at_the_end() -> None:
     bench = Bench(speed=60.0, health_period_s=2.0)
     publications: list[Publication] = []
     for tenth in range(45):
@@ -153,7 +153,7 @@ def test_health_is_told_every_period_and_at_the_end() -> None:
     assert (last.node, last.received, last.refused) == ("plant", 1, 1)
 
 
-def test_under_control_the_reply_says_whether_it_is_manual_or_automatic() -> None:
+def test_under_control_the_reply_states_whether_it_is_manual_or_automatic() -> None:
     bench = Bench(temperature_control=TemperatureControl(), duration_min=1.0)
     texts = [
         bench.ask("set_input", SetInput(signal=name, value=value)).text for name, value in (("qc", 95), ("T", 440))
@@ -169,10 +169,10 @@ def test_set_input_acts_from_the_next_row_on() -> None:
     (sample, *_) = of_kind(bench.node.on_tick(START_NS + SECOND_NS // 10), "sample")
     assert isinstance(sample.message, Sample)
     assert sample.message.value == 95.0
-    assert bench.said == [reply.text]
+    assert bench.logged == [reply.text]
 
 
-def test_a_fault_is_told_in_the_row_in_which_it_comes_and_goes() -> None:
+def test_a_fault_is_published_in_the_rows_in_which_it_starts_and_ends() -> None:
     bench = Bench(speed=60.0, zero_ns=0)
     now_ns = START_NS
     bench.node.on_tick(now_ns)
@@ -226,7 +226,7 @@ def test_what_cannot_be_done_is_refused_with_the_reason(name: str, message: Mess
     assert not reply.accepted
     assert reply.text.startswith(why)
     assert len(reply.text.splitlines()) == 1
-    assert bench.said == []
+    assert bench.logged == []
     (last,) = health_in(bench.node.on_stop(START_NS))
     assert (last.received, last.refused, sum(last.refused_by_reason.values())) == (1, 1, 1)
 
@@ -274,7 +274,7 @@ def test_served_on_a_bus_it_publishes_its_record_and_then_leaves() -> None:
     assert alive == [("reactor/cstr/alive/plant", True), ("reactor/cstr/alive/plant", False)]
 
 
-def test_it_waits_for_the_nodes_it_was_told_of_and_serves_commands_while_it_runs() -> None:
+def test_it_waits_for_the_nodes_in_its_settings_and_serves_commands_while_it_runs() -> None:
     """No sample before the monitor is alive; then an endless run in a thread obeys, until it is asked to stop."""
     config = PlantConfig(speed=600.0, wait_for=("monitor",))
     exchange = Exchange()

@@ -93,7 +93,7 @@ def test_the_file_overrides_the_preset_and_a_flag_overrides_both() -> None:
     )
 
 
-def test_what_is_said_to_be_the_default_overrides_the_preset_too() -> None:
+def test_a_stated_default_overrides_the_preset_too() -> None:
     config = read({"preset": "input-leakage", "faults": [], "scenario": "random-steps"})
     assert (config.faults, config.scenario) == ((), PlantConfig().scenario)
 

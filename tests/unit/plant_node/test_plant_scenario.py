@@ -8,7 +8,7 @@ import pytest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import (
-    SCENARIOS,
+    KINDS,
     Constant,
     FromFile,
     HeldRecord,
@@ -47,7 +47,7 @@ def levels(scenario: Scenario, seed: int = 0) -> np.ndarray[Any, np.dtype[np.flo
 
 
 def test_every_kind_of_the_catalogue_is_tested_here() -> None:
-    assert {type(item) for item in OF_ALL_KINDS} - {HeldRecord} == set(SCENARIOS) - {FromFile}
+    assert {type(item) for item in OF_ALL_KINDS} - {HeldRecord} == set(KINDS.values()) - {FromFile}
 
 
 @pytest.mark.parametrize("scenario", OF_ALL_KINDS, ids=lambda scenario: type(scenario).__name__)
@@ -81,7 +81,7 @@ def test_another_seed_is_another_input() -> None:
     assert not np.any(levels(OF_ALL_KINDS[0], seed=0)[::10] == levels(OF_ALL_KINDS[0], seed=1)[::10])
 
 
-def test_sines_are_the_sum_they_say() -> None:
+def test_sines_match_their_stated_sum() -> None:
     scenario = Sines(mean=100.0, amplitudes=(4.0, 2.0), periods_min=(3.0, 7.0), phases=(0.0, 1.0))
     expected = 100 + 4 * np.sin(2 * np.pi * TIMES / 3) + 2 * np.sin(2 * np.pi * TIMES / 7 + 1)
     np.testing.assert_allclose(levels(scenario), expected, rtol=1e-12)

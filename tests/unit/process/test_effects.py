@@ -167,7 +167,7 @@ def test_effects_on_the_analyser_change_what_it_shows_and_nothing_else() -> None
         np.testing.assert_allclose(run.outputs[:, 0], factor * nominal.outputs[:, 0] + shift, rtol=1e-14)
 
 
-def test_profiles_go_in_time_as_they_say() -> None:
+def test_profiles_match_their_definitions_in_time() -> None:
     """Read off the bias of the thermometer, which is the profile itself."""
     bias = effect_of("temperature_bias")
     since = np.maximum(TIMES - 1.2, 0)

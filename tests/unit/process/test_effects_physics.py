@@ -1,4 +1,4 @@
-"""Effects against the physics written out by hand and integrated by scipy, to a tolerance far below ours."""
+"""Effects against the physics written out by hand and integrated by scipy, with a far smaller tolerance."""
 
 from math import exp
 
@@ -95,7 +95,7 @@ def advance_inputs(switched_min: Array) -> Array:
 
 
 @pytest.mark.parametrize("before_min", [0.01, 0.03, 0.3])
-def test_stamps_that_become_late_are_felt_earlier_from_then_on_and_no_earlier(before_min: float) -> None:
+def test_inputs_whose_stamps_become_late_act_earlier_from_then_on_and_no_earlier(before_min: float) -> None:
     """It happens so long before an input changes: twice that change is felt at once, or nearly so."""
     late, onset_min = 0.04, TIMES[75] - before_min
     truth = advance_inputs(np.where(onset_min < TIMES, np.maximum(TIMES - late, onset_min), TIMES))
@@ -103,7 +103,7 @@ def test_stamps_that_become_late_are_felt_earlier_from_then_on_and_no_earlier(be
     assert np.all(np.abs(found - truth) < ERROR)
 
 
-def test_stamps_that_become_ever_later_are_felt_ever_earlier() -> None:
+def test_inputs_with_ever_later_stamps_act_ever_earlier() -> None:
     """To first order in how fast: the rest is the shift times its growth, here 0.0002 min, times 60 K/min."""
     size, begin, end = 0.04, 5.0, 13.0
     values = {f"sample_timing.{name}": value for name, value in {"size": size, "onset": begin, "end": end}.items()}

@@ -1,4 +1,4 @@
-"""The file of an extended model: what is written is what is read, and what cannot be is told in one line."""
+"""The file of an extended model: it is read as it was written, and an error is reported in one line."""
 
 import json
 
@@ -46,7 +46,7 @@ def test_the_model_that_is_read_runs_as_the_faults_do() -> None:
     assert np.array_equal(Simulator(read).run(time_min, inputs, start).outputs, expected)
 
 
-def test_a_model_tells_by_its_parameters_what_is_in_it() -> None:
+def test_the_effects_of_a_model_follow_from_its_parameters() -> None:
     read = parse_extended_model(written(effects=FAULTS, parameters={"q": 99.5}))
     assert extended_model_of(read.build()).to_object() == read.to_object()
     assert extended_model_of(cstr()).to_object()["effects"] == []
@@ -87,7 +87,7 @@ def test_minutes_of_an_unknown_moment_stay_as_they_are() -> None:
         (written(paramters={}), "paramters"),
     ],
 )
-def test_what_is_no_model_is_told_in_one_line(text: str, expected: str) -> None:
+def test_a_file_that_is_no_model_is_reported_in_one_line(text: str, expected: str) -> None:
     with pytest.raises(InputError) as told:
         parse_extended_model(text)
     assert expected in str(told.value)

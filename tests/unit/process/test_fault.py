@@ -1,4 +1,4 @@
-"""Fault specifications: what they mean, and what is said about wrong ones."""
+"""Fault specifications: their meaning, and the errors of wrong ones."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ from reactorwatch.process.simulate import Simulator
         ("coolant_flow:ramp:0.1,onset=5min", {"size": 0.1, "onset": 5.0}, "coolant_flow:ramp:0.1@5min"),
     ],
 )
-def test_specification_means_what_it_says(text: str, values: dict[str, float], canonical: str | None) -> None:
+def test_a_specification_gives_the_stated_fault(text: str, values: dict[str, float], canonical: str | None) -> None:
     found = parse_fault(text)
     assert found.values == values
     assert str(found) == (canonical or text)
@@ -119,7 +119,7 @@ def test_wrong_part_is_named_in_one_line(text: str, why: str) -> None:
     assert str(caught.value) == f"fault {text!r}: {why}"
 
 
-def test_what_was_not_said_comes_from_the_run() -> None:
+def test_unstated_values_come_from_the_run() -> None:
     assert parse_fault("coolant_flow:ramp:0.1").with_defaults(5.0, 90.0).values == {
         "size": 0.1,
         "onset": 5.0,

@@ -62,7 +62,7 @@ def test_stepper_does_not_step_across_an_onset() -> None:
     np.testing.assert_allclose(whole, parts, rtol=1e-12)
 
 
-def test_equations_that_run_away_are_told_where() -> None:
+def test_equations_that_diverge_are_reported_with_the_time() -> None:
     """dT/dt = T^2 from 300 K has no value after 1/300 min."""
     model = cstr()
     runaway = replace(model, rhs=(ca.SX(0), model.states[1].symbol ** 2))
@@ -72,7 +72,7 @@ def test_equations_that_run_away_are_told_where() -> None:
         Stepper(runaway).advance(np.array([0.1, 300.0]), np.array([100.0]), model.values(), 0.0, 1.0)
 
 
-def test_equations_too_stiff_for_it_are_told_and_do_not_hang() -> None:
+def test_equations_too_stiff_for_it_are_reported_and_do_not_hang() -> None:
     """A time constant of 1e-8 min would take millions of steps to the next sample."""
     model = cstr()
     stiff = replace(model, rhs=(ca.SX(0), 1e8 * (400 - model.states[1].symbol)))

@@ -69,7 +69,7 @@ def test_a_law_in_any_place_survives_the_file(place: Place) -> None:
     assert json.dumps(extended_model_of(again).to_object()) == written
 
 
-def test_the_plant_with_a_law_loses_the_heat_that_the_formula_says() -> None:
+def test_the_plant_with_a_law_loses_the_heat_of_the_formula() -> None:
     time_min = 0.1 * np.arange(50, dtype=np.float64)
     inputs, start = np.full((50, 1), 103.41), np.array([0.1, 438.54])
     free = Simulator(LOSS.extend(cstr())).run(time_min, inputs, start)
@@ -79,7 +79,7 @@ def test_the_plant_with_a_law_loses_the_heat_that_the_formula_says() -> None:
     np.testing.assert_allclose(free.states, expected.states, rtol=1e-9)
 
 
-def test_a_law_says_where_it_was_not_seen() -> None:
+def test_a_law_states_the_region_without_data() -> None:
     assert LOSS.outside({"T": np.array([430.0, 450.0])}) == []
     (sentence,) = LOSS.outside({"T": np.array([430.0, 460.0])})
     assert "460" in sentence

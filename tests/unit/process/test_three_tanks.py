@@ -67,7 +67,7 @@ def test_the_published_means_are_a_steady_state() -> None:
 
 
 @pytest.mark.parametrize("effect", THREE_TANKS_EFFECTS, ids=lambda effect: effect.name)
-def test_an_effect_does_to_the_levels_what_the_equations_by_hand_say(effect: Effect) -> None:
+def test_an_effect_on_the_levels_matches_the_equations_by_hand(effect: Effect) -> None:
     times_s = np.arange(0.0, 300.0, 10.0)
     flows = np.repeat(np.random.default_rng(1).uniform([15, 45], [30, 60], (6, 2)), 5, axis=0)
     size = SIZES[effect.name]

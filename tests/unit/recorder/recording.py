@@ -37,21 +37,21 @@ class Fed:
     files: RecordingFiles
     now_ns: int
     confirmed: Confirmed
-    told: list[Publication] = field(default_factory=list)
+    published: list[Publication] = field(default_factory=list)
 
-    def hear(self, publications: Iterable[Publication], apart_ns: int) -> None:
+    def receive(self, publications: Iterable[Publication], apart_ns: int) -> None:
         """Publish, one message each so often, and let it do what falls due between."""
         for publication in publications:
             self.pass_time(apart_ns)
             encoded = encode(publication)
-            self.told += self.node.on_message(Encoded(*encoded[:3], self.now_ns), self.now_ns)
+            self.published += self.node.on_message(Encoded(*encoded[:3], self.now_ns), self.now_ns)
 
     def pass_time(self, span_ns: int) -> None:
         """Let nothing come for a while."""
         end_ns = self.now_ns + span_ns
         while (due_ns := self.node.next_tick_ns()) <= end_ns:
             self._move_on(max(self.now_ns, due_ns))
-            self.told += self.node.on_tick(self.now_ns)
+            self.published += self.node.on_tick(self.now_ns)
         self._move_on(end_ns)
 
     def _move_on(self, now_ns: int) -> None:
@@ -64,7 +64,7 @@ class Fed:
 
     def stop(self) -> None:
         """Ask it to end, and close its files."""
-        self.told += self.node.on_stop(self.now_ns)
+        self.published += self.node.on_stop(self.now_ns)
         with self.files:
             pass
 
@@ -80,11 +80,11 @@ class Fed:
 
     def alarms(self) -> list[Alarm]:
         """The alarms that it has published."""
-        return [item.message for item in self.told if isinstance(item.message, Alarm)]
+        return [item.message for item in self.published if isinstance(item.message, Alarm)]
 
     def last_health(self) -> Health:
         """Its last report."""
-        return [item.message for item in self.told if isinstance(item.message, Health)][-1]
+        return [item.message for item in self.published if isinstance(item.message, Health)][-1]
 
 
 def recorder(

@@ -24,7 +24,7 @@ def names(folder: Path) -> set[str]:
 def fill(fed: Fed, minutes: int, first: int = 0) -> int:
     """Record for so many minutes, which makes as many files; returns the next number."""
     count = 6 * minutes
-    fed.hear(samples(count, first=first), 10 * SECOND)
+    fed.receive(samples(count, first=first), 10 * SECOND)
     return first + count
 
 
@@ -81,7 +81,9 @@ def test_of_files_on_both_sides_of_a_jump_the_oldest_by_the_confirmed_time_goes_
     assert min(-number for number in numbers) > 3
 
 
-def test_ages_go_on_after_a_restart_in_the_same_boot_and_stand_still_while_the_machine_is_off(tmp_path: Path) -> None:
+def test_ages_continue_after_a_restart_in_the_same_boot_and_stand_still_while_the_machine_is_off(
+    tmp_path: Path,
+) -> None:
     clock = Confirmed(1000, "first")
     ages = Ages(tmp_path / ".ages", clock.read)
     assert ages.update([("a", 7)]) == {"a": 0}
@@ -130,7 +132,7 @@ def test_no_age_is_more_than_the_time_in_which_the_machine_ran(
         assert 0 <= ages.now_ns() - ages.update([("a", 1)])["a"] <= ran_ns
 
 
-def test_the_clock_since_the_machine_s_start_has_a_name_and_goes_on() -> None:
+def test_the_clock_since_the_machine_s_start_has_a_name_and_advances() -> None:
     first, second = read_boot_clock(), read_boot_clock()
     assert first.boot == second.boot
     assert first.since_ns <= second.since_ns

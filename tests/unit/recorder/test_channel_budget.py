@@ -32,10 +32,10 @@ def sample(plant: str, sequence: int = 0) -> Encoded:
     return encode(Publication(f"reactor/{plant}/sample/T", messages.Sample(sequence=sequence, quality=GOOD)))
 
 
-def hear(fed: Fed, received: Iterable[Encoded], apart_ns: int = 0) -> None:
+def receive(fed: Fed, received: Iterable[Encoded], apart_ns: int = 0) -> None:
     for message in received:
         fed.pass_time(apart_ns)
-        fed.told += fed.node.on_message(message._replace(received_ns=fed.now_ns), fed.now_ns)
+        fed.published += fed.node.on_message(message._replace(received_ns=fed.now_ns), fed.now_ns)
 
 
 def recorded_keys(folder: Path) -> set[str]:
@@ -45,8 +45,8 @@ def recorded_keys(folder: Path) -> set[str]:
 @pytest.mark.parametrize("kind", STRAYS)
 def test_10_000_stray_keys_take_no_room_from_messages_of_the_product(tmp_path: Path, kind: str) -> None:
     fed = recorder(tmp_path, START, most_keys=200, black_box_min=0.0)
-    hear(fed, map(STRAYS[kind], range(10_000)))
-    hear(fed, (sample(f"p{number}") for number in range(100)))
+    receive(fed, map(STRAYS[kind], range(10_000)))
+    receive(fed, (sample(f"p{number}") for number in range(100)))
     (raised,) = fed.alarms()
     assert (raised.alarm, raised.event) == (KEYS_ALARM, "raised")
     assert "for more keys of other programs" in raised.text
@@ -57,13 +57,13 @@ def test_10_000_stray_keys_take_no_room_from_messages_of_the_product(tmp_path: P
     assert fed.last_health().refused_by_reason["too many keys"] == 10_000 - MAX_OTHER_CHANNELS
 
 
-def test_messages_of_the_product_beyond_the_room_raise_the_alarm_and_those_that_have_room_go_on(tmp_path: Path) -> None:
+def test_messages_of_the_product_beyond_the_budget_raise_the_alarm_and_those_within_it_continue(tmp_path: Path) -> None:
     fed = recorder(tmp_path, START, most_keys=100, black_box_min=0.0)
     for second in range(100):
-        hear(fed, (sample(f"p{number}", second) for number in range(105)))
+        receive(fed, (sample(f"p{number}", second) for number in range(105)))
         fed.pass_time(SECOND)
     (raised,) = fed.alarms()
-    hear(fed, [encode(Publication(f"reactor/cstr/alarm/{KEYS_ALARM}", raised))])
+    receive(fed, [encode(Publication(f"reactor/cstr/alarm/{KEYS_ALARM}", raised))])
     assert "for more keys of this software" in raised.text
     assert "'reactor/p100/sample/T'" in raised.text
     fed.stop()
@@ -75,16 +75,16 @@ def test_messages_of_the_product_beyond_the_room_raise_the_alarm_and_those_that_
     assert fed.last_health().refused_by_reason["too many keys"] == 5 * 100
 
 
-def test_keys_that_fell_silent_give_their_room_to_others_in_the_next_file(tmp_path: Path) -> None:
+def test_silent_keys_give_their_budget_to_others_in_the_next_file(tmp_path: Path) -> None:
     """Forged messages of the product on 100 keys are forgotten; the keys of a sound plant have room again."""
     fed = recorder(tmp_path, START, most_keys=100, black_box_min=0.0)
-    hear(fed, (sample(f"forged{number}") for number in range(150)))
+    receive(fed, (sample(f"forged{number}") for number in range(150)))
     for second in range(100):
-        hear(fed, [sample("cstr", second)])
+        receive(fed, [sample("cstr", second)])
         fed.pass_time(SECOND)
     fed.pass_time(SECOND)
     assert [item.event for item in fed.alarms()] == ["raised"]
-    hear(fed, (sample("cstr", second) for second in range(100, 200)), SECOND)
+    receive(fed, (sample("cstr", second) for second in range(100, 200)), SECOND)
     assert [item.event for item in fed.alarms()] == ["raised", "cleared"]
     fed.stop()
     first, second_file = recordings_in(tmp_path)

@@ -38,7 +38,7 @@ def test_the_defaults_record_everything() -> None:
         ({"period": 1}, "unknown key 'period'"),
     ],
 )
-def test_a_setting_that_makes_no_sense_is_told_in_one_line(values: dict[str, object], said: str) -> None:
+def test_an_impossible_setting_is_reported_in_one_line(values: dict[str, object], said: str) -> None:
     with pytest.raises(InputError, match=said):
         section(RecorderConfig, "recorder", {"recorder": values}, {})
 

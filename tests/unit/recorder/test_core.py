@@ -1,4 +1,4 @@
-"""What the recorder makes of messages."""
+"""Messages as the recorder stores them."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Encoded, Publication, encode, encode_message, encoding_of
 from recorder import RecordedMessage
-from recorder.core import Recorder
+from recorder.core import Recorder, fingerprint
 
 KEY = "reactor/cstr/sample/T"
 GOOD = messages.QUALITY_GOOD
@@ -75,13 +75,26 @@ def test_the_counts_of_keys_that_are_followed_no_longer_stay(monkeypatch: pytest
     assert (report.lost, report.duplicated) == (10, 10)
 
 
-def test_health_tells_what_was_lost_by_key() -> None:
+def test_health_reports_losses_by_key() -> None:
     recorder = Recorder("cstr", 0)
     for key, sequences in (("reactor/cstr/sample/T", (0, 1, 5)), ("reactor/cstr/sample/C", (0, 1, 1, 3, 2))):
         for sequence in sequences:
             recorder.on_message(encoded(messages.Sample(sequence=sequence, time_ns=sequence, quality=GOOD), key), 0)
     report = health(recorder)
     assert (report.lost, report.duplicated, report.out_of_order, report.received) == (3, 1, 1, 8)
+
+
+def test_samples_of_an_earlier_file_are_not_lost_and_their_lag_is_reported() -> None:
+    """The recorder before had a gap of two; the history of this one holds them, and what was recorded before it."""
+    history = [
+        encoded(messages.Sample(sequence=number, time_ns=number, quality=GOOD), received_ns=1) for number in range(7)
+    ]
+    recorded = {fingerprint(item.key, item.payload) for number, item in enumerate(history) if number not in (2, 3, 6)}
+    recorder = Recorder("cstr", 0, recorded, fingerprints_until_ns=10_000_000)
+    received = [recorder.on_message(item, 5_000_001) for item in history]
+    assert [item.sequence for item in received if item is not None] == [2, 3, 6]
+    report = health(recorder)
+    assert (report.lost, report.out_of_order, report.received, report.lag_ms) == (0, 0, 7, 5.0)
 
 
 def test_absurd_sequence_numbers_do_not_break_the_report() -> None:

@@ -45,7 +45,7 @@ def test_a_cut_by_receipt_holds_what_was_received_then(tmp_path: Path) -> None:
     assert kept == ENTRIES[250:450]
 
 
-def test_a_cut_by_sample_time_holds_what_speaks_of_it_and_what_was_received_meanwhile(tmp_path: Path) -> None:
+def test_a_cut_by_sample_time_holds_the_messages_about_it_and_those_received_meanwhile(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES)
     out = tmp_path / "cut.mcap"
     cut([source], out, sample_window([source], at(10.0), at(20.0)), {})
@@ -62,7 +62,7 @@ def test_a_cut_by_sample_time_holds_what_speaks_of_it_and_what_was_received_mean
     assert reports
 
 
-def test_a_cut_says_first_how_things_stood(tmp_path: Path) -> None:
+def test_a_cut_starts_with_the_latched_messages(tmp_path: Path) -> None:
     """The fault sets in at 20 min and the alarm comes at 22: both stand when the cut begins."""
     source = recorded(tmp_path / "run.mcap", ENTRIES)
     out = tmp_path / "cut.mcap"
@@ -112,7 +112,7 @@ def test_no_source_is_written_over(tmp_path: Path) -> None:
         cut([source], source, receipt_window(0, 2**63), {})
 
 
-def test_a_damaged_source_is_told_and_nothing_is_written(tmp_path: Path) -> None:
+def test_a_damaged_source_is_reported_and_nothing_is_written(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES)
     content = source.read_bytes()
     place = content.index(b"\x28\xb5\x2f\xfd", len(content) // 2)

@@ -261,7 +261,7 @@ def test_a_diagnosis_becomes_a_tab_on_the_time_of_the_run(run: RunColumns, tmp_p
 
 
 @pytest.mark.parametrize(("content", "told"), [(None, "there is no such file"), (b"no dashboard", "is no dashboard")])
-def test_what_is_no_drawing_of_a_diagnosis_is_told(
+def test_a_file_that_is_no_drawing_of_a_diagnosis_is_reported(
     content: bytes | None, told: str, run: RunColumns, tmp_path: Path
 ) -> None:
     if content is not None:

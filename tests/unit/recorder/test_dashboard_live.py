@@ -1,4 +1,4 @@
-"""The live dashboard: what a viewer is sent of a run that goes on. The stream goes into a file instead of a viewer."""
+"""The live dashboard: the stream that a viewer receives of an ongoing run, written into a file."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Pictures of dashboards. They need Rerun's viewer and a graphics driver; without these the tests skip and say so."""
+"""Pictures of dashboards. They need Rerun's viewer and a graphics driver; without these the tests are skipped."""
 
 import io
 import subprocess
@@ -123,7 +123,7 @@ def test_only_coloured_pixels_count() -> None:
     assert count_coloured(buffer.getvalue()) == 30
 
 
-def test_what_cannot_be_drawn_is_told_in_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_drawn_is_reported_in_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no such file"):
         render_tabs(tmp_path / "none.rrd", tmp_path / "tabs")
     (tmp_path / "run.rrd").write_bytes(b"")

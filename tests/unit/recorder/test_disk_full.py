@@ -1,4 +1,4 @@
-"""A disk that is full stops the recording, with an alarm, and not the recorder; with room again it goes on."""
+"""A full disk stops the recording, with an alarm, and not the recorder; with space again it resumes."""
 
 import errno
 import os
@@ -52,7 +52,7 @@ def recorded(folder: Path) -> list[int]:
 def test_what_is_counted_as_not_recorded_is_missing_wherever_the_disk_is_full(tmp_path: Path, room: int) -> None:
     disk = Disk(room)
     fed = recorder(tmp_path / "run.mcap", START, disk.open, health_period_s=60.0, resume_mb=0.0)
-    fed.hear(samples(1000), SECOND // 100)
+    fed.receive(samples(1000), SECOND // 100)
     disk.room = 10**9
     fed.pass_time(3 * SECOND)
     fed.stop()
@@ -60,13 +60,13 @@ def test_what_is_counted_as_not_recorded_is_missing_wherever_the_disk_is_full(tm
 
 
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EIO])
-def test_recording_stops_with_an_alarm_keeps_what_is_there_and_goes_on_when_there_is_room(
+def test_recording_stops_with_an_alarm_keeps_what_is_there_and_resumes_when_there_is_room(
     tmp_path: Path, error: int
 ) -> None:
     disk = Disk(20_000)
     disk.error = error
     fed = recorder(tmp_path / "run.mcap", START, disk.open, health_period_s=60.0, resume_mb=0.0)
-    fed.hear(samples(1000), SECOND // 100)
+    fed.receive(samples(1000), SECOND // 100)
     (raised,) = fed.alarms()
     assert (raised.alarm, raised.event, raised.priority) == (DISK_ALARM, "raised", messages.PRIORITY_CRITICAL)
     assert os.strerror(error) in raised.text
@@ -75,7 +75,7 @@ def test_recording_stops_with_an_alarm_keeps_what_is_there_and_goes_on_when_ther
     fed.pass_time(3 * SECOND)
     assert [item.event for item in fed.alarms()] == ["raised", "cleared"]
     assert fed.alarms()[-1].state == messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED  # nobody has said that he saw it
-    fed.hear(samples(1000, first=1000), SECOND // 100)
+    fed.receive(samples(1000, first=1000), SECOND // 100)
     fed.stop()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run-2.mcap", "run.mcap"]
     kept = recorded(tmp_path)
@@ -89,11 +89,11 @@ def test_recording_stops_with_an_alarm_keeps_what_is_there_and_goes_on_when_ther
     assert health.received == 2000
 
 
-def test_while_the_disk_stays_full_it_is_said_once_and_each_report_counts_on(tmp_path: Path) -> None:
+def test_while_the_disk_stays_full_it_is_reported_once_and_each_report_counts_on(tmp_path: Path) -> None:
     disk = Disk(20_000)
     fed = recorder(tmp_path / "run.mcap", START, disk.open, health_period_s=1.0, resume_mb=0.0)
-    fed.hear(samples(1500), SECOND // 100)
-    reports = [item.message for item in fed.told if isinstance(item.message, messages.Health)]
+    fed.receive(samples(1500), SECOND // 100)
+    reports = [item.message for item in fed.published if isinstance(item.message, messages.Health)]
     counts = [report.refused_by_reason["disk"] for report in reports if report.phase == "not recording"]
     assert len(counts) > 5
     assert counts == sorted(set(counts))
@@ -105,7 +105,7 @@ def test_while_the_disk_stays_full_it_is_said_once_and_each_report_counts_on(tmp
 def test_without_the_room_that_was_asked_for_it_does_not_try(tmp_path: Path) -> None:
     disk = Disk(12_000)
     fed = recorder(tmp_path / "run.mcap", START, disk.open, resume_mb=1e12)
-    fed.hear(samples(500), SECOND // 100)
+    fed.receive(samples(500), SECOND // 100)
     disk.room = 10**9
     fed.pass_time(60 * SECOND)
     assert [item.event for item in fed.alarms()] == ["raised"]
@@ -116,12 +116,12 @@ def test_a_disk_that_is_full_when_a_file_is_completed_loses_nothing_that_was_flu
     """The index of the finished file finds no room; the file is recovered when there is some."""
     disk = Disk(10**9)
     fed = recorder(tmp_path / "run.mcap", START, disk.open, rotate_min=0.5, resume_mb=0.0)
-    fed.hear([*samples(10), alarm("ewma/T"), *samples(2900, 10)], SECOND // 100)
+    fed.receive([*samples(10), alarm("ewma/T"), *samples(2900, 10)], SECOND // 100)
     fed.pass_time(SECOND)
     disk.room = 100
-    fed.hear(samples(100, first=2910), SECOND // 10)
+    fed.receive(samples(100, first=2910), SECOND // 10)
     disk.room = 10**9
-    fed.hear(samples(100, first=3010), SECOND // 10)
+    fed.receive(samples(100, first=3010), SECOND // 10)
     fed.stop()
     first, second = recordings_in(tmp_path)
     assert not list(tmp_path.glob("*.part"))

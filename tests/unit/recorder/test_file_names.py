@@ -1,4 +1,4 @@
-"""What recordings are called."""
+"""Names of recordings."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -51,5 +51,5 @@ def test_a_folder_whose_name_ends_like_a_recording_is_a_folder() -> None:
         ("r.n.mcap", "run.mcap", False),
     ],
 )
-def test_no_file_of_anybody_else_is_taken_for_its_own(out: str, name: str, own: bool) -> None:
+def test_no_foreign_file_is_taken_for_its_own(out: str, name: str, own: bool) -> None:
     assert FileNames.of(Path(out), "cstr", is_folder=False).owns(name) is own

@@ -41,7 +41,7 @@ def samples(count: int, first: int = 0) -> Iterator[Publication]:
 
 def test_files_follow_each_other_by_age_and_hold_everything_between_them(tmp_path: Path) -> None:
     fed = recorder(tmp_path / "run.mcap", START, rotate_min=1.0, black_box_min=0.0)
-    fed.hear(golden.publications(), MINUTE // 700)
+    fed.receive(golden.publications(), MINUTE // 700)
     fed.stop()
     files = sorted(tmp_path.iterdir(), key=lambda path: (len(path.name), path.name))
     assert [path.name for path in files] == ["run.mcap", "run-2.mcap", "run-3.mcap"]
@@ -54,7 +54,7 @@ def test_files_follow_each_other_by_age_and_hold_everything_between_them(tmp_pat
 
 def test_files_follow_each_other_by_size(tmp_path: Path) -> None:
     fed = recorder(tmp_path, START, rotate_mb=0.08, black_box_min=0.0)
-    fed.hear(golden.publications(), SECOND // 10)
+    fed.receive(golden.publications(), SECOND // 10)
     fed.stop()
     sizes = [path.stat().st_size for path in recordings_in(tmp_path)]
     assert len(sizes) > 2
@@ -62,12 +62,12 @@ def test_files_follow_each_other_by_size(tmp_path: Path) -> None:
     assert [entry[:3] for entry in of_others(tmp_path)] == [message[:3] for message in ALL]
 
 
-def test_every_file_says_first_how_things_stand_and_a_folder_says_it_once(tmp_path: Path) -> None:
+def test_every_file_starts_with_the_latched_messages_and_a_folder_yields_them_once(tmp_path: Path) -> None:
     fed = recorder(tmp_path, START, rotate_min=1.0)
     model = messages.ModelSnapshot(time_ns=5, structure="arx", rows=7, reference=True)
     stands = [Publication(keys.key("cstr", keys.MODEL, "T"), model), alarm("ewma/T")]
-    fed.hear([*samples(1), *stands], SECOND)
-    fed.hear(samples(200, first=1), SECOND)
+    fed.receive([*samples(1), *stands], SECOND)
+    fed.receive(samples(200, first=1), SECOND)
     fed.stop()
     files = recordings_in(tmp_path)
     assert len(files) == 4
@@ -80,9 +80,9 @@ def test_every_file_says_first_how_things_stand_and_a_folder_says_it_once(tmp_pa
     assert sum("/alarm/" in entry.key for entry in read_messages(tmp_path)) == 1
 
 
-def test_every_file_opens_by_itself_and_says_where_it_comes_from(tmp_path: Path) -> None:
+def test_every_file_opens_by_itself_and_states_its_origin(tmp_path: Path) -> None:
     fed = recorder(tmp_path, START, rotate_min=1.0, about={"seed": "7"})
-    fed.hear(samples(100), SECOND)
+    fed.receive(samples(100), SECOND)
     fed.stop()
     first, second = recordings_in(tmp_path)
     for number, path in enumerate((first, second), start=1):
@@ -98,7 +98,7 @@ def test_a_folder_is_read_as_one_recording(tmp_path: Path) -> None:
     fed = recorder(tmp_path / "folder", START, rotate_min=0.5, black_box_min=0.0)
     one = recorder(tmp_path / "one.mcap", START, black_box_min=0.0)
     for each in (fed, one):
-        each.hear(golden.publications(), MINUTE // 500)
+        each.receive(golden.publications(), MINUTE // 500)
         each.stop()
     assert len(recordings_in(tmp_path / "folder")) > 2
     assert of_others(tmp_path / "folder") == of_others(tmp_path / "one.mcap")
@@ -112,7 +112,7 @@ def test_files_that_overlap_in_time_are_read_together_in_order_of_receipt(tmp_pa
     a, b = recorder(tmp_path / "a.mcap", START), recorder(tmp_path / "b.mcap", START, plant="other")
     for number in range(20):
         for fed in (a, b):
-            fed.hear(samples(1, number), SECOND)
+            fed.receive(samples(1, number), SECOND)
     a.stop()
     b.stop()
     times = [entry.log_time_ns for entry in of_others(tmp_path)]
@@ -120,7 +120,7 @@ def test_files_that_overlap_in_time_are_read_together_in_order_of_receipt(tmp_pa
     assert len(times) == 40
 
 
-def test_a_folder_without_recordings_is_told_as_such(tmp_path: Path) -> None:
+def test_a_folder_without_recordings_is_reported_as_such(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds no recording \(\.mcap\)"):
         read_messages(tmp_path)
 
@@ -128,7 +128,7 @@ def test_a_folder_without_recordings_is_told_as_such(tmp_path: Path) -> None:
 def test_the_oldest_are_deleted_and_never_the_one_being_written_nor_a_black_box(tmp_path: Path) -> None:
     fed = recorder(tmp_path / "run.mcap", START, rotate_min=1.0, keep_files=2.0, black_box_min=0.1)
     (tmp_path / "mine.mcap").write_bytes(b"of somebody else")
-    fed.hear([*samples(30), alarm("ewma/T"), *samples(400, first=30)], SECOND)
+    fed.receive([*samples(30), alarm("ewma/T"), *samples(400, first=30)], SECOND)
     fed.stop()
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == [".run.ages", "black-box", "mine.mcap", "run-7.mcap", "run-8.mcap"]
@@ -139,7 +139,7 @@ def test_the_oldest_are_deleted_and_never_the_one_being_written_nor_a_black_box(
 
 def test_a_black_box_holds_what_came_before_and_after_the_alarm_and_how_things_stood(tmp_path: Path) -> None:
     fed = recorder(tmp_path, START, rotate_min=1.0, black_box_min=0.5)
-    fed.hear([*samples(10), alarm("shewhart/C"), *samples(89, 10), alarm("ewma/T"), *samples(100, 99)], SECOND)
+    fed.receive([*samples(10), alarm("shewhart/C"), *samples(89, 10), alarm("ewma/T"), *samples(100, 99)], SECOND)
     fed.stop()
     first, second = sorted((tmp_path / "black-box").iterdir())
     assert first.name.endswith("Z-shewhart-C.mcap")
@@ -156,7 +156,7 @@ def test_a_black_box_holds_what_came_before_and_after_the_alarm_and_how_things_s
 
 def test_a_stretch_that_is_not_over_when_the_recorder_stops_is_kept_as_far_as_it_goes(tmp_path: Path) -> None:
     fed = recorder(tmp_path, START, black_box_min=5.0)
-    fed.hear([*samples(5), alarm("ewma/T"), *samples(3, 5)], SECOND)
+    fed.receive([*samples(5), alarm("ewma/T"), *samples(3, 5)], SECOND)
     fed.stop()
     (box,) = (tmp_path / "black-box").iterdir()
     assert len(of_others(box)) == 9
@@ -172,9 +172,9 @@ def test_all_of_a_stretch_is_in_the_file_when_it_is_copied(tmp_path: Path, monke
         "save_black_box",
         lambda _: there.append(sum("/sample/" in x.channel.key for x in Reader(part, tolerant=True))),
     )
-    fed.hear([alarm("ewma/T")], SECOND)
+    fed.receive([alarm("ewma/T")], SECOND)
     fed.pass_time(29 * SECOND)
-    fed.hear(samples(1), 9 * SECOND // 10)
+    fed.receive(samples(1), 9 * SECOND // 10)
     fed.pass_time(SECOND // 5)
     assert there == [1]
     fed.stop()
@@ -182,17 +182,17 @@ def test_all_of_a_stretch_is_in_the_file_when_it_is_copied(tmp_path: Path, monke
 
 def killed(folder: Path, count: int) -> Fed:
     fed = recorder(folder, START)
-    fed.hear(samples(count), SECOND // 10)
+    fed.receive(samples(count), SECOND // 10)
     fed.kill()
     return fed
 
 
 @pytest.mark.parametrize("name", ["run.mcap", "."])
-def test_the_next_start_recovers_what_a_kill_left_and_goes_on_in_a_new_file(tmp_path: Path, name: str) -> None:
+def test_the_next_start_recovers_what_a_kill_left_and_resumes_in_a_new_file(tmp_path: Path, name: str) -> None:
     killed(tmp_path / name, 100)
     (part,) = tmp_path.glob("*.part")
     fed = recorder(tmp_path / name, START + MINUTE)
-    fed.hear(samples(50, first=100), SECOND // 10)
+    fed.receive(samples(50, first=100), SECOND // 10)
     fed.stop()
     assert not list(tmp_path.glob("*.part"))
     first, _second = recordings_in(tmp_path)
@@ -243,7 +243,7 @@ def test_damaged_remains_count_and_are_deleted_in_their_turn_and_what_people_sav
         (tmp_path / name).write_bytes(b"of before")
         os.utime(tmp_path / name, ns=(1, 1))
     fed = recorder(tmp_path / "run.mcap", START, rotate_min=1.0, keep_files=3.0, black_box_min=0.0)
-    fed.hear(samples(130), SECOND)
+    fed.receive(samples(130), SECOND)
     fed.stop()
     names = {path.name for path in tmp_path.iterdir()}
     assert names - {".run.ages"} == {
@@ -255,14 +255,14 @@ def test_damaged_remains_count_and_are_deleted_in_their_turn_and_what_people_sav
     }
 
 
-def test_no_more_is_deleted_by_who_comes_to_it_when_the_last_file_is_whole(
+def test_background_tasks_that_run_after_the_stop_delete_no_more_than_the_limits_require(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As a machine does that is busy with other things."""
     late: list[Callable[[], None]] = []
     monkeypatch.setattr(BackgroundTasks, "submit", lambda _self, _name, task: late.append(task))
     fed = recorder(tmp_path / "run.mcap", START, rotate_min=1.0, keep_files=3.0, black_box_min=0.0)
-    fed.hear(samples(130), SECOND)
+    fed.receive(samples(130), SECOND)
     fed.stop()
     for task in late:
         task()
@@ -273,7 +273,7 @@ def test_no_more_is_deleted_by_who_comes_to_it_when_the_last_file_is_whole(
 def raising(folder: Path) -> Fed:
     """A recorder that has heard an alarm and is killed a while after it."""
     fed = recorder(folder, START, black_box_min=0.5)
-    fed.hear([*samples(100), alarm("ewma/T"), *samples(10, first=100)], SECOND)
+    fed.receive([*samples(100), alarm("ewma/T"), *samples(10, first=100)], SECOND)
     fed.pass_time(SECOND)  # the last of it is flushed
     fed.kill()
     return fed
@@ -291,10 +291,10 @@ def boxed(folder: Path) -> list[list[int]]:
     ]
 
 
-def test_a_stretch_under_way_when_the_recorder_is_killed_goes_on_with_the_next_start(tmp_path: Path) -> None:
+def test_a_segment_under_way_when_the_recorder_is_killed_resumes_with_the_next_start(tmp_path: Path) -> None:
     before = raising(tmp_path)
     fed = recorder(tmp_path, before.now_ns + SECOND, black_box_min=0.5)
-    fed.hear(samples(100, first=110), SECOND)
+    fed.receive(samples(100, first=110), SECOND)
     fed.stop()
     (kept,) = boxed(tmp_path)
     assert kept == list(range(70, 128))  # half a minute around the alarm, two seconds of which passed in between
@@ -306,7 +306,7 @@ def test_a_stretch_that_was_over_while_no_recorder_ran_is_kept_by_the_next_start
     assert boxed(tmp_path) == [list(range(70, 110))]
 
 
-def test_a_copy_of_a_stretch_that_a_kill_left_half_made_is_made_anew_and_no_stretch_twice(tmp_path: Path) -> None:
+def test_a_copy_of_a_segment_that_a_kill_left_half_made_is_made_again_and_no_segment_twice(tmp_path: Path) -> None:
     before = raising(tmp_path)
     (tmp_path / "black-box").mkdir()
     (tmp_path / "black-box" / f".{tmp_path.name}.tmp").touch()  # of somebody else
@@ -352,8 +352,8 @@ def test_a_file_that_another_recorder_writes_is_left_alone(tmp_path: Path) -> No
     fed.stop()
     beside = recorder(tmp_path, START)
     other = recorder(tmp_path, START)
-    beside.hear(samples(10), SECOND)
-    other.hear(samples(10), SECOND)
+    beside.receive(samples(10), SECOND)
+    other.receive(samples(10), SECOND)
     beside.stop()
     other.stop()
     assert len(list(tmp_path.glob("cstr-*.mcap"))) == 2

@@ -1,4 +1,4 @@
-"""A folder or file that is deleted under a recorder raises the alarm, and recording goes on in a new file."""
+"""A folder or file that is deleted under a recorder raises the alarm, and recording resumes in a new file."""
 
 import shutil
 from collections.abc import Callable
@@ -47,20 +47,20 @@ WAYS = (delete_file, put_another_file, delete_folder, delete_folders, rename_fol
 
 @pytest.mark.parametrize("out", ["", "run.mcap"])
 @pytest.mark.parametrize("delete", WAYS)
-def test_the_alarm_comes_at_the_next_flush_and_recording_goes_on_in_a_new_file(
+def test_the_alarm_is_raised_at_the_next_flush_and_recording_resumes_in_a_new_file(
     tmp_path: Path, delete: Callable[[Path], None], out: str
 ) -> None:
     folder = tmp_path / "plant" / "recordings"
     folder.mkdir(parents=True)
     fed = recorder(folder / out, START, black_box_min=0.1)
-    fed.hear([alarm("ewma/T"), *samples(100)], SECOND // 10)
+    fed.receive([alarm("ewma/T"), *samples(100)], SECOND // 10)
     delete(folder)
-    fed.hear(samples(10, first=100), SECOND // 10)
+    fed.receive(samples(10, first=100), SECOND // 10)
     (raised,) = fed.alarms()
     assert (raised.alarm, raised.event) == (DISK_ALARM, "raised")
     assert DELETED in raised.text
     assert fed.last_health().phase == "not recording"
-    fed.hear(samples(100, first=110), SECOND // 10)
+    fed.receive(samples(100, first=110), SECOND // 10)
     assert [item.event for item in fed.alarms()] == ["raised", "cleared"]
     assert fed.alarms()[-1].state == messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED
     fed.stop()
@@ -75,13 +75,13 @@ def test_a_folder_that_cannot_be_made_again_is_tried_until_it_can(tmp_path: Path
     folder = tmp_path / "plant" / "recordings"
     folder.mkdir(parents=True)
     fed = recorder(folder, START)
-    fed.hear(samples(10), SECOND)
+    fed.receive(samples(10), SECOND)
     delete_folder(folder.parent)
     folder.parent.write_bytes(b"a file where the folder was")
-    fed.hear(samples(30, first=10), SECOND)
+    fed.receive(samples(30, first=10), SECOND)
     assert [item.event for item in fed.alarms()] == ["raised"]
     folder.parent.unlink()
-    fed.hear(samples(10, first=40), SECOND)
+    fed.receive(samples(10, first=40), SECOND)
     assert [item.event for item in fed.alarms()] == ["raised", "cleared"]
     fed.stop()
     assert recorded(folder)[-1] == 49
@@ -91,8 +91,8 @@ def test_a_folder_that_is_deleted_when_a_file_is_due_to_end_costs_that_file_alon
     folder = tmp_path / "recordings"
     folder.mkdir()
     fed = recorder(folder, START, rotate_min=1.0, black_box_min=0.0)
-    fed.hear(samples(59), SECOND)
+    fed.receive(samples(59), SECOND)
     shutil.rmtree(folder)
-    fed.hear(samples(60, first=59), SECOND)
+    fed.receive(samples(60, first=59), SECOND)
     fed.stop()
     assert recorded(folder)[-1] == 118

@@ -66,10 +66,10 @@ def test_a_recording_of_another_program_is_described_and_what_it_lacks_is_named(
         assert part in text
 
 
-def test_a_folder_with_only_a_live_file_is_read_and_said_to_be_live(tmp_path: Path) -> None:
+def test_a_folder_with_only_a_live_file_is_read_and_reported_as_live(tmp_path: Path) -> None:
     record = simulate_record(PlantConfig(seed=1), 100)
     fed = recorder(tmp_path, START_NS)
-    fed.hear(samples_of(record, "cstr", START_NS), 2 * SECOND)
+    fed.receive(samples_of(record, "cstr", START_NS), 2 * SECOND)
     fed.pass_time(MINUTE)
     (part,) = tmp_path.glob(f"*{PART}")
     assert not list(tmp_path.glob("*.mcap"))

@@ -87,7 +87,7 @@ def test_a_recovery_keeps_them(tmp_path: Path, cut_off: int) -> None:
     assert ("recovered" in metadata) == bool(cut_off)
 
 
-def test_a_damaged_attachment_is_said_and_left_out(tmp_path: Path) -> None:
+def test_a_damaged_attachment_is_reported_and_left_out(tmp_path: Path) -> None:
     source = foreign(tmp_path / "a.mcap")
     content = bytearray(source.read_bytes())
     content[content.index(PICTURE) + 50_000] ^= 1

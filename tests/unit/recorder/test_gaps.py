@@ -1,4 +1,4 @@
-"""What was lost on the way is in the file, in what is made of the file, and in what the recorder says of itself."""
+"""Lost messages are listed in the file, in what is derived from it, and in the recorder's health."""
 
 from pathlib import Path
 
@@ -30,13 +30,13 @@ def sample(number: int) -> Publication:
 def fed(tmp_path: Path) -> Fed:
     """A recorder to which three alarms did not come, between two samples."""
     fed = recorder(tmp_path / "run.mcap", 10 * SECOND, black_box_min=0.0)
-    fed.hear([sample(0)], SECOND)
+    fed.receive([sample(0)], SECOND)
     assert fed.node.on_gap(ALARMS, 20 * SECOND) == []
-    fed.hear([sample(1)], SECOND)
+    fed.receive([sample(1)], SECOND)
     return fed
 
 
-def test_a_gap_says_all_that_is_known_of_it() -> None:
+def test_a_gap_states_all_that_is_known_of_it() -> None:
     assert parse_gap(Metadata(GAP, gap_metadata(ALARMS))) == ALARMS
     assert gap_metadata(ALARMS)["noticed"] == "1970-01-01T00:00:20.000+00:00"
     assert parse_gap(Metadata(GAP, {"stream": "x"})) is None
@@ -51,9 +51,9 @@ def test_it_is_in_the_file_and_counted_as_lost(fed: Fed, tmp_path: Path) -> None
 
 def test_samples_that_are_lost_are_counted_once_by_their_own_numbers(tmp_path: Path) -> None:
     fed = recorder(tmp_path / "run.mcap", 10 * SECOND, black_box_min=0.0)
-    fed.hear([sample(0)], SECOND)
+    fed.receive([sample(0)], SECOND)
     fed.node.on_gap(Gap("reactor/cstr/sample", 1, 1, 4, 4, 20 * SECOND), 20 * SECOND)
-    fed.hear([sample(5)], SECOND)
+    fed.receive([sample(5)], SECOND)
     fed.stop()
     assert fed.last_health().lost == 4
 
@@ -72,7 +72,7 @@ def test_recovery_and_merging_keep_it_and_a_cut_keeps_those_of_its_time(fed: Fed
 
 def test_what_the_files_before_hold_is_not_written_again_once(tmp_path: Path) -> None:
     first = recorder(tmp_path, 10 * SECOND, black_box_min=0.0)
-    first.hear([sample(0), sample(1)], SECOND)
+    first.receive([sample(0), sample(1)], SECOND)
     first.stop()
     fingerprints = open_files(RecorderConfig(out=str(tmp_path))).fingerprints_since(0)
     assert len(fingerprints) == 3  # with its last report of health

@@ -1,4 +1,4 @@
-"""A recording in a program that is not ours: Rerun's own converter decodes our messages by the schemas in the file.
+"""A recording in another program: Rerun's own converter decodes the messages by the schemas in the file.
 
 What mcap-protobuf-support makes of them is in test_mcap_file.py.
 """

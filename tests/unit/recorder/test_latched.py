@@ -1,4 +1,4 @@
-"""How things stand when a file is begun."""
+"""Latched messages at the start of a file."""
 
 from google.protobuf.message import Message
 
@@ -14,7 +14,7 @@ def remembered(*told: tuple[str, Message], most: int = 100) -> LatchedMessages:
     return head
 
 
-def test_the_last_of_each_model_alarm_and_fault_is_said_again_and_nothing_else() -> None:
+def test_the_last_message_of_each_model_alarm_and_fault_is_repeated_and_nothing_else() -> None:
     head = remembered(
         ("model/T", messages.ModelSnapshot(reference=True, rows=1)),
         ("model/T", messages.ModelSnapshot(reference=False, rows=2)),

@@ -110,7 +110,7 @@ def test_a_live_recording_is_read_and_diagnosed_with_no_option(tmp_path: Path) -
     assert set(case.record.columns) == {"Q1", "Q2", "h1", "h2", "h3"}
 
 
-def test_without_equations_a_recording_is_not_diagnosed_and_the_line_says_the_cure(tmp_path: Path) -> None:
+def test_without_equations_a_recording_is_not_diagnosed_and_the_line_states_the_cure(tmp_path: Path) -> None:
     path, bare = tmp_path / "bare.mcap", tmp_path / "bare.toml"
     signals = RIG[RIG.index("[[signals]]") :]
     bare.write_text(f'name = "rig"\n{signals}', encoding="utf-8")

@@ -86,13 +86,15 @@ def test_a_chunk_of_zeros_names_its_place_and_keeps_what_came_before(tmp_path: P
         (b"PK\x03\x04", f"expected an MCAP recording, got another kind of file; {TABLE_CURE}"),
     ],
 )
-def test_what_is_no_recording_is_told_as_such_and_offers_no_rescue(tmp_path: Path, content: bytes, said: str) -> None:
+def test_a_file_that_is_no_recording_is_reported_as_such_and_offers_no_rescue(
+    tmp_path: Path, content: bytes, said: str
+) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(content)
     assert read(path) == f"{path}: {said}"
 
 
-def test_every_way_of_reading_says_the_same_and_says_it_at_the_call(tmp_path: Path, whole: bytes) -> None:
+def test_every_way_of_reading_reports_the_same_error_at_the_call(tmp_path: Path, whole: bytes) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(whole[:-1])
     for reading in (read_messages, read_record, read_metadata, plants_in):

@@ -68,7 +68,7 @@ def test_other_software_reads_the_same_values_by_the_schemas_in_the_file(tmp_pat
         assert str(decoded) == str(ours)
 
 
-def test_bytes_of_strangers_are_kept_with_the_encoding_they_claimed_and_no_schema(tmp_path: Path) -> None:
+def test_foreign_bytes_are_kept_with_their_stated_encoding_and_no_schema(tmp_path: Path) -> None:
     strange = [
         RecordedMessage("reactor/cstr/sample/T", b"{}", "application/json", 1, 1),
         RecordedMessage("reactor/cstr/sample/T", b"\xff\xff", encoding_of(messages.Sample), 2, 2),
@@ -88,7 +88,7 @@ def test_bytes_of_strangers_are_kept_with_the_encoding_they_claimed_and_no_schem
     assert decodable == [True, False, False]
 
 
-def test_metadata_tells_the_version_and_what_was_given(tmp_path: Path) -> None:
+def test_metadata_holds_the_version_and_the_given_entries(tmp_path: Path) -> None:
     assert read_metadata(recorded(tmp_path / "run.mcap", [])) == {**build_metadata(), "seed": "3"}
 
 
@@ -189,7 +189,7 @@ def test_what_was_flushed_is_on_its_way_to_the_disk(tmp_path: Path) -> None:
     assert sizes[0] < sizes[1] == sizes[2]
 
 
-def test_a_disk_that_takes_no_more_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_in_one_line(tmp_path: Path) -> None:
     """A limit on the size of files stands for the full disk: the system refuses the write in the same way."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     writer = RecordingWriter(tmp_path / "run.mcap", {})

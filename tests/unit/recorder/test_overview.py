@@ -1,4 +1,4 @@
-"""What is told of a recording."""
+"""The overview of a recording."""
 
 from collections import Counter
 from pathlib import Path
@@ -61,13 +61,13 @@ def test_what_came_late_is_not_missing() -> None:
     assert (seen.lost, seen.out_of_order) == (5, 2)
 
 
-def test_what_is_said_again_is_not_counted_but_tells_of_an_alarm_that_stands() -> None:
+def test_repeated_messages_are_not_counted_but_show_an_active_alarm() -> None:
     seen = overview([alarm(10, "raised", 10, latched=True), *sampled(0, 1), alarm(30, "cleared", 10, 30)])
     assert seen.messages == 3
     assert [(item.raised_ns, item.cleared_ns) for item in seen.alarms] == [(10, 30)]
 
 
-def test_alarms_are_told_with_their_ends() -> None:
+def test_alarms_are_listed_with_their_ends() -> None:
     seen = overview(
         [
             alarm(10, "raised", 10),

@@ -1,4 +1,4 @@
-"""What every panel has to keep, and what each of them shows of the golden run. The phase plane has its own file."""
+"""Rules of every panel, and the content of each for the golden run. The phase plane has its own file."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -186,7 +186,7 @@ def test_a_statistic_that_goes_through_the_roof_leaves_the_limits_visible(run: R
     assert max(series.value.max() for series in plot.series if series.name == "statistic") == 1e6, "nothing is cut off"
 
 
-def test_the_log_tells_alarms_and_faults_in_order(run: RunColumns) -> None:
+def test_the_log_lists_alarms_and_faults_in_order(run: RunColumns) -> None:
     assert [(event.kind, event.text) for event in log_of(run).events] == [
         ("fault", "20.0 min  injected: coolant_flow:step:-0.05@20min"),
         ("raised", "22.0 min  shewhart/T: T is lower than the model expects"),
@@ -205,7 +205,7 @@ def changed_alarm(before: messages.Alarm, **values: Any) -> messages.Alarm:
     return messages.Alarm(**{**{name: getattr(before, name) for name in names}, **values})
 
 
-def test_the_log_tells_the_suspects_of_one_look_once(run: RunColumns) -> None:
+def test_the_log_lists_the_suspects_of_one_look_once(run: RunColumns) -> None:
     suspect = messages.Suspect(cause="coolant_flow", probability=0.9, profile="step", size=-0.05, unit="1")
     suspect.onset_ns = run.span_ns[0] + 20 * 60_000_000_000
     raised = changed_alarm(run.alarms[0], event="raised")
@@ -254,7 +254,7 @@ def test_the_life_of_an_alarm_is_a_line_that_begins_with_the_run(run: RunColumns
     assert line.time_ns == tuple(golden.time_ns(round(at / golden.STEP_MIN)) for at in minutes)
 
 
-def test_what_is_known_of_an_alarm_from_before_is_not_said_again(run: RunColumns) -> None:
+def test_a_known_alarm_from_before_is_not_logged_again(run: RunColumns) -> None:
     earlier = replace(run.context, first_ns=run.span_ns[0], alarm_states={"shewhart/T": messages.ALARM_STATE_NORMAL})
     again = replace(run, alarms=(changed_alarm(run.alarms[0], event="raised"),), context=earlier)
     (lanes,) = of_kind(status.draw_alarms(again), StateLines)

@@ -1,4 +1,4 @@
-"""What is synced is on the disk: the system is asked for it, after all bytes were handed to it."""
+"""Synced bytes are on the disk: fsync is called after all bytes were handed over."""
 
 import os
 from collections.abc import Callable

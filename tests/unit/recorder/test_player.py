@@ -121,7 +121,7 @@ def test_a_record_becomes_the_samples_of_a_plant() -> None:
     ]
 
 
-def test_a_row_in_which_nothing_was_measured_says_so() -> None:
+def test_a_row_in_which_nothing_was_measured_has_bad_quality() -> None:
     record = Record(np.array([0.1]), {"qc": np.array([np.nan]), "T": np.array([np.nan])}, "x")
     ((key, body),) = samples_of(record, "p")
     assert key == "reactor/p/sample/qc"
@@ -139,7 +139,7 @@ def test_a_stretch_is_played_with_both_its_ends_at_the_times_of_its_samples() ->
     assert played(player, 100 * SECOND) == [(100, 10), (101, 11), (104, 14), (105, 15)]
 
 
-def test_a_loop_begins_anew_one_row_after_the_last_and_keeps_the_times_of_the_samples() -> None:
+def test_a_loop_restarts_one_row_after_the_last_and_keeps_the_times_of_the_samples() -> None:
     player, now, out = Player(at(0, 0, 2, 4), 2.0, loop=True), 0, list[tuple[float, float]]()
     while len(out) < 9:
         now = max(now, player.next_tick_ns())
@@ -165,7 +165,7 @@ def test_a_pause_holds_the_plants_time_and_the_rest_of_a_row_is_waited_for_after
     assert ticked(player, 1006) == [10]
 
 
-def test_a_step_is_a_row_and_the_play_goes_on_from_it() -> None:
+def test_a_step_is_a_row_and_the_play_resumes_from_it() -> None:
     player = Player(at(0, 0, 10, 10, 20, 30), 1.0)
     player.pause(0)
     assert [stepped(player, 1), stepped(player, 2, rows=2)] == [[0, 0], [10, 10, 20]]
@@ -209,7 +209,7 @@ def test_a_rate_that_is_not_positive_and_a_step_while_playing_are_refused_and_ch
     assert played(player) == [(0, 0), (1, 1)]
 
 
-def test_it_listens_to_nothing_and_has_no_last_words() -> None:
+def test_it_subscribes_to_nothing_and_publishes_nothing_at_the_end() -> None:
     player = Player(at(1), 1.0)
     assert player.on_message(Encoded("reactor/x/command/y", b"", ""), 0) == []
     assert player.on_stop(0) == []

@@ -1,4 +1,4 @@
-"""What is saved of a damaged recording: all before the damage, all after it, and never a wrong message."""
+"""Recovery of a damaged recording: all before the damage, all after it, and never a wrong message."""
 
 import io
 import struct
@@ -132,13 +132,13 @@ def test_without_its_index_nothing_is_missing(tmp_path: Path, whole: bytes) -> N
     assert saved.messages == len(ENTRIES)
 
 
-def test_what_was_saved_is_told_by_topic_and_time(tmp_path: Path, whole: bytes) -> None:
+def test_saved_messages_are_reported_by_topic_and_time(tmp_path: Path, whole: bytes) -> None:
     _, saved = recovered(tmp_path, whole[: chunks(whole)[2][0]])
     assert saved.topics == Counter(entry.key for entry in ENTRIES[: 2 * CHUNK])
     assert (saved.first_ns, saved.last_ns) == (ENTRIES[0].log_time_ns, ENTRIES[2 * CHUNK - 1].log_time_ns)
 
 
-def test_a_recovered_file_says_where_it_came_from_and_what_is_missing(tmp_path: Path, whole: bytes) -> None:
+def test_a_recovered_file_states_its_origin_and_what_is_missing(tmp_path: Path, whole: bytes) -> None:
     recovered(tmp_path, whole[:-1])
     metadata = read_metadata(tmp_path / "out.mcap")
     assert (metadata["plant"], metadata["seed"]) == ("cstr", "3")
@@ -171,7 +171,7 @@ def test_other_software_reads_what_was_recovered(tmp_path: Path, whole: bytes) -
         (b"\x89MCAP0\r\n" + bytes(1000), "holds no message that could be saved"),
     ],
 )
-def test_where_nothing_can_be_saved_one_line_says_so_and_nothing_is_written(
+def test_where_nothing_can_be_saved_one_line_reports_it_and_nothing_is_written(
     tmp_path: Path, content: bytes, said: str
 ) -> None:
     path = tmp_path / "run.mcap"

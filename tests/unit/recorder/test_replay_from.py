@@ -1,4 +1,4 @@
-"""A replay from a time on begins with the alarms that stand then, and says where it waits for long."""
+"""A replay from a given time starts with the active alarms, and reports a long wait."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -83,7 +83,7 @@ def test_standing_alarms_are_due_with_the_first_sample(rate: float) -> None:
         ([0, 1, 2, 3602], float("inf"), []),
     ],
 )
-def test_a_wait_of_more_than_a_minute_for_a_jump_of_the_clock_is_said(
+def test_a_wait_of_more_than_a_minute_for_a_jump_of_the_clock_is_reported(
     seconds: list[float], rate: float, waits: list[float]
 ) -> None:
     said = list[float]()

@@ -1,4 +1,4 @@
-"""Which recordings are deleted."""
+"""Retention: the recordings that are deleted."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""When a recording is flushed, synced and followed by a new file."""
+"""The times at which a recording is flushed, synced and followed by a new file."""
 
 from math import inf
 
@@ -47,7 +47,7 @@ def test_without_messages_nothing_is_due() -> None:
 
 
 @pytest.mark.parametrize(("fsync", "synced"), [("never", 0), ("chunk", 20), ("second", 10)])
-def test_the_policy_says_how_often_ten_seconds_are_synced(fsync: Fsync, synced: int) -> None:
+def test_the_policy_sets_how_often_ten_seconds_are_synced(fsync: Fsync, synced: int) -> None:
     """A message each tenth of a second, a flush each half, from START on."""
     decide, syncs = filing(fsync), 0
     for tenth in range(101):

@@ -142,7 +142,7 @@ def test_a_node_s_report_stands_at_the_newest_sample_of_its_receipt(run: RunColu
     assert [report.time_ns for report in run.health["monitor"]] == [golden.time_ns(row) for row in rows]
 
 
-def test_models_are_told_apart_by_what_they_are_for() -> None:
+def test_models_are_distinguished_by_their_purpose() -> None:
     parameter = messages.Parameter(name="a1", value=0.9, sd=0.1)
     published = [
         messages.ModelSnapshot(time_ns=at, parameters=[parameter], excitation=0.1 * at, reference=reference, held=held)

@@ -1,4 +1,4 @@
-"""Where a new run of a plant starts, as the numbers and times of its samples tell."""
+"""The start of a new run of a plant, by the sequence numbers and times of its samples."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -90,7 +90,7 @@ def test_a_signal_that_was_absent_where_the_clock_stepped_back_joins_the_run_of_
     assert splitter.update("T", 30, 20 * PERIOD) == 2
 
 
-def test_a_publisher_that_does_not_count_has_one_run_while_its_clock_goes_on() -> None:
+def test_a_publisher_without_sequence_numbers_has_one_run_while_its_clock_advances() -> None:
     splitter = RunSplitter()
     assert [splitter.update("T", 0, time_ns) for time_ns in (5, 6, 9, 3, 4)] == [1, 1, 1, 2, 2]
 
@@ -109,7 +109,7 @@ def test_continuous_times_increase_and_keep_the_spacing_of_rows(runs: list[Sessi
             assert after[1] - before[1] == after[2] - before[2]
 
 
-def test_what_is_said_of_the_run_before_stays_with_it() -> None:
+def test_messages_about_the_run_before_stay_with_it() -> None:
     clock = ContinuousTime()
     for number in range(10):
         clock.continuous_ns(T, Sample(sequence=number, time_ns=number * PERIOD))

@@ -1,4 +1,4 @@
-"""What sequence numbers say about what never came."""
+"""Losses counted by sequence numbers."""
 
 import pytest
 from hypothesis import given
@@ -33,7 +33,7 @@ def test_counts(sequences: list[int], lost: int, duplicated: int, out_of_order: 
     assert counted(sequences) == (lost, duplicated, out_of_order)
 
 
-def test_a_publisher_that_is_started_anew_loses_only_what_its_new_run_skipped() -> None:
+def test_a_restarted_publisher_loses_only_what_its_new_run_skipped() -> None:
     check = SequenceCounter()
     for sequence, time_ns in ((0, 0), (1, 100), (2, 200), (0, 1000), (1, 1100), (4, 1400)):
         check.update(sequence, time_ns)

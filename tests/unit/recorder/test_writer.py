@@ -1,4 +1,4 @@
-"""A full disk at any byte: no message is lost that was said to be saved, none is there twice, and flushing resumes."""
+"""A full disk at any byte: no message reported as saved is lost, none is there twice, and flushing resumes."""
 
 import errno
 import os

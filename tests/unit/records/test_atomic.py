@@ -57,7 +57,7 @@ def test_an_exception_leaves_the_old_file_and_nothing_beside_it(
         ("x" * 300, "File name too long"),
     ],
 )
-def test_where_nothing_can_be_written_it_says_so_before_the_work(tmp_path: Path, name: str, said: str) -> None:
+def test_where_nothing_can_be_written_it_is_reported_before_the_work(tmp_path: Path, name: str, said: str) -> None:
     (tmp_path / "a_file").write_text("")
     (tmp_path / "a_folder").mkdir()
     with pytest.raises(InputError, match=said), atomic_write(tmp_path / name):

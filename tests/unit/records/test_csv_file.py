@@ -130,7 +130,7 @@ def test_a_signal_that_is_not_required_may_be_absent(tmp_path: Path) -> None:
         (b"\x89MCAP0\r\n" + bytes(100), "expected a CSV file, got an MCAP recording"),
     ],
 )
-def test_what_is_wrong_with_a_file_is_told_in_one_line(tmp_path: Path, text: str | bytes, said: str) -> None:
+def test_an_error_in_a_file_is_reported_in_one_line(tmp_path: Path, text: str | bytes, said: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(InputError) as error:
         read_csv(path)
@@ -139,7 +139,7 @@ def test_what_is_wrong_with_a_file_is_told_in_one_line(tmp_path: Path, text: str
     assert "\n" not in str(error.value)
 
 
-def test_a_file_that_cannot_be_opened_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_opened_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no such file"):
         read_csv(tmp_path / "none.csv")
     with pytest.raises(InputError, match="expected a CSV file, got a folder"):

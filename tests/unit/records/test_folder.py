@@ -1,4 +1,4 @@
-"""A folder is made with those above it, or it is told why it cannot be."""
+"""A folder is made with its parents, or the reason of the failure is reported."""
 
 from pathlib import Path
 

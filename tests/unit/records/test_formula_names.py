@@ -84,7 +84,7 @@ def test_a_name_with_control_characters_is_refused_by_a_workbook_in_one_line(tmp
     assert not (tmp_path / "record.xlsx").exists()
 
 
-def test_an_export_says_once_that_a_quote_was_written() -> None:
+def test_an_export_reports_once_that_a_quote_was_written() -> None:
     record = Record(np.arange(2.0), {"=a": np.zeros(2), "-b": np.zeros(2)}, "x")
     assert _report_text(Path("x.csv"), record).count("formula") == 1
     assert "formula" not in _report_text(Path("x.xlsx"), record)

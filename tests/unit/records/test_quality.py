@@ -135,7 +135,7 @@ def test_values_of_another_quality_than_good_are_excluded_from_their_column(
 
 @pytest.mark.parametrize("header", ["T_status", "T.Status", "T_flag", "T_q", "T_QC", "T.Valid"])
 @pytest.mark.parametrize("pair", [("Good", "Bad"), ("192", "24"), ("gut", "schlecht")])
-def test_a_state_that_says_good_is_a_quality(pair: tuple[str, str], header: str, tmp_path: Path) -> None:
+def test_a_state_named_good_is_a_quality(pair: tuple[str, str], header: str, tmp_path: Path) -> None:
     record = read_wide(tmp_path, f"T,qc,{header}", [cell(pair, row) for row in range(ROWS)])
     assert excluded(record, "T") == list(range(ROWS))[BAD]
     assert not excluded(record, "qc")
@@ -188,7 +188,7 @@ def test_codes_of_opc_ua_are_good_at_0(other: int, is_signed: bool, is_hexadecim
         ("Bad quality", ["1", "0"], [False, True]),
     ],
 )
-def test_a_header_says_what_codes_and_flags_mean(header: str, cells: list[str], good: list[bool]) -> None:
+def test_a_header_defines_codes_and_flags(header: str, cells: list[str], good: list[bool]) -> None:
     assert list(judge(cells, header, FileFormat()).values()) == good
 
 

@@ -323,7 +323,7 @@ def test_files_in_a_row_are_one_record(tmp_path: Path) -> None:
     assert turned.time_min[ROWS - 100] == -100.0
 
 
-def test_a_file_of_several_runs_goes_on_where_the_one_before_ended() -> None:
+def test_a_file_of_several_runs_continues_where_the_one_before_ended() -> None:
     def part(*times: float) -> Record:
         return Record(np.array(times), {"T": np.array(times)}, "part")
 

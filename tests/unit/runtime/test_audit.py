@@ -1,4 +1,4 @@
-"""What somebody told a node to do is on the bus, with who, and what came of it."""
+"""Commands are published for audit, with their author and result."""
 
 import threading
 
@@ -38,7 +38,7 @@ def asked(name: str, command: Message) -> Encoded:
         ("baseline", BaselineCommand(what="relearn", by="Anna", why="new pump")),
     ],
 )
-def test_every_command_that_changes_something_is_recorded_with_who_gave_it(name: str, command: Message) -> None:
+def test_every_command_that_changes_something_is_recorded_with_its_author(name: str, command: Message) -> None:
     found = audit(asked(name, command), CommandReply(accepted=True, text="done"), 7)
     assert found is not None
     assert found.key == f"reactor/cstr/audit/{name}"

@@ -25,7 +25,7 @@ from tests.memory_bus import Exchange, MemoryBus
         ("a.b/c", "aXb/c", False),
     ],
 )
-def test_key_expressions_match_as_zenoh_says(expression: str, key: str, expected: bool) -> None:
+def test_key_expressions_match_as_in_zenoh(expression: str, key: str, expected: bool) -> None:
     """https://zenoh.io/docs/manual/abstractions/#key-expression."""
     import zenoh
 
@@ -34,7 +34,7 @@ def test_key_expressions_match_as_zenoh_says(expression: str, key: str, expected
         assert zenoh.KeyExpr(expression).intersects(zenoh.KeyExpr(key)) is expected
 
 
-def test_what_one_publishes_the_others_hear() -> None:
+def test_the_others_receive_what_one_publishes() -> None:
     exchange, heard = Exchange(), list[Encoded]()
     listener, speaker = MemoryBus(exchange), MemoryBus(exchange)
     listener.subscribe("reactor/*/sample/**", heard.append)
@@ -47,7 +47,7 @@ def test_what_one_publishes_the_others_hear() -> None:
     assert heard == [message]
 
 
-def test_a_question_is_answered_by_who_listens_there() -> None:
+def test_a_query_is_answered_by_the_queryable_on_its_key() -> None:
     exchange = Exchange()
     server, client = MemoryBus(exchange), MemoryBus(exchange)
 
@@ -60,7 +60,7 @@ def test_a_question_is_answered_by_who_listens_there() -> None:
     assert client.query(Encoded("reactor/other/command/set_input", b"", ""), 1.0) == []
 
 
-def test_who_does_not_answer_within_the_time_is_not_waited_for_longer() -> None:
+def test_a_queryable_that_does_not_answer_within_the_time_is_not_waited_for_longer() -> None:
     exchange = Exchange()
     server, client = MemoryBus(exchange), MemoryBus(exchange)
     server.declare_queryable("a/*", lambda request: None)
@@ -69,7 +69,7 @@ def test_who_does_not_answer_within_the_time_is_not_waited_for_longer() -> None:
     assert CommandReply.FromString(answer.payload).text == "here"
 
 
-def test_a_token_is_seen_by_those_who_come_late_and_goes_with_its_bus() -> None:
+def test_a_late_subscriber_sees_a_token_and_the_token_ends_with_its_bus() -> None:
     exchange, seen = Exchange(), list[tuple[str, bool]]()
     node, watcher = MemoryBus(exchange), MemoryBus(exchange)
     node.declare_token("reactor/cstr/alive/monitor")
@@ -78,7 +78,7 @@ def test_a_token_is_seen_by_those_who_come_late_and_goes_with_its_bus() -> None:
     assert seen == [("reactor/cstr/alive/monitor", True), ("reactor/cstr/alive/monitor", False)]
 
 
-def test_who_leaves_the_answer_to_others_is_not_waited_for() -> None:
+def test_a_queryable_that_leaves_the_answer_to_others_is_not_waited_for() -> None:
     exchange = Exchange()
     server, client = MemoryBus(exchange), MemoryBus(exchange)
     server.declare_queryable("a/*", lambda request: request.decline())

@@ -9,7 +9,7 @@ from reactorwatch.runtime.bus_zenoh.messages import MAX_KEY, SEQUENCE_ATTACHMENT
 
 
 @pytest.mark.parametrize(("length", "is_numbered"), [(MAX_KEY, True), (MAX_KEY + 1, False), (60_000, False)])
-def test_a_key_too_long_for_any_of_ours_is_not_put_in_order(length: int, is_numbered: bool) -> None:
+def test_a_key_longer_than_any_of_the_contract_is_not_put_in_order(length: int, is_numbered: bool) -> None:
     """The names of streams are kept, so that a made-up key of 65,535 characters would take as many bytes."""
     sample = SimpleNamespace(
         key_expr="x" * length,

@@ -59,7 +59,7 @@ def test_a_certificate_does_not_outlive_its_authority(ca: Identity) -> None:
     assert issue(ca, "a.viewer", NOW, 1000.0).certificate.not_valid_after_utc == ca.certificate.not_valid_after_utc
 
 
-def test_who_only_calls_has_a_client_s_certificate_by_its_name(ca: Identity) -> None:
+def test_a_role_that_only_connects_has_a_client_certificate_by_its_name(ca: Identity) -> None:
     viewer = issue(ca, "a.viewer", NOW, 10.0).certificate
     usage = viewer.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     assert list(usage) == [ExtendedKeyUsageOID.CLIENT_AUTH]
@@ -172,7 +172,7 @@ def test_no_rule_of_a_plant_reaches_another_but_for_the_tokens_of_fleets() -> No
         ('ca = "settings.toml"\ncertificate = "settings.toml"\nkey = "settings.toml"', "got 'tcp/127.0.0.1:7447' with"),
     ],
 )
-def test_half_an_identity_is_told_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
+def test_half_an_identity_is_reported_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
     path = tmp_path / "settings.toml"
     path.write_text(f"[bus]\n{text}\n", encoding="utf-8")
     assert tomllib.loads(path.read_text(encoding="utf-8"))
@@ -181,7 +181,7 @@ def test_half_an_identity_is_told_in_one_line(tmp_path: Path, text: str, expecte
     assert expected in str(caught.value)
 
 
-def test_a_damaged_authority_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_damaged_authority_is_reported_in_one_line(tmp_path: Path) -> None:
     make_site(tmp_path, ("a",), ENDPOINT, ENDPOINT, 10.0, NOW)
     (tmp_path / "authority" / "ca.pem").write_text("no certificate", encoding="utf-8")
     with pytest.raises(InputError, match="is no certificate in PEM") as caught:

@@ -18,7 +18,7 @@ class Machine:
         return self.passed_ns
 
 
-def test_it_tells_what_the_machine_s_clock_tells_also_when_that_is_set_forward() -> None:
+def test_it_follows_the_machine_s_clock_also_when_that_is_set_forward() -> None:
     machine = Machine()
     clock = SteadyClock(machine.wall_ns, machine.monotonic_ns)
     for step_ns in (0, 1, SECOND, 3600 * SECOND):
@@ -27,7 +27,7 @@ def test_it_tells_what_the_machine_s_clock_tells_also_when_that_is_set_forward()
         assert clock.now_ns() == machine.wall_ns()
 
 
-def test_when_the_machine_s_clock_is_set_back_it_goes_on_more_slowly_until_it_is_right_again() -> None:
+def test_when_the_machine_s_clock_is_set_back_it_runs_more_slowly_until_it_is_right_again() -> None:
     machine = Machine()
     clock = SteadyClock(machine.wall_ns, machine.monotonic_ns)
     machine.set_ns -= 60 * SECOND

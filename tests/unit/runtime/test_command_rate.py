@@ -1,4 +1,4 @@
-"""A flood of commands is refused beyond a rate, by name and in all, and people who come by are still served."""
+"""A flood of commands is refused beyond a rate, by name and in all, and occasional commands are still served."""
 
 import pytest
 

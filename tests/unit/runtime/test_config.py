@@ -49,7 +49,7 @@ def test_the_bus_is_on_loopback_unless_asked() -> None:
         ("[monitor]\nplant = 'a/b'\n", "plant name must be"),
     ],
 )
-def test_what_is_wrong_is_told_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
+def test_an_error_is_reported_in_one_line(tmp_path: Path, text: str, expected: str) -> None:
     with pytest.raises(InputError) as caught:
         section(MonitorConfig, "monitor", read_settings(settings_file(tmp_path, text)), {})
     assert expected in str(caught.value)

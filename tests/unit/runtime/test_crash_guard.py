@@ -50,7 +50,7 @@ def test_the_modules_are_those_that_the_documents_name() -> None:
 
 @pytest.mark.parametrize("error", ERRORS)
 @pytest.mark.parametrize("module", MODULES)
-def test_an_error_within_a_process_of_ours_is_one_line(
+def test_an_error_within_a_node_process_is_one_line(
     module: str, error: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     raised, code, line = ERRORS[error]

@@ -1,7 +1,8 @@
-"""Between a bus and who listens: one order, whichever thread it comes from, and nothing older than asked for."""
+"""Delivery from a bus to a subscriber: one order, whatever the thread, and nothing older than requested."""
 
 import time
 from collections.abc import Callable
+from math import inf, isinf
 from queue import SimpleQueue
 from types import SimpleNamespace
 
@@ -21,19 +22,19 @@ def message(number: int) -> SequencedMessage:
     return SequencedMessage(1, number, sample)
 
 
-def each(heard: "SimpleQueue[Encoded | Gap]") -> Callable[[list[Encoded]], None]:
+def each(received: "SimpleQueue[Encoded | Gap]") -> Callable[[list[Encoded]], None]:
     """Puts what is handed on together into a queue, one by one."""
 
     def put(messages: list[Encoded]) -> None:
         for message in messages:
-            heard.put(message)
+            received.put(message)
 
     return put
 
 
-def taken(heard: "SimpleQueue[Encoded | Gap]") -> list[str]:
+def taken(received: "SimpleQueue[Encoded | Gap]") -> list[str]:
     """The numbers that were handed on, so far."""
-    items = [heard.get_nowait() for _ in range(heard.qsize())]
+    items = [received.get_nowait() for _ in range(received.qsize())]
     return [item.payload.decode() for item in items if isinstance(item, Encoded)]
 
 
@@ -48,12 +49,12 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reorder_buffer, "TIMEOUT_NS", 1_000_000)
-    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
-    delivery = Delivery(each(heard), heard.put)
+    received: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    delivery = Delivery(each(received), received.put)
     delivery.start()
     for number in (0, 3):
         delivery.receive([message(number)])
-    items = [heard.get(timeout=WITHIN_S) for _ in range(3)]
+    items = [received.get(timeout=WITHIN_S) for _ in range(3)]
     delivery.close()
     gap = items[1]
     assert isinstance(gap, Gap)
@@ -63,18 +64,18 @@ def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.Monke
 
 def test_what_is_missing_is_asked_for_before_it_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reorder_buffer, "TIMEOUT_NS", 1_000_000)
-    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    received: SimpleQueue[Encoded | Gap] = SimpleQueue()
     asked: list[tuple[str, float]] = []
 
     def ask(stream: str, since_s: float) -> list[SequencedMessage]:
         asked.append((stream, since_s))
         return [message(number) for number in (0, 1, 3)]
 
-    delivery = Delivery(each(heard), heard.put, ask)
+    delivery = Delivery(each(received), received.put, ask)
     delivery.start()
     delivery.receive([message(0)])
     delivery.receive([message(3)])
-    items = [heard.get(timeout=WITHIN_S) for _ in range(4)]
+    items = [received.get(timeout=WITHIN_S) for _ in range(4)]
     delivery.close()
     assert [item.payload.decode() if isinstance(item, Encoded) else item[2:5] for item in items] == [
         "0",
@@ -90,14 +91,14 @@ def test_what_is_missing_is_asked_for_before_it_is_given_up(monkeypatch: pytest.
 @pytest.mark.parametrize("before", [1, 3])
 def test_the_query_reaches_back_to_the_message_before_the_gap(clock: SimpleNamespace, before: int) -> None:
     """Between them the link was down for a minute, and all that is missing was published then."""
-    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    received: SimpleQueue[Encoded | Gap] = SimpleQueue()
     asked: SimpleQueue[float] = SimpleQueue()
 
     def ask(stream: str, since_s: float) -> list[SequencedMessage]:
         asked.put(since_s)
         return [message(number) for number in range(before, before + 2)]
 
-    delivery = Delivery(each(heard), heard.put, ask)
+    delivery = Delivery(each(received), received.put, ask)
     delivery.start()
     delivery.receive([message(number) for number in range(before)])
     clock.now_ns += 60 * SECOND
@@ -105,28 +106,49 @@ def test_the_query_reaches_back_to_the_message_before_the_gap(clock: SimpleNames
     clock.now_ns += reorder_buffer.TIMEOUT_NS
     delivery.receive([message(before + 3)])
     assert asked.get(timeout=WITHIN_S) == 60.0 + reorder_buffer.TIMEOUT_NS / 1e9
-    items = [heard.get(timeout=WITHIN_S) for _ in range(before + 4)]
+    items = [received.get(timeout=WITHIN_S) for _ in range(before + 4)]
     delivery.close()
     assert [item.payload.decode() for item in items if isinstance(item, Encoded)] == [*map(str, range(before + 4))]
 
 
+def test_a_gap_that_was_long_on_its_way_is_queried_in_all_that_is_cached(clock: SimpleNamespace) -> None:
+    """A busy subscriber takes a message long after its publication, so what is missing is older than it seems."""
+    received: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    queried: SimpleQueue[float] = SimpleQueue()
+
+    def query(_stream: str, since_s: float) -> list[SequencedMessage]:
+        queried.put(since_s)
+        return [message(number) for number in range(0 if isinf(since_s) else 2, 4)]
+
+    delivery = Delivery(each(received), received.put, query)
+    delivery.start()
+    delivery.receive([message(0)])
+    delivery.receive([message(3)])
+    clock.now_ns += reorder_buffer.TIMEOUT_NS
+    delivery.receive([message(4)])
+    items = [received.get(timeout=WITHIN_S) for _ in range(5)]
+    delivery.close()
+    assert [item.payload.decode() for item in items if isinstance(item, Encoded)] == [*map(str, range(5))]
+    assert [queried.get_nowait() for _ in range(queried.qsize())] == [reorder_buffer.TIMEOUT_NS / 1e9, inf]
+
+
 def test_a_stream_that_began_while_the_link_was_down_is_asked_for_from_its_beginning(clock: SimpleNamespace) -> None:
     """And again only for what was published since: a made-up publisher costs its victim little."""
-    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    received: SimpleQueue[Encoded | Gap] = SimpleQueue()
     asked: SimpleQueue[float] = SimpleQueue()
 
     def ask(stream: str, since_s: float) -> list[SequencedMessage]:
         asked.put(since_s)
         return [message(number) for number in range(100)]
 
-    delivery = Delivery(each(heard), heard.put, ask)
+    delivery = Delivery(each(received), received.put, ask)
     delivery.start()
     clock.now_ns += 600 * SECOND  # the link was down for most of them
     delivery.receive([message(70)])
     clock.now_ns += SECOND
     delivery.receive([message(71)])
     assert asked.get(timeout=WITHIN_S) == 601.0
-    items = [heard.get(timeout=WITHIN_S) for _ in range(100)]
+    items = [received.get(timeout=WITHIN_S) for _ in range(100)]
     assert [item.payload.decode() for item in items if isinstance(item, Encoded)] == [*map(str, range(100))]
     for made_up in (2, 3):
         clock.now_ns += 10 * SECOND
@@ -134,7 +156,7 @@ def test_a_stream_that_began_while_the_link_was_down_is_asked_for_from_its_begin
         clock.now_ns += SECOND
         delivery.receive([message(8)._replace(publisher=made_up)])
         asked_s = asked.get(timeout=WITHIN_S)
-        assert [heard.get(timeout=WITHIN_S) for _ in range(2)]
+        assert [received.get(timeout=WITHIN_S) for _ in range(2)]
     delivery.close()
     assert asked_s == 11.0
 
@@ -145,7 +167,7 @@ def test_each_stream_is_asked_for_before_its_messages_are_given_up(
     """Another stream was asked for while a message of this one was missing already, but not yet overdue."""
     timeout_ns = 20_000_000
     monkeypatch.setattr(reorder_buffer, "TIMEOUT_NS", timeout_ns)
-    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    received: SimpleQueue[Encoded | Gap] = SimpleQueue()
     asked: SimpleQueue[str] = SimpleQueue()
 
     def of(kind: str, number: int) -> SequencedMessage:
@@ -155,7 +177,7 @@ def test_each_stream_is_asked_for_before_its_messages_are_given_up(
         asked.put(stream)
         return [of(stream.split("/")[2], 1)]
 
-    delivery = Delivery(each(heard), heard.put, ask)
+    delivery = Delivery(each(received), received.put, ask)
     delivery.start()
     delivery.receive([of("estimate", 0), of("chart", 0)])
     delivery.receive([of("estimate", 2)])
@@ -164,44 +186,44 @@ def test_each_stream_is_asked_for_before_its_messages_are_given_up(
     for stream in ("reactor/x/estimate", "reactor/x/chart"):
         clock.now_ns += timeout_ns // 2
         assert asked.get(timeout=WITHIN_S) == stream
-    items = [heard.get(timeout=WITHIN_S) for _ in range(6)]
+    items = [received.get(timeout=WITHIN_S) for _ in range(6)]
     delivery.close()
     assert not any(isinstance(item, Gap) for item in items)
 
 
 def test_what_waits_is_handed_on_when_the_bus_is_closed() -> None:
-    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
-    delivery = Delivery(each(heard), heard.put)
+    received: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    delivery = Delivery(each(received), received.put)
     delivery.start()
     for number in (0, 3):
         delivery.receive([message(number)])
     delivery.close()
-    assert taken(heard) == ["0", "3"]
+    assert taken(received) == ["0", "3"]
 
 
-def test_what_waits_is_handed_on_when_it_is_asked_for_and_delivery_goes_on() -> None:
-    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
-    delivery = Delivery(each(heard), heard.put)
+def test_pending_messages_are_delivered_on_request_and_delivery_continues() -> None:
+    received: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    delivery = Delivery(each(received), received.put)
     delivery.start()
     for number in (0, 3):
         delivery.receive([message(number)])
     delivery.flush_deliveries()
-    assert taken(heard) == ["0", "3"]
+    assert taken(received) == ["0", "3"]
     delivery.receive([message(4)])
     delivery.close()
-    assert taken(heard) == ["4"]
+    assert taken(received) == ["4"]
 
 
-def test_nothing_goes_on_before_it_is_known_what_was_before() -> None:
-    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
-    delivery = Delivery(each(heard), heard.put)
+def test_nothing_is_delivered_before_the_history_is_complete() -> None:
+    received: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    delivery = Delivery(each(received), received.put)
     delivery.receive([message(9)])
     delivery.set_last(message(8))
     delivery.add_history(message(7))
     assert not delivery.history_complete()
     delivery.add_history(message(8))
     assert delivery.history_complete()
-    assert taken(heard) == []
+    assert taken(received) == []
     delivery.start()
-    assert taken(heard) == ["7", "8", "9"]
+    assert taken(received) == ["7", "8", "9"]
     delivery.close()

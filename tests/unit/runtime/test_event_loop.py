@@ -1,4 +1,4 @@
-"""The loop of the nodes: nothing that arrives is lost, ticks come when they are due, a stop is heard at once."""
+"""The event loop of the nodes: no message is lost, ticks come when they are due, a stop acts at once."""
 
 import signal
 import threading
@@ -21,13 +21,13 @@ class Echo:
     """A node that publishes a Health for all that happens to it."""
 
     def __init__(self, ticks: int = 0, messages: int | None = None) -> None:
-        self.heard: list[Encoded] = []
+        self.received: list[Encoded] = []
         self.ticks: list[int] = []
         self.stopped = False
         self._ticks, self._messages = ticks, messages
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
-        self.heard.append(message)
+        self.received.append(message)
         return [Publication("out/message", Health(time_ns=now_ns))]
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
@@ -43,7 +43,7 @@ class Echo:
     @property
     def finished(self) -> bool:
         ticked = self._messages is None and len(self.ticks) == self._ticks > 0
-        return ticked or (self._messages is not None and len(self.heard) >= self._messages)
+        return ticked or (self._messages is not None and len(self.received) >= self._messages)
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         self.stopped = True
@@ -75,10 +75,10 @@ def test_every_message_is_handed_over_in_order() -> None:
         speaker.publish(Encoded(f"in/{number}", b"", ""))
     thread.join(WITHIN_S)
     assert not thread.is_alive()
-    assert [message.key for message in node.heard] == [f"in/{number}" for number in range(5000)]
+    assert [message.key for message in node.received] == [f"in/{number}" for number in range(5000)]
 
 
-def test_a_question_is_answered_by_the_loop_of_the_node_while_who_asked_waits() -> None:
+def test_a_query_is_answered_by_the_loop_of_the_node_while_its_caller_waits() -> None:
     exchange, stop = Exchange(), StopSignal()
     loop = EventLoop(Echo(), MemoryBus(exchange), stop)
     loop.accept_commands("command/*")
@@ -88,7 +88,7 @@ def test_a_question_is_answered_by_the_loop_of_the_node_while_who_asked_waits() 
 
 
 @pytest.mark.parametrize(("bound", "most"), [("MAX_INBOX_MESSAGES", 100), ("MAX_INBOX_BYTES", 100_000)])
-def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(
+def test_a_publisher_faster_than_a_node_can_receive_is_made_to_wait(
     bound: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The inbox stays within its bound, of messages or of bytes, and nothing is lost."""
@@ -109,7 +109,7 @@ def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(
         ahead[0] = max(ahead[0], number + 1 - handled[0])
     thread.join(WITHIN_S)
     assert not thread.is_alive()
-    assert len(node.heard) == count
+    assert len(node.received) == count
     assert ahead[0] <= 100 + 2
 
 
@@ -162,7 +162,7 @@ def test_what_arrived_before_the_stop_is_still_handled() -> None:
         speaker.publish(Encoded(f"in/{number}", b"", ""))
     stop.set()
     loop.run()
-    assert len(node.heard) == 1000
+    assert len(node.received) == 1000
 
 
 def test_what_waits_for_a_missing_message_is_handled_before_the_node_ends() -> None:
@@ -174,7 +174,7 @@ def test_what_waits_for_a_missing_message_is_handled_before_the_node_ends() -> N
     bus.held += [Encoded(f"in/{number}", b"", "") for number in range(3)]
     stop.set()
     loop.run()
-    assert [message.key for message in node.heard] == ["in/0", "in/1", "in/2"]
+    assert [message.key for message in node.received] == ["in/0", "in/1", "in/2"]
     assert node.stopped
 
 
@@ -185,13 +185,13 @@ def test_a_function_is_called_when_all_messages_that_arrived_before_are_handled_
     loop.subscribe("in/**")
     for number in range(3):
         speaker.publish(Encoded(f"in/{number}", b"", ""))
-        loop.call(lambda now_ns: [Publication(f"out/{len(node.heard)}", Health(time_ns=now_ns))])
+        loop.call(lambda now_ns: [Publication(f"out/{len(node.received)}", Health(time_ns=now_ns))])
     stop.set()
     loop.run()
     assert [key for key in published if key != "out/message"] == ["out/1", "out/2", "out/3", "out/stop"]
 
 
-def test_lingering_hears_what_comes_within_it() -> None:
+def test_draining_receives_messages_that_arrive_within_it() -> None:
     exchange, stop, node = Exchange(), StopSignal(), Echo()
     loop = EventLoop(node, MemoryBus(exchange), stop, drain_timeout_s=1.0)
     loop.subscribe("in/**")
@@ -200,10 +200,10 @@ def test_lingering_hears_what_comes_within_it() -> None:
     thread.start()
     loop.run()
     thread.join()
-    assert [message.key for message in node.heard] == ["in/late"]
+    assert [message.key for message in node.received] == ["in/late"]
 
 
-def test_a_node_that_is_finished_holds_nobody_up_who_still_publishes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_finished_node_blocks_no_publisher(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("reactorwatch.runtime.event_loop.MAX_INBOX_MESSAGES", 10)
     exchange = Exchange()
     node, speaker = Echo(messages=5), MemoryBus(exchange)
@@ -263,7 +263,7 @@ def test_a_question_is_answered_by_the_node() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_that_comes_while_the_main_thread_holds_a_lock_still_wakes_who_needs_that_lock(
+def test_a_signal_that_arrives_while_the_main_thread_holds_a_lock_still_wakes_the_thread_that_needs_it(
     number: signal.Signals,
 ) -> None:
     lock, woken = threading.Lock(), threading.Event()
@@ -316,9 +316,7 @@ class Batched(MemoryBus):
 
 
 @pytest.mark.parametrize(("bound", "most"), [("MAX_INBOX_MESSAGES", 100), ("MAX_INBOX_BYTES", 100_000)])
-def test_messages_that_come_together_are_bounded_likewise(
-    bound: str, most: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_batch_of_messages_is_bounded_in_the_same_way(bound: str, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(f"reactorwatch.runtime.event_loop.{bound}", most)
     count, handled, ahead = 5000, [0], [0]
     bus, stop = Batched(Exchange()), StopSignal()
@@ -345,10 +343,10 @@ def test_messages_that_come_together_are_bounded_likewise(
 def test_messages_are_handed_over_together_in_their_order_and_tokens_as_they_come_and_go() -> None:
     exchange, stop = Exchange(), StopSignal()
     node, speaker = Echo(), MemoryBus(exchange)
-    heard, alive = list[str](), list[tuple[str, bool]]()
+    received, alive = list[str](), list[tuple[str, bool]]()
 
     def on_batch(messages: list[Encoded], _now_ns: int) -> list[Publication]:
-        heard.extend(message.key for message in messages)
+        received.extend(message.key for message in messages)
         return []
 
     def on_token(token: str, is_alive: bool, _now_ns: int) -> list[Publication]:
@@ -368,5 +366,5 @@ def test_messages_are_handed_over_together_in_their_order_and_tokens_as_they_com
     speaker.undeclare_token("alive/x")
     thread.join(WITHIN_S)
     assert not thread.is_alive()
-    assert heard == [f"in/{number}" for number in range(1000)]
+    assert received == [f"in/{number}" for number in range(1000)]
     assert alive == [("alive/x", True), ("alive/x", False)]

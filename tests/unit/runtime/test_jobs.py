@@ -1,4 +1,4 @@
-"""Jobs come to the same whoever does them; a failure stays with its job, and a dead worker costs a retry."""
+"""Jobs give the same results on any executor; a failure stays with its job, and a dead worker costs a retry."""
 
 import multiprocessing
 import os
@@ -54,7 +54,7 @@ def test_answers_are_those_of_the_function_in_the_order_of_the_jobs(anyone: Exec
     assert list(in_job_order(anyone.map_unordered(square, range(12)))) == [number**2 for number in range(12)]
 
 
-def test_a_job_that_fails_is_told_in_a_line_and_the_others_are_done(anyone: Executor) -> None:
+def test_a_job_that_fails_is_reported_in_one_line_and_the_others_are_done(anyone: Executor) -> None:
     first, bad, broken, last = in_job_order(anyone.map_unordered(picky, range(4)))
     assert (first, last) == (0, 3)
     assert bad == Failed("x must not be 1, got 1")
@@ -98,7 +98,7 @@ def test_each_process_has_one_thread_of_linear_algebra(monkeypatch: pytest.Monke
     assert list(ProcessExecutor(1).map_unordered(linear_algebra_threads, [0])) == [(0, "1")]
 
 
-def test_who_stops_asking_leaves_no_process_behind() -> None:
+def test_a_caller_that_stops_iterating_leaves_no_process_behind() -> None:
     before = set(multiprocessing.active_children())  # of a cluster that other tests have, they come and go
     outcomes = ProcessExecutor(2).map_unordered(square, range(100))
     next(outcomes)
@@ -136,7 +136,7 @@ def test_one_process_is_this_one_and_by_default_there_is_one_a_core() -> None:
         (None, "here", "--scheduler must be an address like tcp://127.0.0.1:8786, got 'here'"),
     ],
 )
-def test_what_cannot_be_is_told_in_a_line(processes: int | None, scheduler: str | None, said: str) -> None:
+def test_an_impossible_setting_is_reported_in_one_line(processes: int | None, scheduler: str | None, said: str) -> None:
     if scheduler == "here":
         pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
     with pytest.raises(InputError) as told:
@@ -144,7 +144,7 @@ def test_what_cannot_be_is_told_in_a_line(processes: int | None, scheduler: str 
     assert str(told.value) == said
 
 
-def test_without_dask_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_dask_the_cure_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"^--scheduler needs Dask: pip install 'reactorwatch\[cluster\]'$"):
         choose_executor(None, "tcp://127.0.0.1:8786")
@@ -154,7 +154,7 @@ def test_without_dask_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     ("theirs", "said"),
     [("0.0.1", "has reactorwatch 0.0.1, this is "), (None, "has no reactorwatch; install ")],
 )
-def test_workers_with_another_version_or_none_are_told(
+def test_workers_with_another_version_or_none_are_reported(
     cluster: str, theirs: str | None, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("reactorwatch.runtime.parallel.dask_workers._version_query", lambda: lambda: theirs)
@@ -162,7 +162,7 @@ def test_workers_with_another_version_or_none_are_told(
         list(choose_executor(None, cluster).map_unordered(square, range(2)))
 
 
-def test_a_cluster_without_workers_is_told_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_without_workers_is_reported_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("reactorwatch.runtime.parallel.dask_workers.WORKERS_WITHIN_S", 0.2)
     with dask_cluster(0) as address:
         said = f"has no workers; start some with: dask worker {address} --nthreads 1"
@@ -170,7 +170,7 @@ def test_a_cluster_without_workers_is_told_with_the_cure(monkeypatch: pytest.Mon
             list(choose_executor(None, address).map_unordered(square, range(2)))
 
 
-def test_a_scheduler_that_is_not_there_is_told_by_its_address(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_scheduler_is_reported_by_its_address(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
     monkeypatch.setattr("reactorwatch.runtime.parallel.dask_workers.CONNECT_WITHIN_S", 0.2)
     with pytest.raises(InputError, match=r"^--scheduler tcp://127\.0\.0\.1:1: cannot be reached: "):

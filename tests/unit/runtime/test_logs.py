@@ -1,4 +1,4 @@
-"""A log is a line an event: for people as text, for programs as an object."""
+"""A log is a line an event: as text, or as a JSON object."""
 
 import json
 import subprocess
@@ -58,7 +58,7 @@ class Disk(StringIO):
         return super().write(text)
 
 
-def test_lines_that_a_full_disk_refuses_are_counted_and_the_next_one_says_so() -> None:
+def test_lines_that_a_full_disk_refuses_are_counted_and_the_next_one_reports_it() -> None:
     disk = Disk()
     log = LogFile(disk)
     log.write("first\n")
@@ -72,7 +72,7 @@ def test_lines_that_a_full_disk_refuses_are_counted_and_the_next_one_says_so() -
     assert disk.getvalue().splitlines() == ["first", said, "second", "third"]
 
 
-def test_a_process_whose_log_cannot_be_written_goes_on_to_its_own_end() -> None:
+def test_a_process_whose_log_cannot_be_written_runs_to_its_own_end() -> None:
     program = (
         "import structlog; from reactorwatch.runtime import logs; logs.configure(); "
         "[structlog.get_logger().info('row', n=n) for n in range(1000)]; raise SystemExit(7)"

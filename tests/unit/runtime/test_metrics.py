@@ -1,4 +1,4 @@
-"""What a node counts is on its page as it was published, in the words of Prometheus."""
+"""The counts of a node are on its metrics page as they were published, in the Prometheus format."""
 
 import socket
 import sys
@@ -61,7 +61,7 @@ def page(port: int, node: str = "monitor") -> dict[str, float]:
     return found
 
 
-Told = Callable[[Health | Alarm | Sample], None]
+Publish = Callable[[Health | Alarm | Sample], None]
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def alarms() -> list[Alarm]:
 
 
 @pytest.fixture
-def tell(port: int, alarms: list[Alarm]) -> Iterator[Told]:
+def publish(port: int, alarms: list[Alarm]) -> Iterator[Publish]:
     """Publishes as the monitor, whose page is served."""
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     page = Metrics("monitor", {"R-101": lambda: alarms}, lambda: 5_000_000)
@@ -83,8 +83,8 @@ def tell(port: int, alarms: list[Alarm]) -> Iterator[Told]:
         yield lambda message: metrics.on_publish(Publication("reactor/R-101/of/node", message))
 
 
-def test_the_counts_of_health_are_there_in_base_units(port: int, tell: Told) -> None:
-    tell(HEALTH)
+def test_the_counts_of_health_are_there_in_base_units(port: int, publish: Publish) -> None:
+    publish(HEALTH)
     found = page(port)
     expected = {
         "messages_received_total": 1000,
@@ -110,7 +110,9 @@ def test_the_counts_of_health_are_there_in_base_units(port: int, tell: Told) -> 
     assert found["process_resident_memory_bytes{}"] > 1e6
 
 
-def test_alarms_are_counted_by_state_also_where_there_are_none(port: int, tell: Told, alarms: list[Alarm]) -> None:
+def test_alarms_are_counted_by_state_also_where_there_are_none(
+    port: int, publish: Publish, alarms: list[Alarm]
+) -> None:
     def counted() -> dict[str, float]:
         return {
             name.split('state="')[1].rstrip('"}'): value
@@ -118,18 +120,18 @@ def test_alarms_are_counted_by_state_also_where_there_are_none(port: int, tell: 
             if name.startswith("reactorwatch_alarms{")
         }
 
-    tell(HEALTH)
+    publish(HEALTH)
     none = dict.fromkeys(
         ("acknowledged", "returned_unacknowledged", "shelved", "suppressed_by_design", "out_of_service"), 0.0
     )
     assert counted() == {"normal": 2.0, "unacknowledged": 1.0, **none}
     alarms[0].state = AlarmState.ALARM_STATE_ACKNOWLEDGED
-    tell(alarms[0])
+    publish(alarms[0])
     assert counted() == {"normal": 2.0, "unacknowledged": 0.0, **none, "acknowledged": 1.0}
 
 
-def test_a_node_that_has_said_nothing_yet_has_a_page_without_counts(port: int, tell: Told) -> None:
-    tell(Sample(time_ns=1))
+def test_a_node_that_has_published_nothing_yet_has_a_page_without_counts(port: int, publish: Publish) -> None:
+    publish(Sample(time_ns=1))
     assert not any(name.startswith(("reactorwatch_messages", "reactorwatch_alarms")) for name in page(port))
 
 
@@ -215,7 +217,7 @@ class Lines:
         self.served.set()
 
 
-def test_a_port_that_is_taken_stops_no_node_health_says_so_and_it_is_served_once_it_is_free(
+def test_a_port_in_use_stops_no_node_is_reported_in_health_and_is_served_once_it_is_free(
     port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
@@ -243,7 +245,7 @@ def test_a_node_ends_at_once_while_its_port_is_taken(port: int) -> None:
         assert "metrics" not in {thread.name for thread in threading.enumerate()}
 
 
-def test_without_the_library_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_library_the_cure_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
     metrics = serve_metrics(MetricsConfig(port=9464), Metrics("monitor", {"R-101": None}))
     with pytest.raises(InputError, match=r"pip install 'reactorwatch\[metrics\]'"), metrics:
@@ -259,7 +261,7 @@ def test_without_the_library_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -
         ({"ports": 1}, "unknown key 'ports'; did you mean 'port'?"),
     ],
 )
-def test_settings_that_cannot_be_are_told(values: dict[str, object], said: str) -> None:
+def test_impossible_settings_are_reported(values: dict[str, object], said: str) -> None:
     with pytest.raises(InputError) as told:
         section(MetricsConfig, "metrics", {"metrics": values}, {})
     assert said in str(told.value)

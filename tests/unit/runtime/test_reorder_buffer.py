@@ -1,4 +1,4 @@
-"""What a node published goes on in that order, whatever comes late; and what never comes is told."""
+"""Messages of a publisher are delivered in order, however late they arrive; lost ones are reported."""
 
 import random
 from collections.abc import Iterable
@@ -25,13 +25,13 @@ def fed(
     return [item for number in numbers for item in order.push(publisher, STREAM, key, number, number, now_ns)]
 
 
-def test_what_comes_in_order_goes_on_at_once() -> None:
+def test_messages_in_order_are_delivered_at_once() -> None:
     order = ReorderBuffer[int]()
     assert fed(order, [0, 1, 2]) == [0, 1, 2]
     assert order.due_ns() is None
 
 
-def test_what_is_recovered_key_by_key_goes_on_row_by_row() -> None:
+def test_messages_recovered_key_by_key_are_delivered_row_by_row() -> None:
     """Three signals; after row 1 a link was down for four rows."""
     order = ReorderBuffer[int]()
     assert fed(order, [0, 1, 2]) == [0, 1, 2]
@@ -40,14 +40,14 @@ def test_what_is_recovered_key_by_key_goes_on_row_by_row() -> None:
     assert order.due_ns() is None
 
 
-def test_any_order_of_a_stream_that_was_heard_from_its_beginning_is_put_right() -> None:
+def test_any_order_of_a_stream_that_was_received_from_its_start_is_put_right() -> None:
     for seed in range(50):
         numbers = list(range(1, 40))
         random.Random(seed).shuffle(numbers)
         assert fed(ReorderBuffer[int](), [0, *numbers]) == list(range(40))
 
 
-def test_a_late_listener_gathers_what_he_is_told_and_then_goes_on_at_once() -> None:
+def test_a_late_subscriber_sorts_the_first_window_and_then_passes_messages_on_at_once() -> None:
     order = ReorderBuffer[int]()
     assert fed(order, [30, 33, 31, 34, 32]) == []
     assert order.due_ns() == START_WINDOW_NS
@@ -57,7 +57,7 @@ def test_a_late_listener_gathers_what_he_is_told_and_then_goes_on_at_once() -> N
     assert order.due_ns() is None
 
 
-def test_what_never_comes_is_told_when_it_is_given_up_and_the_rest_goes_on() -> None:
+def test_lost_messages_are_reported_when_they_are_given_up_and_the_rest_is_delivered() -> None:
     order = ReorderBuffer[int]()
     assert fed(order, [0, 3, 4, 7], now_ns=10) == [0]
     assert order.due_ns() == 10 + TIMEOUT_NS
@@ -144,7 +144,7 @@ def test_what_is_missing_later_is_waited_for_as_long_by_itself() -> None:
     assert fed(order, [4], now_ns=2 * RECOVERY_TIMEOUT_NS - 2, key="C") == [4, 5]
 
 
-def test_a_silent_key_of_which_the_last_number_was_told_is_one_that_may_be_recovered() -> None:
+def test_a_silent_key_with_a_reported_last_number_may_be_recovered() -> None:
     order = ReorderBuffer[int](await_history=True)
     order.set_last(1, STREAM, "C", 3)
     order.set_last(1, STREAM, "T", 4)
@@ -176,7 +176,7 @@ def test_keys_that_each_keep_their_order_make_one_order_whatever_is_lost_and_how
         assert sum(item.messages for item in heard if isinstance(item, Gap)) == came[-1] - len(came)
 
 
-def test_what_comes_after_it_was_given_up_goes_on_at_once() -> None:
+def test_a_message_that_arrives_after_it_was_given_up_is_delivered_at_once() -> None:
     order = ReorderBuffer[int]()
     fed(order, [0, 2])
     list(order.release_overdue(TIMEOUT_NS))
@@ -197,7 +197,7 @@ def test_what_comes_again_and_what_was_before_the_first_is_passed_over() -> None
     assert fed(order, [3, 5, 6, 7]) == [7]
 
 
-def test_who_begins_to_listen_hears_what_is_after_his_time_only() -> None:
+def test_a_new_subscriber_receives_only_messages_after_its_start() -> None:
     """Number 7 came live before the publisher said that it had come to 8; 9 after."""
     order = ReorderBuffer[int](await_history=True)
     assert fed(order, [7, 9]) == []
@@ -208,14 +208,14 @@ def test_who_begins_to_listen_hears_what_is_after_his_time_only() -> None:
     assert fed(order, [3, 8, 10]) == [10]
 
 
-def test_a_publisher_that_says_nothing_more_is_known_by_its_last_number() -> None:
+def test_a_publisher_that_publishes_nothing_more_is_known_by_its_last_number() -> None:
     order = ReorderBuffer[int](await_history=True)
     order.set_last(1, STREAM, "T", 8)
     assert list(order.end_history(1)) == []
     assert fed(order, [0, 3, 8, 9]) == [9]
 
 
-def test_who_asks_for_what_was_before_hears_it_first_once_and_in_order() -> None:
+def test_a_subscriber_with_history_receives_it_first_once_and_in_order() -> None:
     order = ReorderBuffer[int](await_history=True)
     assert fed(order, [1, 9, 10, 11]) == []
     order.set_last(1, STREAM, "T", 9)
@@ -225,7 +225,7 @@ def test_who_asks_for_what_was_before_hears_it_first_once_and_in_order() -> None
     assert fed(order, [2, 10, 12]) == [12]
 
 
-def test_what_was_before_is_told_when_nothing_is_missing_up_to_what_comes_live() -> None:
+def test_the_history_is_delivered_when_nothing_is_missing_up_to_the_live_messages() -> None:
     """Two keys by turns; 7 was published after its key was asked, and thrown away on the way."""
     order = ReorderBuffer[int](await_history=True)
     assert order.history_complete()
@@ -244,7 +244,7 @@ def test_what_was_before_is_told_when_nothing_is_missing_up_to_what_comes_live()
     assert list(order.end_history(0)) == list(range(10))
 
 
-def test_what_is_still_remembered_of_some_keys_only_goes_first_and_is_no_gap() -> None:
+def test_a_partial_history_of_some_keys_is_delivered_first_and_is_no_gap() -> None:
     order = ReorderBuffer[int](await_history=True)
     for number, key in ((1, "C"), (3, "C"), (5, "C"), (4, "T"), (6, "T")):
         order.add_history(1, STREAM, key, number, number)
@@ -254,13 +254,13 @@ def test_what_is_still_remembered_of_some_keys_only_goes_first_and_is_no_gap() -
     assert order.due_ns() is None
 
 
-def test_a_publisher_that_comes_while_others_are_asked_is_heard_from_its_beginning() -> None:
+def test_a_publisher_that_appears_during_the_history_query_is_received_from_its_start() -> None:
     order = ReorderBuffer[int](await_history=True)
     assert fed(order, [0, 1]) == []
     assert list(order.end_history(1)) == [0, 1]
 
 
-def test_as_long_as_a_recovery_goes_on_it_is_waited_for() -> None:
+def test_a_recovery_is_waited_for_as_long_as_it_lasts() -> None:
     order = ReorderBuffer[int]()
     fed(order, [0, 10, 12])
     assert fed(order, [1], now_ns=4 * 10**9) == [1]
@@ -297,7 +297,7 @@ def test_no_more_bytes_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyP
     assert fed(order, [14]) == []  # there is room again
 
 
-def test_while_what_was_before_is_told_no_more_waits_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_during_the_history_no_more_messages_wait_than_the_capacity(monkeypatch: pytest.MonkeyPatch) -> None:
     """What did not find room is told as missing."""
     monkeypatch.setattr(stream_state, "MAX_HELD", 10)
     order = ReorderBuffer[int](await_history=True)
@@ -308,7 +308,7 @@ def test_while_what_was_before_is_told_no_more_waits_than_there_is_room_for(monk
     assert [(item.first, item.last) for item in told if isinstance(item, Gap)] == [(11, 99)]
 
 
-def test_publishers_without_number_are_forgotten_and_the_one_that_goes_on_is_not(
+def test_idle_publishers_are_evicted_and_the_active_one_is_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(reorder_buffer, "MAX_STREAMS", 100)
@@ -338,7 +338,7 @@ def test_the_fast_way_is_for_keys_that_are_remembered(monkeypatch: pytest.Monkey
     assert [order.accept_next(1, f"x{place}", 100 + place, 0) for place in range(10)] == [True] * 10
 
 
-def test_the_fast_way_is_for_the_publisher_that_went_on_last() -> None:
+def test_the_fast_path_is_for_the_last_active_publisher() -> None:
     order = ReorderBuffer[int]()
     assert fed(order, [0, 1]) == [0, 1]
     assert not order.accept_next(2, "T", 2, 0)
@@ -355,7 +355,7 @@ def test_the_fast_way_is_closed_while_something_is_waited_for() -> None:
     assert order.accept_next(1, "T", 3, 0)
 
 
-def test_publishers_of_one_message_that_nobody_had_told_of_are_forgotten() -> None:
+def test_unannounced_publishers_of_one_message_are_evicted() -> None:
     """Garbage, with something like a publisher and a number, makes a stream each."""
     order = ReorderBuffer[int]()
     fed(order, [0])
@@ -383,7 +383,7 @@ def test_a_flood_of_made_up_publishers_pushes_out_its_own_and_not_those_that_are
     assert fed(order, [3, 2], now_ns=1000) == [2, 3]
 
 
-def test_publishers_that_were_told_of_or_heard_from_their_beginning_are_not_forgotten() -> None:
+def test_publishers_that_were_announced_or_received_from_their_start_are_not_evicted() -> None:
     """Of an alarm there may be a message a day."""
     order = ReorderBuffer[int](await_history=True)
     order.set_last(1, STREAM, "T", 7)
@@ -397,7 +397,7 @@ def test_publishers_that_were_told_of_or_heard_from_their_beginning_are_not_forg
     assert fed(order, [2, 1], publisher=2) == [1, 2]
 
 
-def test_the_one_that_goes_on_by_the_fast_way_is_not_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_active_publisher_on_the_fast_path_is_not_evicted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reorder_buffer, "MAX_STREAMS", 100)
     order = ReorderBuffer[int]()
     assert fed(order, [0]) == [0]

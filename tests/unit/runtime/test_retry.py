@@ -1,4 +1,4 @@
-"""What can pass is waited for at a node's start, and what only a person can mend is raised at once."""
+"""Transient errors are waited for at a node's start, and permanent ones are raised at once."""
 
 import errno
 import os
@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
+from monitor_node.node import MonitorNode
 from monitor_node.storage.state_files import StateFolder
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
@@ -112,7 +112,7 @@ def test_a_passing_state_is_tried_again_until_it_has_passed_with_a_line_for_each
     assert pauses == [min(0.1 * 2**number, 2.0) for number in range(len(reasons))]
 
 
-def test_health_says_what_a_node_waits_for_and_a_stop_ends_the_wait_at_once() -> None:
+def test_health_reports_what_a_node_waits_for_and_a_stop_ends_the_wait_at_once() -> None:
     exchange, stop, heard = Exchange(), StopSignal(), list[Encoded]()
     MemoryBus(exchange).subscribe("reactor/cstr/health/*", heard.append)
 

@@ -83,7 +83,7 @@ def test_without_its_notes_the_addresses_have_to_be_given(site: Path) -> None:
 
 
 @pytest.mark.parametrize("endpoint", [None, ENDPOINT])
-def test_the_router_goes_on_listening_where_it_did(site: Path, endpoint: str | None) -> None:
+def test_the_router_keeps_its_endpoint(site: Path, endpoint: str | None) -> None:
     make_site(site, ("b",), endpoint, None, 90.0, NOW)
     assert rules(site)["listen"]["endpoints"] == [LISTEN]  # type: ignore[index]
 
@@ -220,6 +220,6 @@ def test_what_is_no_holder_cannot_be_revoked(site: Path, holder: str) -> None:
     assert contents(site) == before
 
 
-def test_a_site_whose_authority_ended_says_so(site: Path) -> None:
+def test_a_site_whose_authority_expired_reports_it(site: Path) -> None:
     with pytest.raises(InputError, match="the authority's certificate ended on 2035"):
         make_site(site, (), None, None, 90.0, NOW + 3651 * DAY, renew_days=30.0)

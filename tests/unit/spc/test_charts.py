@@ -1,4 +1,4 @@
-"""What holds for every chart of the catalogue."""
+"""Properties of every chart of the catalogue."""
 
 from typing import Any
 
@@ -27,7 +27,7 @@ def restored(chart: Any) -> Any:
     return type(chart).resume(copy_of(chart.memory))
 
 
-def test_stopped_and_gone_on_is_never_stopped(member: Member) -> None:
+def test_a_stopped_and_resumed_chart_equals_one_never_stopped(member: Member) -> None:
     """Stored after any of 40 samples, the chart goes on bit for bit."""
     samples = member.sample(np.random.default_rng(1), 40)
     steady, stopped = member.new(), member.new()
@@ -128,7 +128,7 @@ def test_a_bank_refuses_a_row_as_a_whole() -> None:
     assert bank.memory.to_bytes() == before
 
 
-def test_a_bank_restarts_the_plants_it_is_told() -> None:
+def test_a_bank_restarts_the_given_plants() -> None:
     bank = Bank([Ewma(0.0, 1.0) for _ in range(3)])
     bank.update([1.0, 2.0, 3.0])
     bank.restart(np.array([False, True, False]))

@@ -9,7 +9,7 @@ from reactorwatch.cli.main import app
 from reactorwatch.errors import InputError
 
 
-def said(command: str) -> str:
+def run_charts(command: str) -> str:
     result = CliRunner().invoke(app, ["charts", *command.split()], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.output
@@ -31,20 +31,20 @@ def said(command: str) -> str:
 )
 def test_arl_prints_one_number(command: str, length: float) -> None:
     """The published one; sources as in `published.py`."""
-    assert float(said(f"arl {command}")) == pytest.approx(length, rel=0.006)
+    assert float(run_charts(f"arl {command}")) == pytest.approx(length, rel=0.006)
 
 
 def test_arl_prints_an_object_for_machines() -> None:
-    found = json.loads(said("arl ewma --lambda 0.25 --limit 3 --shift 1 --json"))
+    found = json.loads(run_charts("arl ewma --lambda 0.25 --limit 3 --shift 1 --json"))
     assert found.pop("arl") == pytest.approx(11.154267)
     assert found == {"chart": "ewma", "lambda": 0.25, "limit": 3.0, "shift": 1.0}
 
 
 def test_what_design_prints_has_the_run_length_asked_for() -> None:
-    found = json.loads(said("design cusum --arl0 370.4 --shift 1 --json"))
+    found = json.loads(run_charts("design cusum --arl0 370.4 --shift 1 --json"))
     k, h = found["parameters"]["k"], found["parameters"]["h"]
-    assert float(said(f"arl cusum --k {k} --h {h}")) == pytest.approx(370.4, rel=1e-6)
-    text = said("design cusum --arl0 370.4 --shift 1").split()
+    assert float(run_charts(f"arl cusum --k {k} --h {h}")) == pytest.approx(370.4, rel=1e-6)
+    text = run_charts("design cusum --arl0 370.4 --shift 1").split()
     assert text[:3] == ["cusum", "k", "0.5"]
 
 
@@ -59,7 +59,7 @@ def test_what_design_prints_has_the_run_length_asked_for() -> None:
         ("design median --arl0 500 --shift 1", "chart must be one of shewhart, cusum, ewma, mewma, t2, got 'median'"),
     ],
 )
-def test_wrong_input_is_told_in_one_line(command: str, message: str) -> None:
+def test_wrong_input_is_reported_in_one_line(command: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as refused:
-        said(command)
+        run_charts(command)
     assert "\n" not in str(refused.value)

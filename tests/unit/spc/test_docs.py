@@ -1,4 +1,4 @@
-"""The page about charts says what is computed."""
+"""The page about charts states what is computed."""
 
 from tests.unit.spc.tables import BEGIN, END, PAGE, table
 

@@ -1,4 +1,4 @@
-"""What is promised of false alarms is kept on average over trainings, for white residuals and autocorrelated ones."""
+"""The promised rate of false alarms is kept on average over trainings, for white and autocorrelated residuals."""
 
 from functools import cache
 

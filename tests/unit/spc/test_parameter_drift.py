@@ -196,7 +196,7 @@ def test_a_record_without_noise_makes_no_drift_of_rounding() -> None:
 
 @pytest.mark.parametrize("row", [3, 50, 250, 450, 497])
 @pytest.mark.parametrize("lags", [2, 3, 5])
-def test_a_training_with_one_step_of_the_input_cannot_tell_how_its_lags_scatter(row: int, lags: int) -> None:
+def test_a_training_with_one_step_of_the_input_does_not_determine_how_its_lags_scatter(row: int, lags: int) -> None:
     """The difference of two lags is other than 0 in one row, which the regression explains wholly."""
     rng = np.random.default_rng(row)
     step = (np.arange(-lags, 500) >= row).astype(np.float64)

@@ -75,7 +75,7 @@ def test_a_parameter_that_alone_moves_has_all_of_the_statistic() -> None:
     assert watched.contributions([0.0, 0.02, 0.0]).tolist() == pytest.approx([0.0, said.statistic, 0.0])
 
 
-def test_stopped_with_its_excitation_and_gone_on_is_never_stopped() -> None:
+def test_a_chart_stopped_and_resumed_with_its_excitation_equals_one_never_stopped() -> None:
     steady, stopped = chart(), chart()
     for row, d in zip(0.5 * rows(7, 40), difference(np.random.default_rng(7), 40), strict=True):
         stopped = ParameterT2.resume(copy_of(stopped.memory))

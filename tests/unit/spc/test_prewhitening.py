@@ -43,7 +43,7 @@ def test_its_uncertainty_is_that_of_many_trainings() -> None:
     assert passed == pytest.approx(np.mean([item.passed_variance for item in first]), rel=0.25)
 
 
-def test_a_lasting_shift_is_passed_on_by_the_part_that_it_tells() -> None:
+def test_a_lasting_shift_is_passed_on_by_its_informative_part() -> None:
     learned = Prewhitening(0.0, (0.5, 0.2), 2.0, 1000, 0.001, 0.001)
     assert learned.shift_gain == pytest.approx(0.3)
     assert innovations_of(np.full(10, 6.0), learned)[-1] == pytest.approx(0.3 * 6.0 / 2.0)

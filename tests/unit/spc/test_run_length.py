@@ -98,7 +98,7 @@ def test_the_published_start_of_the_ewma_is_off(weight: float, limit: float, shi
 
 @pytest.mark.parametrize("start", [0.0, 1.5])
 @pytest.mark.parametrize("shift", [0.0, 0.5, 2.0])
-def test_the_sides_of_a_cusum_combine_as_the_chain_of_both_says(start: float, shift: float) -> None:
+def test_the_sides_of_a_cusum_combine_as_the_chain_of_both(start: float, shift: float) -> None:
     """Zero state with and without head start, to 1e-5; steady state to 0.1 %."""
     k, h = 0.5, 24.5 / 6.0
     coarse, fine = Lattice(k, 24, 3, start), Lattice(k, 73, 9, start)

@@ -13,8 +13,8 @@ PERIOD = 6_000_000_000  # ns of the plant's time
 LEAST_S = 1.0
 
 
-def heard(rows: int, period_ns: int = PERIOD, speed: float = 1.0) -> DataTimeout:
-    """One that has heard a regular plant, received at `speed` times the plant's time from 0 on."""
+def trained_timeout(rows: int, period_ns: int = PERIOD, speed: float = 1.0) -> DataTimeout:
+    """A timeout after samples of a regular plant, received at `speed` times the plant's time from 0 on."""
     silence = DataTimeout(limit=5.0, least_s=LEAST_S)
     for row in range(rows):
         silence.on_receipt(int(row * period_ns / speed))
@@ -32,19 +32,19 @@ def resume(stopped: DataTimeout) -> DataTimeout:
 
 @pytest.mark.parametrize("missing", [0, 1, 4])
 def test_up_to_four_missing_rows_are_no_silence(missing: int) -> None:
-    assert heard(100).update((100 + missing) * PERIOD, present=True) == NO_CHANGE
+    assert trained_timeout(100).update((100 + missing) * PERIOD, present=True) == NO_CHANGE
 
 
 @pytest.mark.parametrize("missing", [5, 6, 1000])
 def test_a_longer_gap_is_a_silence_from_five_periods_after_the_last_row_until_the_next(missing: int) -> None:
-    silence = heard(100)
+    silence = trained_timeout(100)
     change = silence.update((100 + missing) * PERIOD, present=True)
     assert change == Change(raised_ns=104 * PERIOD, cleared_ns=(100 + missing) * PERIOD)
     assert not silence.is_active
 
 
-def test_a_sensor_without_values_is_silent_while_the_rows_go_on() -> None:
-    silence = heard(100)
+def test_a_sensor_without_values_is_silent_while_rows_arrive() -> None:
+    silence = trained_timeout(100)
     changes = [silence.update(row * PERIOD, present=False) for row in range(100, 120)]
     assert [(row, change) for row, change in enumerate(changes, 100) if change != NO_CHANGE] == [
         (105, Change(raised_ns=104 * PERIOD, cleared_ns=None))
@@ -61,7 +61,7 @@ def test_a_slow_sensor_is_measured_by_its_own_period() -> None:
 
 
 def test_a_gap_in_all_rows_is_no_fault_of_a_sensor() -> None:
-    sensor = heard(100)
+    sensor = trained_timeout(100)
     sensor.suppress_until(200 * PERIOD)
     assert sensor.update(200 * PERIOD, present=False) == NO_CHANGE
     assert [sensor.update(row * PERIOD, present=False) for row in range(201, 206)] == [NO_CHANGE] * 5
@@ -69,7 +69,7 @@ def test_a_gap_in_all_rows_is_no_fault_of_a_sensor() -> None:
 
 
 def test_a_sensor_that_is_silent_already_stays_so_through_a_gap_in_all_rows() -> None:
-    sensor = heard(100)
+    sensor = trained_timeout(100)
     sensor.update(110 * PERIOD, present=False)
     sensor.suppress_until(200 * PERIOD)
     assert sensor.is_active
@@ -77,21 +77,21 @@ def test_a_sensor_that_is_silent_already_stays_so_through_a_gap_in_all_rows() ->
 
 
 def test_a_clock_that_is_set_back_is_no_silence_and_is_followed_from_there() -> None:
-    silence = heard(100)
+    silence = trained_timeout(100)
     assert silence.update(-50 * PERIOD, present=True) == NO_CHANGE
     assert silence.update(-49 * PERIOD, present=True) == NO_CHANGE
     assert silence.update(-40 * PERIOD, present=True) == Change(-44 * PERIOD, -40 * PERIOD)
 
 
 def test_a_silent_sensor_stays_so_when_the_clock_is_set_back_and_it_still_has_no_value() -> None:
-    sensor = heard(100)
+    sensor = trained_timeout(100)
     sensor.update(110 * PERIOD, present=False)
     assert sensor.update(20 * PERIOD, present=False) == NO_CHANGE
     assert sensor.is_active
 
 
 def test_after_a_long_silence_the_next_is_noticed_nearly_as_soon() -> None:
-    silence = heard(100)
+    silence = trained_timeout(100)
     silence.on_receipt(1100 * PERIOD)
     silence.update(1100 * PERIOD, present=True)
     due_ns = silence.due_ns()
@@ -113,8 +113,8 @@ def test_rows_that_get_lost_singly_are_no_silence() -> None:
     assert all(silence.update(int(row) * PERIOD, present=True) == NO_CHANGE for row in kept)
 
 
-def test_a_plant_that_goes_on_ten_times_slower_is_taken_as_it_is_after_a_few_rows() -> None:
-    silence = heard(100)
+def test_a_plant_that_resumes_ten_times_slower_is_accepted_after_a_few_rows() -> None:
+    silence = trained_timeout(100)
     changes = [silence.update((99 + 10 * row) * PERIOD, present=True) for row in range(1, 100)]
     silent = [row for row, change in enumerate(changes) if change != NO_CHANGE]
     assert silent == list(range(len(silent)))
@@ -122,14 +122,14 @@ def test_a_plant_that_goes_on_ten_times_slower_is_taken_as_it_is_after_a_few_row
 
 
 def test_nothing_is_silent_before_the_usual_spacing_is_known() -> None:
-    assert heard(20).update(10_000 * PERIOD, present=True) == NO_CHANGE
-    assert heard(20).due_ns() is None
+    assert trained_timeout(20).update(10_000 * PERIOD, present=True) == NO_CHANGE
+    assert trained_timeout(20).due_ns() is None
     assert DataTimeout().due_ns() is None
 
 
 def test_when_nothing_happens_it_is_nothing_itself_that_is_returned() -> None:
     """Whoever asks for it by identity is right."""
-    silence = heard(100)
+    silence = trained_timeout(100)
     assert silence.update(100 * PERIOD, present=True) is NO_CHANGE
     assert silence.update(101 * PERIOD, present=False) is NO_CHANGE
     assert silence.update(0, present=True) is NO_CHANGE
@@ -141,7 +141,7 @@ def test_when_nothing_happens_it_is_nothing_itself_that_is_returned() -> None:
 
 @pytest.mark.parametrize("speed", [1.0, 0.5])
 def test_a_plant_from_which_nothing_comes_is_silent_after_five_periods_of_receipt_time(speed: float) -> None:
-    silence = heard(100, speed=speed)
+    silence = trained_timeout(100, speed=speed)
     due_ns = silence.due_ns()
     assert due_ns == 104 * PERIOD / speed
     assert silence.check(due_ns - 1) == NO_CHANGE
@@ -149,13 +149,13 @@ def test_a_plant_from_which_nothing_comes_is_silent_after_five_periods_of_receip
 
 
 def test_a_plant_that_runs_fast_is_given_the_least_time() -> None:
-    silence = heard(100, speed=600.0)  # a row every 10 ms
+    silence = trained_timeout(100, speed=600.0)  # a row every 10 ms
     assert silence.due_ns() == 99 * PERIOD / 600 + LEAST_S * 1e9
 
 
 def test_a_silence_is_asked_for_once_and_then_waited_out() -> None:
     """`on_tick` is called when something is due: after the alarm nothing may be, or the loop would spin."""
-    silence = heard(100)
+    silence = trained_timeout(100)
     due_ns = silence.due_ns()
     assert due_ns is not None
     silence.check(due_ns)
@@ -163,8 +163,8 @@ def test_a_silence_is_asked_for_once_and_then_waited_out() -> None:
     assert silence.check(10**16) == NO_CHANGE
 
 
-def test_a_live_run_and_a_replay_tell_of_a_silence_with_the_same_times() -> None:
-    live, replay = heard(100), heard(100, speed=1e6)
+def test_a_live_run_and_a_replay_report_a_silence_with_the_same_times() -> None:
+    live, replay = trained_timeout(100), trained_timeout(100, speed=1e6)
     said = [live.check(150 * PERIOD)]
     live.on_receipt(200 * PERIOD)
     said.append(live.update(200 * PERIOD, present=True))
@@ -174,7 +174,7 @@ def test_a_live_run_and_a_replay_tell_of_a_silence_with_the_same_times() -> None
 
 
 def test_rows_that_the_transport_held_up_end_the_silence_and_leave_none_in_a_replay() -> None:
-    live, replay = heard(100), heard(100, speed=1e6)
+    live, replay = trained_timeout(100), trained_timeout(100, speed=1e6)
     raised_ns = live.check(150 * PERIOD).raised_ns
     assert live.update(100 * PERIOD, present=True) == Change(None, raised_ns)
     assert [live.update(row * PERIOD, present=True) for row in range(101, 150)] == [NO_CHANGE] * 49
@@ -194,7 +194,7 @@ def test_samples_that_arrive_in_bursts_are_waited_for_between_them() -> None:
 
 
 def test_a_receipt_clock_that_is_set_back_is_followed_from_there() -> None:
-    silence = heard(100)
+    silence = trained_timeout(100)
     silence.on_receipt(-(10**15))
     assert silence.due_ns() == -(10**15) + 5 * PERIOD
 
@@ -203,7 +203,7 @@ def test_a_receipt_clock_that_is_set_back_is_followed_from_there() -> None:
 
 
 @pytest.mark.parametrize("cut", [0, 1, 7, 30, 52, 75])
-def test_it_goes_on_from_its_stored_state_as_if_it_had_never_stopped(cut: int) -> None:
+def test_it_resumes_from_its_stored_state_as_if_it_had_never_stopped(cut: int) -> None:
     rows = [*range(50), *range(70, 100)]
 
     def step(silence: DataTimeout, row: int) -> Change:
@@ -218,7 +218,7 @@ def test_it_goes_on_from_its_stored_state_as_if_it_had_never_stopped(cut: int) -
 
 
 def test_a_monitor_that_was_down_does_not_call_the_plant_silent_for_it() -> None:
-    resumed = resume(heard(100))
+    resumed = resume(trained_timeout(100))
     assert resumed.due_ns() is None
     resumed.on_receipt(10**15)
     assert resumed.due_ns() == 10**15 + 5 * PERIOD
@@ -239,7 +239,7 @@ def test_settings_that_make_no_rule_are_refused(limit: float, least_s: float, te
 
 def test_what_comes_in_a_burst_after_a_cut_shortens_no_patience() -> None:
     """A minute of rows that were held up comes within a tenth of a second."""
-    silence, plain = heard(100), heard(100)
+    silence, plain = trained_timeout(100), trained_timeout(100)
     end_ns = 100 * PERIOD
     for row in range(200):
         silence.on_receipt(end_ns + row * 500_000)
@@ -249,8 +249,8 @@ def test_what_comes_in_a_burst_after_a_cut_shortens_no_patience() -> None:
     assert due_ns - (end_ns + 199 * 500_000) >= 0.99 * (usual_ns - 99 * PERIOD)
 
 
-def test_a_plant_that_goes_on_faster_is_waited_for_less_after_a_while() -> None:
-    silence = heard(100)
+def test_a_plant_that_resumes_faster_gets_a_shorter_timeout_after_a_while() -> None:
+    silence = trained_timeout(100)
     for row in range(3000):
         silence.on_receipt(100 * PERIOD + row * PERIOD // 100)
     due_ns = silence.due_ns()
@@ -258,9 +258,9 @@ def test_a_plant_that_goes_on_faster_is_waited_for_less_after_a_while() -> None:
     assert due_ns - (100 * PERIOD + 2999 * PERIOD // 100) <= 1.01 * LEAST_S * 1e9
 
 
-def test_who_was_frozen_himself_or_whose_clock_was_set_does_not_blame_the_plant() -> None:
-    """He looks an hour late; if nothing comes then, he tells it in its time."""
-    silence = heard(100)
+def test_a_monitor_that_was_frozen_or_had_its_clock_set_does_not_blame_the_plant() -> None:
+    """The check runs an hour late; if nothing arrives after it, the alarm is raised in due time."""
+    silence = trained_timeout(100)
     due_ns = silence.due_ns()
     assert due_ns is not None
     late_ns = due_ns + 3600 * 10**9

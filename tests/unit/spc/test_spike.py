@@ -45,7 +45,7 @@ def test_what_is_withheld_and_what_was_a_spike(values: list[float], expected: st
     assert story([-z for z in values]) == expected
 
 
-def test_a_spike_is_told_with_its_size_when_the_next_value_is_back() -> None:
+def test_a_spike_is_reported_with_its_size_when_the_next_value_is_back() -> None:
     spike = Spike(LIMIT)
     sizes = [spike.update(z).size for z in (0.0, 12.5, 0.3, -7.0, 0.1)]
     assert sizes == [0.0, 0.0, 12.5, 0.0, -7.0]
@@ -105,7 +105,7 @@ def test_values_about_a_new_level_are_no_spikes_while_an_alarm_stands(level: flo
 
 
 @pytest.mark.parametrize("level", [-20.0, 0.0, 5.0])
-def test_a_spike_beside_the_new_level_is_told_with_its_distance_from_it(level: float) -> None:
+def test_a_spike_beside_the_new_level_is_reported_with_its_distance_from_it(level: float) -> None:
     spike, noise = Spike(LIMIT), np.random.default_rng(8)
     for z in noise.normal(size=40).tolist():
         assert not spike.update(level + z, is_moved=True).spike
@@ -204,7 +204,7 @@ def test_a_limit_that_is_none_is_refused(limit: float) -> None:
 
 
 @given(st.lists(st.tuples(st.floats(-20, 20), st.booleans()), max_size=60), st.integers(0, 60))
-def test_it_goes_on_from_its_stored_state_as_if_it_had_never_stopped(
+def test_it_resumes_from_its_stored_state_as_if_it_had_never_stopped(
     values: list[tuple[float, bool]], cut: int
 ) -> None:
     through, stopped = Spike(LIMIT), Spike(LIMIT)

@@ -94,7 +94,7 @@ def test_missing_samples_between_equal_readings_do_not_excuse_them() -> None:
     assert stuck.update(3.0).out
 
 
-def test_after_a_restart_equal_readings_are_counted_anew() -> None:
+def test_after_a_restart_the_count_of_equal_readings_starts_again() -> None:
     noise = np.random.default_rng(1).normal(size=1020).tolist()
     stuck = trained(np.array(noise[:1000]))
     for _ in range(4):
@@ -150,7 +150,7 @@ def test_a_coarse_signal_that_hardly_steps_any_more_has_come_to_rest() -> None:
     assert not any(stuck.update(value).out for value in resting.tolist())
 
 
-def test_a_plant_without_noise_that_begins_anew_at_rest_is_not_stuck() -> None:
+def test_a_plant_without_noise_that_restarts_at_rest_is_not_stuck() -> None:
     stuck = trained(np.sin(np.arange(1000.0)))
     assert stuck.limit == SMALLEST - 1.0
     stuck.memory.restart()

@@ -22,39 +22,39 @@ class Desk:
     """A board with alarms of charts whose centre is 0 and whose limits are -3 and 3.
 
     Attributes:
-        said: everything published so far.
+        published: everything published so far.
     """
 
     def __init__(self, config: MonitorConfig = AT_ONCE, signals: tuple[str, ...] = ("C", "T")) -> None:
         self.board = Annunciator(config)
         self.alarms = {signal: self.board.declare("shewhart", signal) for signal in signals}
-        self.said: list[Publication] = []
+        self.published: list[Publication] = []
 
     def point(self, minutes: float, **values: float) -> None:
         """A row: the statistic of each signal named."""
         for signal, value in values.items():
             judgement = Judgement(value, 0.0, -3.0, 3.0, abs(value) > 3.0)
             self.judge(self.alarms[signal], minutes, judgement)
-        self.said += self.board.end_row(to_time_ns(minutes))
+        self.published += self.board.end_row(to_time_ns(minutes))
 
     def judge(self, alarm: ChartAlarm, minutes: float, judgement: Judgement) -> None:
         """A point of an alarm's chart."""
         raised = alarm.update(judgement)
         if raised is not None:
             explanation = Explanation(f"{alarm.name} is out", {}) if raised else None
-            self.said += self.board.apply(to_time_ns(minutes), [AlarmChange(alarm, judgement, "K", explanation)])
+            self.published += self.board.apply(to_time_ns(minutes), [AlarmChange(alarm, judgement, "K", explanation)])
 
-    def told(self, kind: type[M]) -> list[M]:
+    def messages(self, kind: type[M]) -> list[M]:
         """The messages of a kind."""
-        return [item.message for item in self.said if isinstance(item.message, kind)]
+        return [item.message for item in self.published if isinstance(item.message, kind)]
 
     def changes(self) -> list[tuple[str, str]]:
         """(alarm, event) of every change."""
-        return [(alarm.alarm, alarm.event) for alarm in self.told(Alarm)]
+        return [(alarm.alarm, alarm.event) for alarm in self.messages(Alarm)]
 
     def figures(self) -> AlarmKpis:
-        """The last that were told."""
-        return self.told(AlarmKpis)[-1]
+        """The newest KPIs."""
+        return self.messages(AlarmKpis)[-1]
 
     def alarm(self, signal: str = "T") -> ChartAlarm:
         """The alarm of a signal."""

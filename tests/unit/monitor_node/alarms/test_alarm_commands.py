@@ -1,4 +1,4 @@
-"""What people ask of the alarms on the bus: done and told, or refused in one line with nothing changed."""
+"""Operators' alarm commands on the bus: done and published, or refused in one line with nothing changed."""
 
 import gc
 import shutil
@@ -8,9 +8,9 @@ import pytest
 from google.protobuf.message import Message
 from msgspec.structs import replace
 
-from monitor_node.__main__ import MonitorNode
 from monitor_node.alarms.commands import COMMANDS
 from monitor_node.config import MonitorConfig
+from monitor_node.node import MonitorNode
 from plant_node.node import COMMANDS as PLANT_COMMANDS
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode_message
 from reactorwatch.contract.messages_pb2 import (
@@ -48,7 +48,7 @@ def alarmed(leak: list[Encoded]) -> bytes:
     node = MonitorNode(CONFIG, 0)
     for message in leak:
         node.on_message(message, 0)
-    return node.to_bytes()
+    return node.monitor(PLANT).to_bytes()
 
 
 class Room:
@@ -59,24 +59,24 @@ class Room:
         state: state that the monitor resumes from; empty: it starts without one.
 
     Attributes:
-        said: what the monitor published because of commands.
+        published: what the monitor published because of commands.
     """
 
     def __init__(self, config: MonitorConfig, state: bytes = b"") -> None:
         self.node = MonitorNode(config, 0)
         if state:
-            self.node.from_bytes(state)
-        self.said: list[Publication] = []
+            self.node.monitor(PLANT).from_bytes(state)
+        self.published: list[Publication] = []
         self._operator = MemoryBus(Exchange())
         self._operator.declare_queryable(f"reactor/{PLANT}/command/*", self._answer)
 
-    def hear(self, messages: list[Encoded]) -> list[Publication]:
+    def receive(self, messages: list[Encoded]) -> list[Publication]:
         """Samples come."""
         return [item for message in messages for item in self.node.on_message(message, 0)]
 
     def ask(self, name: str, message: Message) -> CommandReply:
         """A person asks."""
-        self.said.clear()
+        self.published.clear()
         question = Encoded(f"reactor/{PLANT}/command/{name}", *encode_message(message))
         (answer,) = self._operator.query(question, 1.0)
         reply = decode(answer.payload, answer.encoding)
@@ -85,7 +85,8 @@ class Room:
 
     def _answer(self, request: Request) -> None:
         reply, publications = self.node.on_command(request.question, 0)
-        self.said += publications
+        assert reply is not None
+        self.published += publications
         request.reply(reply)
 
 
@@ -103,13 +104,13 @@ def by_anna(alarm: str = "shewhart/T", comment: str = "") -> AlarmCommand:
     return AlarmCommand(alarm=alarm, by="Anna", comment=comment)
 
 
-def test_an_alarm_that_is_acknowledged_is_told_at_the_time_of_the_newest_sample(room: Room) -> None:
+def test_an_acknowledged_alarm_is_published_at_the_time_of_the_newest_sample(room: Room) -> None:
     reply = room.ask("acknowledge", by_anna(comment="seen"))
     assert (reply.accepted, reply.text) == (True, "alarm shewhart/T: acknowledge by Anna")
-    alarm, figures = (item.message for item in room.said)
+    alarm, figures = (item.message for item in room.published)
     assert isinstance(alarm, Alarm)
     assert isinstance(figures, AlarmKpis)
-    assert [item.key for item in room.said] == ["reactor/cstr/alarm/shewhart/T", "reactor/cstr/alarm_kpis/monitor"]
+    assert [item.key for item in room.published] == ["reactor/cstr/alarm/shewhart/T", "reactor/cstr/alarm_kpis/monitor"]
     assert alarm.time_ns == to_time_ns(END_MIN)
     assert alarm.state == AlarmState.ALARM_STATE_ACKNOWLEDGED
     assert (alarm.event, alarm.by, alarm.comment) == ("acknowledge", "Anna", "seen")
@@ -138,14 +139,14 @@ def test_a_comment_changes_nothing_but_the_comment(room: Room) -> None:
     before = listed(room)["shewhart/T"]
     reply = room.ask("comment", by_anna(comment="valve is stiff"))
     assert (reply.alarms[0].state, reply.alarms[0].comment) == (before.state, "valve is stiff")
-    assert [type(item.message) for item in room.said] == [Alarm]
+    assert [type(item.message) for item in room.published] == [Alarm]
 
 
 def test_the_list_has_every_alarm_and_publishes_nothing(room: Room) -> None:
     reply = room.ask("list_alarms", ListAlarms())
     assert [alarm.alarm for alarm in reply.alarms][:5] == ["shewhart/C", "shewhart/T", "ewma/C", "ewma/T", "mewma/all"]
     assert {alarm.alarm.split("/")[0] for alarm in reply.alarms[5:]} == {"silence", "stuck", "range", "spike", "shift"}
-    assert room.said == []
+    assert room.published == []
 
 
 def test_one_command_acknowledges_every_alarm_of_an_incident(room: Room) -> None:
@@ -164,13 +165,13 @@ def test_one_command_acknowledges_every_alarm_of_an_incident(room: Room) -> None
 def test_an_incident_is_published_as_single_acknowledgements_of_its_alarms(room: Room, alarmed: bytes) -> None:
     """So a recording of it is replayed from the alarms alone."""
     room.ask("acknowledge", AlarmCommand(incident=1, by="Anna"))
-    names = [item.message.alarm for item in room.said if isinstance(item.message, Alarm)]
+    names = [item.message.alarm for item in room.published if isinstance(item.message, Alarm)]
     singly = Room(CONFIG, alarmed)
     published = []
     for name in names:
         singly.ask("acknowledge", by_anna(name))
-        published += singly.said
-    assert room.said == published
+        published += singly.published
+    assert room.published == published
 
 
 def test_an_alarm_that_is_acknowledged_is_left_out_of_its_incident(room: Room) -> None:
@@ -212,13 +213,13 @@ REFUSED: list[tuple[str, Message, str]] = [
 def test_what_cannot_be_done_is_refused_in_one_line_and_changes_nothing(
     room: Room, name: str, message: Message, text: str
 ) -> None:
-    before = room.node.alarms.memory.to_bytes()
+    before = room.node.monitor(PLANT).alarms.memory.to_bytes()
     reply = room.ask(name, message)
     assert not reply.accepted
     assert reply.text.startswith(text)
     assert "\n" not in reply.text
-    assert room.said == []
-    assert room.node.alarms.memory.to_bytes() == before
+    assert room.published == []
+    assert room.node.monitor(PLANT).alarms.memory.to_bytes() == before
     (health,) = room.node.on_tick(1)
     assert isinstance(health.message, Health)
     assert health.message.refused == 1
@@ -237,10 +238,11 @@ def test_a_flood_of_commands_is_refused_counted_and_written_nowhere(
     assert {reply.text for reply in replies if not reply.accepted} == {
         "too many commands by 'Anna': 30 at once and 5 a second are taken; try again in a second"
     }
-    assert room.node.rejects.by_reason == {"too_many_commands": 3000 - len(obeyed)}
+    assert room.node.monitor(PLANT).rejects.by_reason == {"too_many_commands": 3000 - len(obeyed)}
     assert room.ask("comment", AlarmCommand(alarm="shewhart/T", by="Ben", comment="mine")).accepted
     question = Encoded(f"reactor/{PLANT}/command/comment", *encode_message(by_anna(comment="a second later")))
     reply, _ = room.node.on_command(question, 1_000_000_000)
+    assert reply is not None
     assert reply.accepted
 
 
@@ -265,11 +267,11 @@ def test_the_plant_and_the_monitor_share_no_command() -> None:
     assert not set(COMMANDS) & set(PLANT_COMMANDS)
 
 
-def test_what_was_said_survives_a_restart(tmp_path: Path, leak: list[Encoded]) -> None:
+def test_alarm_states_survive_a_restart(tmp_path: Path, leak: list[Encoded]) -> None:
     """The first monitor was killed, and the second has other settings: it has the alarms, and trains."""
     config = replace(CONFIG, state_file=str(tmp_path / "monitor.state"))
     first = Room(config)
-    first.hear(leak)
+    first.receive(leak)
     first.ask("acknowledge", by_anna(comment="seen"))
     first.ask("shelve", ShelveAlarm(alarm="shewhart/C", by="Ben", minutes=5.0))
     del first
@@ -280,10 +282,10 @@ def test_what_was_said_survives_a_restart(tmp_path: Path, leak: list[Encoded]) -
     assert (t.state, t.by, t.comment, t.incident) == (AlarmState.ALARM_STATE_ACKNOWLEDGED, "Anna", "seen", 1)
     assert (c.state, c.shelved_until_ns) == (AlarmState.ALARM_STATE_SHELVED, to_time_ns(END_MIN + 5))
     time_min, columns = leaking_run(0.0, 1.0, 10.0, seed=1)
-    said = second.hear(list(samples(time_min + END_MIN, columns)))
+    said = second.receive(list(samples(time_min + END_MIN, columns)))
     (back,) = [item.message for item in said if isinstance(item.message, Alarm) and item.message.alarm == c.alarm]
     assert (back.alarm, back.event, back.time_ns) == ("shewhart/C", "shelf time over", to_time_ns(END_MIN + 5))
-    assert second.node.phase == "training"
+    assert second.node.monitor(PLANT).phase == "training"
 
 
 def test_a_file_in_no_folder_is_refused_at_the_start(tmp_path: Path) -> None:

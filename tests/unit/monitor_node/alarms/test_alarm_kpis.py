@@ -63,7 +63,7 @@ def test_priorities_and_states_are_counted() -> None:
     raise_at(desk, 0, 1)
     desk.point(2, T=OUT, C=OUT)
     assert desk.figures().unacknowledged == 2
-    desk.said += desk.board.shelve("shewhart/C", 5.0, "Anna", "")
+    desk.published += desk.board.shelve("shewhart/C", 5.0, "Anna", "")
     figures = desk.figures()
     counts = {Priority.Name(item.priority): (item.raised, item.standing) for item in figures.priorities}
     assert counts == {
@@ -76,11 +76,11 @@ def test_priorities_and_states_are_counted() -> None:
     assert figures.incidents == 1
 
 
-def test_they_are_told_at_each_minute_and_at_each_change() -> None:
+def test_they_are_published_at_each_minute_and_at_each_change() -> None:
     desk = Desk()
     for row in range(30):
         desk.point(row / 10, T=OUT if row == 14 else IN)
-    times = [item.time_ns for item in desk.told(AlarmKpis)]
+    times = [item.time_ns for item in desk.messages(AlarmKpis)]
     assert times == [to_time_ns(minute) for minute in (0, 1, 1.4, 1.5, 2)]
 
 

@@ -43,7 +43,7 @@ def test_without_dead_band_the_off_delay_alone_rides_over_short_returns() -> Non
     desk = Desk(msgspec.structs.replace(AT_ONCE, dead_band=0.0, clear_count=3))
     for row, letter in enumerate("x..x..x...x"):
         desk.point(row, T=OUT if letter == "x" else IN)
-    assert [alarm.time_ns // to_time_ns(1.0) for alarm in desk.told(Alarm)] == [0, 9, 10]
+    assert [alarm.time_ns // to_time_ns(1.0) for alarm in desk.messages(Alarm)] == [0, 9, 10]
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -82,7 +82,9 @@ def test_an_alarm_long_after_the_last_change_is_an_incident_of_its_own() -> None
         (137, {"C": OUT}),  # 31 min after it, though T stands
     ):
         desk.point(minute, **values)
-    told = [(alarm.alarm[-1], alarm.incident, alarm.first_in) for alarm in desk.told(Alarm) if alarm.event == "raised"]
+    told = [
+        (alarm.alarm[-1], alarm.incident, alarm.first_in) for alarm in desk.messages(Alarm) if alarm.event == "raised"
+    ]
     assert told == [("T", 1, True), ("C", 1, False), ("C", 1, False), ("C", 2, True)]
 
 
@@ -117,7 +119,7 @@ def test_a_clock_that_is_set_back_begins_a_new_incident() -> None:
     desk = Desk()
     desk.point(100, T=OUT)
     desk.point(10, C=OUT)
-    assert [alarm.incident for alarm in desk.told(Alarm)] == [1, 2]
+    assert [alarm.incident for alarm in desk.messages(Alarm)] == [1, 2]
 
 
 def test_an_incident_is_published_with_each_change_of_it_and_only_then() -> None:
@@ -128,13 +130,13 @@ def test_an_incident_is_published_with_each_change_of_it_and_only_then() -> None
     desk.point(2.0, C=OUT)  # suspects and a second alarm: one message
     desk.board.set_suspects([SuspectedCause("coolant_flow", 0.9)])
     desk.point(3.0, C=OUT)  # the same suspects again
-    desk.said += desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Anna", "")  # C is unacknowledged still
-    desk.said += desk.board.act("shewhart/C", Event.ACKNOWLEDGE, "Anna", "")
+    desk.published += desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Anna", "")  # C is unacknowledged still
+    desk.published += desk.board.act("shewhart/C", Event.ACKNOWLEDGE, "Anna", "")
     desk.point(4.0, T=IN)
     desk.point(5.0, C=IN)
     published = [
         (item.time_ns, list(item.alarms), [s.cause for s in item.suspects], item.state, item.until_ns)
-        for item in desk.told(Incident)
+        for item in desk.messages(Incident)
     ]
     first, both = ["shewhart/T"], ["shewhart/T", "shewhart/C"]
     assert published == [
@@ -143,8 +145,8 @@ def test_an_incident_is_published_with_each_change_of_it_and_only_then() -> None
         (to_time_ns(3.0), both, ["coolant_flow"], AlarmState.ALARM_STATE_ACKNOWLEDGED, 0),
         (to_time_ns(5.0), both, ["coolant_flow"], AlarmState.ALARM_STATE_NORMAL, to_time_ns(5.0)),
     ]
-    assert {(item.number, item.since_ns) for item in desk.told(Incident)} == {(1, to_time_ns(0.5))}
-    keys = {item.key for item in desk.said if isinstance(item.message, Incident)}
+    assert {(item.number, item.since_ns) for item in desk.messages(Incident)} == {(1, to_time_ns(0.5))}
+    keys = {item.key for item in desk.published if isinstance(item.message, Incident)}
     assert keys == {"reactor/cstr/incident/1"}
 
 
@@ -156,7 +158,7 @@ def test_the_suspects_of_an_alarm_are_those_of_its_incident_at_its_own_changes()
     desk.board.set_suspects([SuspectedCause("feed_flow", 0.7)])
     desk.point(2.0, T=IN)
     desk.point(3.0, C=OUT)
-    published = [(item.alarm, item.event, [s.cause for s in item.suspects]) for item in desk.told(Alarm)]
+    published = [(item.alarm, item.event, [s.cause for s in item.suspects]) for item in desk.messages(Alarm)]
     assert published == [
         ("shewhart/T", "raised", []),
         ("shewhart/C", "raised", ["coolant_flow"]),
@@ -173,8 +175,8 @@ def test_an_incident_that_a_later_one_follows_keeps_its_suspects_and_is_publishe
     desk.point(60.0, T=OUT, C=OUT)
     desk.board.set_suspects([SuspectedCause("feed_flow", 0.7)])
     desk.point(61.0, T=IN)
-    desk.said += desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Anna", "")
-    newest = {item.number: item for item in desk.told(Incident)}
+    desk.published += desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Anna", "")
+    newest = {item.number: item for item in desk.messages(Incident)}
     assert [s.cause for s in newest[1].suspects] == ["coolant_flow"]
     assert [s.cause for s in newest[2].suspects] == ["feed_flow"]
     assert (newest[1].until_ns, newest[1].state) == (to_time_ns(61.0), AlarmState.ALARM_STATE_NORMAL)
@@ -195,22 +197,22 @@ def test_a_shelf_ends_with_its_time_and_a_standing_alarm_comes_up_again() -> Non
     desk.point(9.9, T=OUT)
     assert desk.alarm().memory.state is State.SHELVED
     desk.point(10.0, T=OUT)
-    last = desk.told(Alarm)[-1]
+    last = desk.messages(Alarm)[-1]
     assert (last.event, last.state) == ("shelf time over", AlarmState.ALARM_STATE_UNACKNOWLEDGED)
     assert (last.incident, last.by, last.comment, last.shelved_until_ns) == (1, "Anna", "known", 0)
 
 
-def test_what_happens_out_of_sight_is_told_and_counts_when_it_comes_up() -> None:
+def test_changes_of_a_suppressed_alarm_are_published_and_count_when_it_returns() -> None:
     desk = Desk()
     desk.point(0, T=IN)
     desk.board.act("shewhart/T", Event.SUPPRESS, "Anna", "start-up")
     desk.point(1, T=OUT)
-    hidden = desk.told(Alarm)[-1]
+    hidden = desk.messages(Alarm)[-1]
     assert (hidden.event, hidden.state, hidden.incident) == ("raised", AlarmState.ALARM_STATE_SUPPRESSED_BY_DESIGN, 0)
     assert hidden.comment == "start-up"
     assert desk.figures().alarms_10min == 0
-    desk.said += desk.board.act("shewhart/T", Event.UNSUPPRESS, "Anna", "")
-    shown = desk.told(Alarm)[-1]
+    desk.published += desk.board.act("shewhart/T", Event.UNSUPPRESS, "Anna", "")
+    shown = desk.messages(Alarm)[-1]
     assert (shown.state, shown.incident, shown.first_in) == (AlarmState.ALARM_STATE_UNACKNOWLEDGED, 1, True)
     assert (shown.time_ns, shown.raised_ns) == (to_time_ns(1.0), to_time_ns(1.0))
     assert desk.figures().alarms_10min == 1
@@ -229,9 +231,9 @@ def test_a_new_occurrence_carries_no_name_from_the_last_one() -> None:
     desk.point(0, T=OUT)
     desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Anna", "seen")
     desk.point(1, T=IN)
-    assert (desk.told(Alarm)[-1].state, desk.told(Alarm)[-1].by) == (AlarmState.ALARM_STATE_NORMAL, "Anna")
+    assert (desk.messages(Alarm)[-1].state, desk.messages(Alarm)[-1].by) == (AlarmState.ALARM_STATE_NORMAL, "Anna")
     desk.point(2, T=OUT)
-    assert (desk.told(Alarm)[-1].by, desk.told(Alarm)[-1].comment) == ("", "")
+    assert (desk.messages(Alarm)[-1].by, desk.messages(Alarm)[-1].comment) == ("", "")
 
 
 # --- over a restart ------------------------------------------------------------------------------------------
@@ -257,16 +259,16 @@ def test_a_change_that_an_error_kept_from_being_applied_is_found_again() -> None
     assert desk.alarm().update(out) is True
     again = desk.board.declare("shewhart", "T")  # as the pipeline does that is made after the error
     assert again.update(out) is True
-    desk.said += desk.board.apply(to_time_ns(1.0), [AlarmChange(again, out, "K", Explanation("out", {}))])
+    desk.published += desk.board.apply(to_time_ns(1.0), [AlarmChange(again, out, "K", Explanation("out", {}))])
     assert desk.changes() == [("shewhart/T", "raised")]
     assert desk.board.declare("shewhart", "T").update(out) is None, "one that is active is not raised again"
 
 
-def test_a_board_that_was_stored_goes_on_as_if_nothing_had_happened() -> None:
+def test_a_stored_annunciator_resumes_as_if_it_had_never_stopped() -> None:
     stayed, gone = busy_desk(), busy_desk()
     back = Desk()
     back.board.restore(stored(gone))
-    stayed.said.clear()
+    stayed.published.clear()
     rows: list[tuple[float, dict[str, float]]] = [
         (2, {"T": OUT, "C": OUT}),
         (30.9, {"T": IN}),
@@ -282,10 +284,10 @@ def test_a_board_that_was_stored_goes_on_as_if_nothing_had_happened() -> None:
         ("shewhart/T", "raised"),
         ("shewhart/C", "cleared"),
     ]
-    assert [encode(item) for item in stayed.said if isinstance(item.message, Alarm)] == [
-        encode(item) for item in back.said if isinstance(item.message, Alarm)
+    assert [encode(item) for item in stayed.published if isinstance(item.message, Alarm)] == [
+        encode(item) for item in back.published if isinstance(item.message, Alarm)
     ]
-    assert encode(stayed.said[-1]) == encode(back.said[-1])
+    assert encode(stayed.published[-1]) == encode(back.published[-1])
     assert stayed.board.memory.to_bytes() == back.board.memory.to_bytes()
 
 
@@ -296,7 +298,7 @@ def test_figures_of_each_minute_carry_its_time_and_follow_what_time_alone_change
     desk.point(3.0, T=5.0)
     for minute in (*range(4, 30), 24 * 60 + 3, 24 * 60 + 4):
         desk.point(float(minute))
-    figures = {item.time_ns: item for item in desk.told(AlarmKpis)}
+    figures = {item.time_ns: item for item in desk.messages(AlarmKpis)}
     assert list(figures) == [to_time_ns(minute) for minute in (*range(30), 24 * 60 + 3, 24 * 60 + 4)]
     assert [figures[to_time_ns(minute)].alarms_10min for minute in (2, 3, 12, 13)] == [0, 1, 1, 0]
     assert [list(figures[to_time_ns(minute)].stale) for minute in (24 * 60 + 3, 24 * 60 + 4)] == [[], ["shewhart/T"]]

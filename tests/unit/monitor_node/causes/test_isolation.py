@@ -75,7 +75,7 @@ def test_gross_faults_are_named_after_twenty_minutes(isolation: Isolation) -> No
     ("cause", "size", "noticed"),
     [("temperature_bias", 0.55, 1.0), ("concentration_bias", -0.0036, 1.0), ("coolant_flow", -0.01, 1.0)],
 )
-def test_small_faults_of_sensor_and_process_are_told_apart(
+def test_small_faults_of_sensor_and_process_are_distinguished(
     isolation: Isolation, cause: str, size: float, noticed: float
 ) -> None:
     """Two standard deviations of the sensor, and a hundredth of the coolant."""
@@ -99,7 +99,7 @@ def test_causes_that_imitate_each_other_share_the_probability(isolation: Isolati
     assert max(shares) < 0.8
 
 
-def test_a_drift_is_told_from_a_step(isolation: Isolation) -> None:
+def test_a_drift_is_distinguished_from_a_step(isolation: Isolation) -> None:
     fault = f"temperature_bias:ramp:5@{ONSET_MIN}min,end={ONSET_MIN + 50}min"
     suspects = suspects_of(isolation, rows_of(fault, seed=3, after_min=20.0))
     found = suspects[0]

@@ -1,4 +1,4 @@
-"""A look for causes stops at a budget of filter steps, whatever the sensors show, and says so."""
+"""A search for causes stops at a budget of filter steps, whatever the sensors show, and reports it."""
 
 import math
 from collections.abc import Iterator
@@ -109,7 +109,7 @@ def test_no_run_of_bad_values_fails_or_exceeds_the_budget_and_a_restart_over_it_
     assert max(looks, default=0) <= limit + STEPS_PER_SEARCH + max(STEPS_PER_RUN, CONFIG.isolation_rows)
 
 
-def test_a_look_that_stopped_names_no_cause_and_the_incident_says_so(
+def test_a_search_that_stopped_names_no_cause_and_the_incident_states_it(
     run: list[Encoded], trained: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Twenty rows of 700 K, with 20,000 steps: few values exceed the full budget."""

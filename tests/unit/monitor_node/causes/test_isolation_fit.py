@@ -109,7 +109,7 @@ def test_a_drift_that_has_ended_is_a_ramp_of_its_final_size() -> None:
     assert best.parameters[2] == pytest.approx(ONSET_MIN + 5.0, abs=0.5)
 
 
-def test_a_ramp_that_goes_on_and_a_step_have_no_end() -> None:
+def test_an_ongoing_ramp_and_a_step_have_no_end() -> None:
     for fault, profile in (
         (f"temperature_bias:ramp:6@{ONSET_MIN}min,end={ONSET_MIN + 40.0}min", Ramp),
         ("temperature_bias:step:3", Step),

@@ -89,7 +89,7 @@ def test_looks_follow_until_their_last_and_rows_are_kept_as_long(leak: list[Row]
     assert kept_rows(search) == CONFIG.isolation_rows
 
 
-def test_late_looks_name_what_early_ones_cannot_and_a_resumed_search_says_the_same(leak: list[Row]) -> None:
+def test_late_looks_name_what_early_ones_cannot_and_a_resumed_search_gives_the_same_result(leak: list[Row]) -> None:
     """A leak of 4 % is a large fault: looks resume from the progress of those before."""
     first, board = suspicion()
     feed(first, leak[:ALARM])

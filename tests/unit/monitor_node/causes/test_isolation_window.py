@@ -1,4 +1,4 @@
-"""What counts of the rows: since the last gap, without what nothing confirms."""
+"""Rows that enter the isolation: those since the last gap, without unconfirmed ones."""
 
 from math import nan
 

@@ -1,4 +1,4 @@
-"""A sensor that is wrong is told what it should read."""
+"""Reconstruction of the value that a faulty sensor should read."""
 
 from math import isnan, nan
 
@@ -58,7 +58,7 @@ def test_of_a_plant_that_the_model_describes_it_is_exact(fault: str, place: int,
 @pytest.mark.parametrize(
     ("fault", "place", "size"), [("temperature_bias:step:3", 1, 3.0), ("concentration_bias:step:0.02", 0, 0.02)]
 )
-def test_of_a_noisy_process_it_is_as_wrong_as_it_says(fault: str, place: int, size: float) -> None:
+def test_of_a_noisy_process_its_error_matches_its_standard_deviation(fault: str, place: int, size: float) -> None:
     """Errors last for a minute: 600 rows are worth some 60, and within the 1e-4 quantiles of chi-square of as many."""
     noise = NoiseLevels((0.002, 0.3), (NOISY["C"], NOISY["T"]))
     measured, value, sd = reconstructed(fault, place, noise, 2, process_noise_sd=NOISY)
@@ -88,7 +88,7 @@ def test_it_leaves_the_sensor_out_some_time_before_the_onset_that_was_found() ->
     assert one.update(*row) == other.update(*row)
 
 
-def test_a_missing_input_is_as_it_was_and_without_any_nothing_is_said() -> None:
+def test_a_missing_input_keeps_its_value_and_without_any_nothing_is_reconstructed() -> None:
     reconstruction = reconstruction_of(SENSORS, 1)
     assert all(isnan(item) for item in reconstruction.update(0.0, (nan,), (0.1, 440.0)))
     assert all(isnan(item) for item in reconstruction.update(0.1, (100.0,), (0.1, 440.0)))

@@ -1,4 +1,4 @@
-"""After an alarm its cause is named, as data come, and what a faulty sensor should read is told."""
+"""After an alarm its cause is named as data arrive, and the true value of a faulty sensor is published."""
 
 import numpy as np
 import pytest
@@ -93,7 +93,7 @@ def test_suspects_change_at_looks_alone_and_alarms_that_come_later_have_them(
         "temperature_bias:step:-25",
     ],
 )
-def test_whatever_happens_to_the_plant_the_monitor_goes_on_and_says_what_it_knows(specification: str) -> None:
+def test_whatever_happens_to_the_plant_the_monitor_continues_and_publishes_what_it_knows(specification: str) -> None:
     """Gross faults, some of which put the reactor out: no cause may be followed through them."""
     run, _ = run_of(specification, seed=7)
     told = run.suspected
@@ -127,10 +127,10 @@ def test_a_replay_names_the_same_causes_bit_for_bit(leaking: Watched) -> None:
     assert [item.SerializeToString() for item in again.alarms] == [item.SerializeToString() for item in leaking.alarms]
 
 
-def test_what_a_biased_thermometer_should_read_is_told_and_is_right() -> None:
+def test_the_true_value_of_a_biased_thermometer_is_published_and_is_right() -> None:
     """The truth is the same plant without the bias. The thermometer is 3 K off, the reconstruction a tenth of it."""
     run, sound = run_of("temperature_bias:step:3", seed=4)
-    told = [item.message for item in run.said if isinstance(item.message, Reconstruction)]
+    told = [item.message for item in run.published if isinstance(item.message, Reconstruction)]
     assert len(told) > 100
     assert {message.cause for message in told} == {"temperature_bias"}
     truth = np.array([sound[round(message.time_ns / 6e9), 1] for message in told])
@@ -140,13 +140,13 @@ def test_what_a_biased_thermometer_should_read_is_told_and_is_right() -> None:
     assert np.mean([message.measured for message in told] - truth) == pytest.approx(3.0, abs=0.2)
 
 
-def test_a_stuck_thermometer_names_itself_nothing_else_is_blamed_and_what_it_should_read_is_told() -> None:
+def test_a_stuck_thermometer_is_named_nothing_else_is_blamed_and_its_true_value_is_published() -> None:
     time_min, columns, sound = faulty_run("temperature_bias:step:0", seed=5)
     columns["T"][1300:] = columns["T"][1300]
     run = watched(time_min, columns, MonitorConfig())
     assert [alarm for alarm, _ in run.raised] == ["stuck/T"]
     assert [item.cause for item in run.alarms[-1].suspects] == ["stuck_sensor"]
-    told = [item.message for item in run.said if isinstance(item.message, Reconstruction)]
+    told = [item.message for item in run.published if isinstance(item.message, Reconstruction)]
     assert len(told) > 400
     off = np.array([message.value - sound[round(message.time_ns / 6e9), 1] for message in told])
     assert np.sqrt(np.mean(off**2)) < 0.4
@@ -158,4 +158,4 @@ def test_a_sound_run_and_one_that_is_asked_not_to_look_suspect_nothing() -> None
     time_min, columns, _ = faulty_run("coolant_flow:step:-0.05", seed=6)
     unasked = watched(time_min, columns, MonitorConfig(isolation=False))
     assert unasked.raised
-    assert not any(isinstance(item.message, Alarm) and item.message.suspects for item in unasked.said)
+    assert not any(isinstance(item.message, Alarm) and item.message.suspects for item in unasked.published)

@@ -1,4 +1,4 @@
-"""The charts of a plant together: every kind finds what it is for, says whose it is, and begins anew afterwards."""
+"""The charts of a plant together: each finds its kind of fault, names the signal, and restarts afterwards."""
 
 from itertools import pairwise
 from typing import Any
@@ -27,7 +27,7 @@ AT_MIN, AT = 130.0, 1300
         ("pca_spe", 3.0, 1.0, "pca_spe/all"),
     ],
 )
-def test_each_chart_alone_finds_a_lasting_shift_of_a_sensor_and_says_whose_it_is(
+def test_each_chart_alone_finds_a_lasting_shift_of_a_sensor_and_names_the_sensor(
     chart: ChartName, size: float, within_min: float, alarm: str
 ) -> None:
     """Stage by stage: a compiled step for each set of charts takes seconds."""
@@ -57,7 +57,7 @@ def test_all_charts_together_are_quiet_on_a_sound_plant_and_share_the_budget() -
     assert run.monitor.pipeline.expected_false_alarms == pytest.approx(300 / (30 * 24 * 60), rel=0.01)
 
 
-def test_a_wider_budget_makes_narrower_limits_as_the_run_lengths_say() -> None:
+def test_a_wider_budget_makes_narrower_limits_as_the_run_lengths_require() -> None:
     run = sound_run(110.0, seed=3)
     limits = [
         watched(*run, MonitorConfig(false_alarms_per_30_days=budget, isolation=False)).points("ewma/T")[-1].upper_limit
@@ -66,7 +66,7 @@ def test_a_wider_budget_makes_narrower_limits_as_the_run_lengths_say() -> None:
     assert limits == sorted(limits, reverse=True)
 
 
-def test_a_chart_with_a_memory_begins_anew_when_its_alarm_is_cleared() -> None:
+def test_a_chart_with_a_memory_restarts_when_its_alarm_is_cleared() -> None:
     time_min, columns = sound_run(170.0, seed=4)
     columns["T"][AT : AT + 50] += 1.5
     run = watched(time_min, columns, MonitorConfig(charts=("ewma",), isolation=False))
@@ -84,7 +84,7 @@ def test_a_cusum_stops_at_its_ceiling_and_is_soon_back_after_a_large_change() ->
     assert back == round((CEILING - 1.0) * 5.0 / 0.5)
 
 
-def test_the_drift_of_the_model_is_told_every_fifty_rows_and_is_an_alarm_only_where_asked_for() -> None:
+def test_the_drift_of_the_model_is_published_every_fifty_rows_and_is_an_alarm_only_where_asked_for() -> None:
     time_min, columns = sound_run(300.0, seed=5)
     gain = np.where(time_min < 150.0, 1.0, 1.15)
     centre = columns["T"].mean()

@@ -1,4 +1,4 @@
-"""A stuck sensor, a spike and a dead plant are told as what they are, at once, and as nothing else."""
+"""A stuck sensor, a spike and a dead plant are reported as such, at once, and as nothing else."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ CONFIG = MonitorConfig(isolation=False)
 
 
 @pytest.mark.parametrize(("signal", "row"), [("T", AT), ("C", AT)])
-def test_a_stuck_sensor_is_told_within_ten_readings(signal: str, row: int) -> None:
+def test_a_stuck_sensor_is_reported_within_ten_readings(signal: str, row: int) -> None:
     time_min, columns = sound_run(135.0, seed=1)
     columns[signal][row:] = columns[signal][row]
     run = watched(time_min, columns)
@@ -33,7 +33,7 @@ def test_a_stuck_sensor_is_told_within_ten_readings(signal: str, row: int) -> No
 
 
 @pytest.mark.parametrize(("signal", "size"), [("T", 6.0), ("T", -40.0), ("C", 0.05)])
-def test_a_spike_is_told_one_row_later_and_raises_nothing_else(signal: str, size: float) -> None:
+def test_a_spike_is_reported_one_row_later_and_raises_nothing_else(signal: str, size: float) -> None:
     time_min, columns = sound_run(150.0, seed=2)
     columns[signal][AT] += size
     run = watched(time_min, columns)
@@ -73,7 +73,7 @@ def test_a_spike_in_a_standing_incident_belongs_to_it_and_begins_none() -> None:
     assert told[0].alarm != "spike/T"
 
 
-def test_a_dead_sensor_is_told_while_the_others_go_on() -> None:
+def test_a_dead_sensor_is_reported_while_the_others_continue() -> None:
     time_min, columns = sound_run(140.0, seed=3)
     columns["T"][AT:] = np.nan
     monitor = Monitor(CONFIG, 0)
@@ -87,7 +87,7 @@ def test_a_dead_sensor_is_told_while_the_others_go_on() -> None:
     assert raised == [("silence/T", minute_ns(AT_MIN - 0.1 + 0.5))]
 
 
-def test_a_dead_plant_is_told_by_the_clock_of_receipt_while_nothing_comes() -> None:
+def test_a_dead_plant_is_reported_by_the_clock_of_receipt_while_nothing_arrives() -> None:
     """A row a second, then nothing: five seconds later the loop wakes the monitor, and it says so once."""
     time_min, columns = sound_run(10.0, seed=4)
     monitor = Monitor(CONFIG, 0)

@@ -1,4 +1,4 @@
-"""The watch over a fleet: each plant is watched as if it were alone, by one monitor."""
+"""Monitoring of a fleet: each plant is monitored as if it were alone, by one monitor."""
 
 import pytest
 
@@ -21,7 +21,7 @@ def test_each_plant_is_watched_as_if_it_were_alone(
         assert of(plant, said) == expected[plant]
 
 
-def test_many_messages_together_say_what_each_would_alone(
+def test_a_batch_of_messages_gives_the_output_of_each_alone(
     runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
 ) -> None:
     monitor, messages, said = fleet(), row_by_row(runs.values()), list[Publication]()
@@ -39,7 +39,7 @@ def test_a_plant_is_watched_as_soon_as_a_node_of_it_is_alive() -> None:
     assert shown == [("x", True)]
 
 
-def test_a_plant_whose_node_goes_is_still_watched() -> None:
+def test_a_plant_whose_node_stops_is_still_monitored() -> None:
     monitor = fleet()
     monitor.on_alive("reactor/x/alive/plant", True, 0)
     monitor.on_alive("reactor/x/alive/plant", False, 1)
@@ -53,7 +53,7 @@ def test_what_is_no_sample_of_a_plant_makes_no_plant(key: str) -> None:
     assert monitor.plants == []
 
 
-def test_the_health_of_each_plants_monitor_is_told() -> None:
+def test_the_health_of_each_plants_monitor_is_published() -> None:
     monitor = fleet()
     for plant in ("x", "y"):
         monitor.on_alive(f"reactor/{plant}/alive/plant", True, 0)
@@ -62,7 +62,7 @@ def test_the_health_of_each_plants_monitor_is_told() -> None:
     assert monitor.next_tick_ns() == SECOND_NS + int(QUICK.health_period_s * 1e9)
 
 
-def test_a_plant_that_falls_silent_is_told_of_while_others_go_on(runs: dict[str, list[Encoded]]) -> None:
+def test_a_plant_that_falls_silent_is_reported_while_others_continue(runs: dict[str, list[Encoded]]) -> None:
     monitor = fleet()
     for number in range(200):  # rows
         now_ns = number * SECOND_NS
@@ -91,7 +91,7 @@ def test_settings_that_make_no_monitor_are_refused_before_there_is_a_plant() -> 
         fleet(config=MonitorConfig(outputs=("pressure",), priorities={}, reference="process"))
 
 
-def test_shards_together_say_of_each_plant_what_one_monitor_says_once(
+def test_shards_together_publish_of_each_plant_what_one_monitor_publishes_once(
     runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
 ) -> None:
     monitors = [fleet(shard=Shard(number, 3)) for number in (1, 2, 3)]

@@ -9,14 +9,13 @@ import pytest
 from monitor_node.core import Monitor
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.monitor import EVICT_NS
-from monitor_node.fleet.node import POLL_NS, FleetNode
-from monitor_node.storage.state_files import CLAIM, StateFolder
+from monitor_node.node import POLL_NS, MonitorNode
+from monitor_node.storage.state_files import CLAIM
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmKpis
 from reactorwatch.runtime.metrics import Metrics
 from reactorwatch.runtime.security.command_rate import PER_NAME
-from tests.memory_bus import Exchange, MemoryBus
 
 from ..fleets import PLANTS, QUICK, alarms, of, row_by_row, run_of
 
@@ -27,7 +26,7 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self.now_ns = 0
         config = msgspec.structs.replace(QUICK, state_every_s=0.1)
-        self.node = FleetNode(config, FleetConfig(plants=PLANTS), MemoryBus(Exchange()), 0, StateFolder(folder))
+        self.node = MonitorNode(config, 0, FleetConfig(plants=PLANTS, state=str(folder)))
 
     def tick(self) -> list[Publication]:
         """Publications a moment later."""
@@ -119,8 +118,8 @@ def test_there_is_no_file_of_a_plant_of_which_nothing_is_known(bench: Bench, tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == [CLAIM, "a.state"]
 
 
-def test_figures_of_alarms_are_told_from_the_first_alarm_of_a_plant_on() -> None:
-    node = FleetNode(QUICK, FleetConfig(plants=PLANTS), MemoryBus(Exchange()), 0)
+def test_alarm_kpis_are_published_from_the_first_alarm_of_a_plant_on() -> None:
+    node = MonitorNode(QUICK, 0, FleetConfig(plants=PLANTS))
     runs = {"sound": run_of("sound", 21), "leaking": run_of("leaking", 22, leak_min=30.0)}
     said = list[Publication]()
     messages = row_by_row(runs.values())

@@ -5,10 +5,9 @@ from structlog.testing import capture_logs
 
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.node import FleetNode
+from monitor_node.node import MonitorNode
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import section
-from tests.memory_bus import Exchange, MemoryBus
 
 from ..fleets import QUICK, run_of
 
@@ -46,7 +45,7 @@ def test_a_share_that_no_plant_can_have_is_refused_in_one_line() -> None:
 
 def test_each_plant_is_watched_with_its_share() -> None:
     fleet = FleetConfig(plants="reactor/*", false_alarms_per_day=2.0, most_plants=30)
-    node = FleetNode(QUICK, fleet, MemoryBus(Exchange()), 0)
+    node = MonitorNode(QUICK, 0, fleet)
     for message in run_of("x", 11, span_min=25.0):
         node.on_messages([message], 0)
     promise = node.monitor("x").promise
@@ -57,7 +56,7 @@ def test_each_plant_is_watched_with_its_share() -> None:
 
 def test_more_plants_than_share_it_are_logged_once_with_what_may_come() -> None:
     fleet = FleetConfig(plants="reactor/*", false_alarms_per_day=1.0, most_plants=2)
-    node = FleetNode(QUICK, fleet, MemoryBus(Exchange()), 0)
+    node = MonitorNode(QUICK, 0, fleet)
     with capture_logs() as lines:
         for name in ("a", "b", "c"):
             node.register(name, 0, verified=True)

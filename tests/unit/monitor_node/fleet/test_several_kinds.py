@@ -1,4 +1,4 @@
-"""A fleet of plants of several processes: each plant is watched as by a monitor of its own process."""
+"""A fleet of plants of several processes: each plant is monitored as by a monitor of its own process."""
 
 from collections.abc import Iterable, Iterator
 from itertools import islice

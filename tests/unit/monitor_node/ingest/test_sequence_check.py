@@ -1,4 +1,4 @@
-"""Which samples are of the plant that is watched: a stranger's are refused, and no run of the plant's own loses one."""
+"""Samples of another plant are refused, and no run of the monitored plant loses one."""
 
 import random
 
@@ -141,7 +141,7 @@ def test_a_second_plant_is_refused_while_the_first_is_held_up_for_less_than_a_re
     assert taken([*first[:100], *second[:held_up], *turns, first[120]]) == (first, second)
 
 
-def test_a_first_plant_that_is_held_up_for_longer_cannot_be_told_from_one_that_was_started_again() -> None:
+def test_a_first_plant_that_is_held_up_for_longer_cannot_be_distinguished_from_a_restarted_one() -> None:
     """The samples up to the decision are the same, so the second is watched, and the first refused when it is back."""
     first, second = regular(0, 120), regular(0, 60, -9000 * PERIOD)
     restart = [*first[:100], *second[:CONFIRMED]]

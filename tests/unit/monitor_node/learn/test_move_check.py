@@ -1,4 +1,4 @@
-"""A model that errs after moves of the inputs does not keep its promise, and says so."""
+"""A model that errs after moves of the inputs does not keep its promise, and this is reported."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def promise_after(time_min: Array, rows: Array) -> Promise:
 
 
 @pytest.mark.parametrize("inputs", ["wide", "mid"])
-def test_a_linear_model_of_the_curved_reactor_is_said_to_err(inputs: str) -> None:
+def test_a_linear_model_of_the_curved_reactor_is_reported_to_err(inputs: str) -> None:
     """Without noise its residuals are all errors of the model."""
     record = sound_record(inputs, "none", 11, TRAINING_MIN + 1.0)
     promise = promise_after(record.time_min, np.column_stack([record.columns[name] for name in ("qc", "C", "T")]))

@@ -1,4 +1,4 @@
-"""What the process cannot be is no measurement: it raises an alarm of its own and reaches no filter and no chart."""
+"""Values that the process cannot take are no measurements: they raise an alarm and reach no filter and no chart."""
 
 from typing import Any
 

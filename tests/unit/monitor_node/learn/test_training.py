@@ -1,4 +1,4 @@
-"""Training: a disturbed stretch is left out and told, too much of it is refused, and the better reference is taken."""
+"""Training: a disturbed segment is excluded and reported, too many are refused, and the better reference is taken."""
 
 import msgspec
 import numpy as np
@@ -11,7 +11,7 @@ from ..watching import sound_run, watched
 CONFIG = MonitorConfig(isolation=False)
 
 
-def test_a_training_with_a_disturbed_stretch_leaves_it_out_says_so_and_watches_as_well() -> None:
+def test_a_training_with_a_disturbed_segment_leaves_it_out_reports_it_and_monitors_as_well() -> None:
     time_min, columns = sound_run(150.0, seed=1)
     columns["T"][300:420] += 3.0
     run = watched(time_min, columns)
@@ -24,7 +24,7 @@ def test_a_training_with_a_disturbed_stretch_leaves_it_out_says_so_and_watches_a
     assert run.raised == clean.raised == []
 
 
-def test_a_training_of_which_too_much_is_disturbed_begins_anew() -> None:
+def test_a_training_of_which_too_much_is_disturbed_restarts() -> None:
     time_min, columns = sound_run(230.0, seed=2)
     columns["T"][550:1000] += 3.0
     run = watched(time_min, columns)
@@ -108,7 +108,7 @@ def test_the_process_model_of_another_plant_is_refused_in_one_line(setting: dict
 
 
 @pytest.mark.parametrize(("moves", "is_too_few"), [(0, False), (1, True), (4, True), (5, False), (40, False)])
-def test_without_equations_a_training_with_few_moves_of_the_input_is_said_not_to_keep_the_promise(
+def test_without_equations_a_training_with_few_moves_of_the_input_is_reported_not_to_keep_the_promise(
     moves: int, is_too_few: bool
 ) -> None:
     generator = np.random.default_rng(moves)

@@ -105,7 +105,7 @@ def test_a_change_whose_row_was_lost_holds_from_the_next_row_on(warm: Run) -> No
     assert late.time_ns == change.time_ns + 6_000_000_000
 
 
-def test_a_monitor_that_resumes_before_the_finding_goes_on_bit_for_bit(warm: Run) -> None:
+def test_a_monitor_that_resumes_before_the_finding_continues_bit_for_bit(warm: Run) -> None:
     again = Monitor(CONFIG, 0)
     again.from_bytes(warm.pending)
     job = again.diagnosis_job
@@ -116,7 +116,7 @@ def test_a_monitor_that_resumes_before_the_finding_goes_on_bit_for_bit(warm: Run
     assert published == warm.published[-len(published) :]
 
 
-def test_a_monitor_that_resumes_after_the_change_goes_on_bit_for_bit_without_a_training(warm: Run) -> None:
+def test_a_monitor_that_resumes_after_the_change_continues_bit_for_bit_without_a_training(warm: Run) -> None:
     again = Monitor(CONFIG, 0)
     again.from_bytes(warm.changed)
     assert again.diagnosis_job is None

@@ -68,7 +68,7 @@ def test_a_training_of_few_rows_is_left_as_it_is() -> None:
     assert find_uncertain(cstr(), ("C", "T"), np.arange(20.0), nothing, np.zeros((20, 2))) == Uncertain()
 
 
-def test_what_is_uncertain_is_said_in_words() -> None:
+def test_uncertainty_is_stated_in_words() -> None:
     assert describe_uncertain(("constant volume", "wander T", "noise C")) == (
         "a disturbance of the balance of T wanders, the noise of C has memory, limits allow for what the training "
         "leaves open of the constants"

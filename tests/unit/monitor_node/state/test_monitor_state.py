@@ -1,4 +1,4 @@
-"""A monitor that was stopped and goes on from its stored state says what it would have said, value for value."""
+"""A monitor that resumes from its stored state publishes what it would have published, value for value."""
 
 import random
 from itertools import chain
@@ -75,7 +75,7 @@ def stopped_at(
 
 @pytest.mark.parametrize("points", [True, False], ids=["with points", "without"])
 @pytest.mark.parametrize("reference", ["process", "black-box", "arx"])
-def test_who_was_stopped_at_any_samples_says_the_same(
+def test_a_monitor_stopped_at_any_samples_publishes_the_same(
     reference: Literal["process", "black-box", "arx"], points: bool, leak: list[Encoded]
 ) -> None:
     """In training and watching, in an alarm, acknowledged and shelved, in the middle of a row."""
@@ -89,7 +89,7 @@ def test_who_was_stopped_at_any_samples_says_the_same(
     assert len(events) > 3
 
 
-def test_a_state_that_was_gone_on_from_is_the_same_bytes(leak: list[Encoded]) -> None:
+def test_a_state_that_was_resumed_from_is_the_same_bytes(leak: list[Encoded]) -> None:
     monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
     run(monitor, leak, 0, 2400)
     again.from_bytes(monitor.to_bytes())
@@ -104,7 +104,7 @@ def test_a_state_of_another_layout_is_refused_in_one_line(version: int) -> None:
         Monitor(CONFIG, 0).from_bytes(stored)
 
 
-def test_a_monitor_that_heard_nothing_yet_is_stored_and_restored() -> None:
+def test_a_monitor_that_received_nothing_yet_is_stored_and_restored() -> None:
     again = Monitor(CONFIG, 0)
     again.from_bytes(Monitor(CONFIG, 0).to_bytes())
     assert again.phase == "waiting"
@@ -192,7 +192,7 @@ def duplicated(monitor: Monitor) -> int:
 
 
 @pytest.mark.parametrize("rows_again", [5, 100, 800])
-def test_samples_that_were_heard_before_the_stop_are_counted_and_change_nothing(
+def test_samples_that_were_received_before_the_stop_are_counted_and_change_nothing(
     rows_again: int, leak: list[Encoded]
 ) -> None:
     """The publisher tells its last rows again, many more than the alignment remembers."""
@@ -236,7 +236,7 @@ def test_a_stop_while_samples_are_held_back_after_a_pause_loses_none(rows: int, 
     assert again.rows == len(messages) // SIGNALS
 
 
-def test_a_plant_that_began_anew_meanwhile_is_heard(leak: list[Encoded]) -> None:
+def test_a_plant_that_restarted_meanwhile_is_accepted(leak: list[Encoded]) -> None:
     """Its clock was set back and it counts from 0: what it says of times that were heard has other numbers."""
     monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
     run(monitor, leak, 0, 2300)
@@ -261,7 +261,7 @@ def test_a_sample_far_ahead_before_the_history_judges_no_row_twice(leak: list[En
     assert again.rows == monitor.rows
 
 
-def test_once_all_was_told_a_plant_that_repeats_itself_is_heard() -> None:
+def test_after_the_history_a_plant_that_repeats_itself_is_accepted() -> None:
     """A simulated plant that is started anew with the same clock publishes the same numbers at the same times."""
     messages = list(samples(*leaking_run(0.0, 1.0, 20.0, seed=1)))
     monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
@@ -274,7 +274,7 @@ def test_once_all_was_told_a_plant_that_repeats_itself_is_heard() -> None:
     assert again.rows == 2 * monitor.rows
 
 
-def test_a_plant_that_says_nothing_after_the_stop_is_silent(leak: list[Encoded]) -> None:
+def test_a_plant_that_publishes_nothing_after_the_stop_is_silent(leak: list[Encoded]) -> None:
     """It is waited for from the start on, as long as its receipts before the stop ask for."""
     second = 1_000_000_000
     monitor = Monitor(CONFIG, 0)
@@ -290,7 +290,7 @@ def test_a_plant_that_says_nothing_after_the_stop_is_silent(leak: list[Encoded])
     assert [item.key for item in said if "/alarm/" in item.key] == [keys.key(PLANT, keys.ALARM, "silence/plant")]
 
 
-def test_the_rows_of_a_fault_that_is_followed_go_on(leak: list[Encoded]) -> None:
+def test_the_rows_of_a_fault_under_search_continue(leak: list[Encoded]) -> None:
     """A state in the middle of an isolation remembers how far it has come: the suspects are the same, bit for bit."""
     config = MonitorConfig(training_min=60.0)
     whole = [item for told in run(Monitor(config, 0), leak, 0, len(leak)) for item in told if "/alarm/" in item.key]

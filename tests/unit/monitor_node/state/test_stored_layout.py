@@ -17,7 +17,7 @@ from reactorwatch.version import this_build
 CONFIG = MonitorConfig(training_min=6.0, isolation=False)
 
 
-def test_a_state_names_the_build_that_stored_it_and_one_of_another_build_says_so_where_it_is_refused() -> None:
+def test_a_state_names_the_build_that_stored_it_and_its_refusal_names_another_build() -> None:
     monitor = Monitor(CONFIG, 0, points=False)
     settings = learning_settings(CONFIG, monitor.model, points=False)
     data = monitor.to_bytes()

@@ -1,7 +1,8 @@
 """Monitors that are started one after the other, each in place of one that was killed."""
 
-from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from monitor_node.node import MonitorNode
 
 _running: list[MonitorNode] = []
 
@@ -14,3 +15,9 @@ def start_node(config: MonitorConfig, start_ns: int) -> MonitorNode:
             file.claim.close()
     _running.append(MonitorNode(config, start_ns))
     return _running[-1]
+
+
+def own(node: MonitorNode) -> Monitor:
+    """Monitor of the only plant."""
+    (plant,) = node.plants
+    return node.monitor(plant)

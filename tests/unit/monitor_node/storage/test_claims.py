@@ -8,18 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.node import FleetNode
+from monitor_node.node import MonitorNode
 from monitor_node.storage import claims
 from monitor_node.storage.claims import Claim, is_local
 from monitor_node.storage.state_files import CLAIM, StateFolder
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.errors import InputError, is_passing
-from tests.memory_bus import Exchange, MemoryBus
 
 from ..fleets import QUICK, run_of
 
@@ -159,8 +157,8 @@ def test_a_mount_of_a_network_within_a_local_file_system_is_not_local(
     assert not is_local(tmp_path)
 
 
-def fleet_node(folder: Path) -> FleetNode:
-    node = FleetNode(QUICK, FleetConfig(plants="reactor/*"), MemoryBus(Exchange()), 0, StateFolder(folder))
+def fleet_node(folder: Path) -> MonitorNode:
+    node = MonitorNode(QUICK, 0, FleetConfig(plants="reactor/*", state=str(folder)))
     node.on_alive("reactor/a/alive/plant", True, 0)
     return node
 

@@ -11,19 +11,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.node import FleetNode
+from monitor_node.node import MonitorNode
 from monitor_node.storage.state_files import CLAIM, StateFolder, find_kept_aside, keep_aside
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
 from reactorwatch.errors import InputError
-from tests.memory_bus import Exchange, MemoryBus
 
 from ..fleets import of_plant
 from ..samples import leaking_run, samples
-from .restarts import start_node
+from .restarts import own, start_node
 
 FOREIGN = {
     "settings.toml": b'[monitor]\nplant = "cstr"\n',
@@ -65,12 +63,12 @@ def test_settings_changed_and_changed_back_cost_no_row(
     learned = dict.fromkeys(range(len(SETTINGS)), 0)
     for number in starts:
         node = start_node(config(folder, **SETTINGS[number]), 0)
-        assert node.rows == learned[number]
+        assert own(node).rows == learned[number]
         first = 3 * learned[number]
         for message in rows[first : first + 15]:
             node.on_message(message, 0)
         node.on_stop(0)
-        learned[number] = node.rows
+        learned[number] = own(node).rows
     assert len(files(folder)) == len(set(starts))
 
 
@@ -82,7 +80,7 @@ def test_an_empty_state_is_not_written_over_one_that_was_kept(tmp_path: Path, ro
     node.on_stop(0)
     for order in (2, 4):
         start_node(config(tmp_path, order=order), 0)
-    assert start_node(config(tmp_path), 0).rows == len(rows) // 3
+    assert own(start_node(config(tmp_path), 0)).rows == len(rows) // 3
 
 
 def test_each_damaged_file_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -196,7 +194,7 @@ def stands(alarm: Alarm) -> bool:
 
 def stored_alarms(node: MonitorNode) -> list[Alarm]:
     """Its alarms, without the time of the newest row."""
-    alarms = node.alarms.all_alarms()
+    alarms = own(node).alarms.all_alarms()
     for alarm in alarms:
         alarm.time_ns = 0
     return alarms
@@ -211,7 +209,7 @@ def in_alarm(leak: list[Encoded]) -> MonitorNode:
     node = start_node(WITH_ALARMS, 0)
     for message in leak:
         node.on_message(message, 0)
-    assert any(stands(alarm) for alarm in node.alarms.all_alarms())
+    assert any(stands(alarm) for alarm in own(node).alarms.all_alarms())
     return node
 
 
@@ -224,7 +222,7 @@ def flip_bit(stored: bytes, bit: int) -> bytes:
 @pytest.fixture
 def stored(tmp_path: Path, in_alarm: MonitorNode) -> Path:
     """Folder with the state of a monitor with alarms that stand."""
-    (tmp_path / "monitor.state").write_bytes(in_alarm.to_bytes())
+    (tmp_path / "monitor.state").write_bytes(own(in_alarm).to_bytes())
     return tmp_path
 
 
@@ -253,13 +251,13 @@ def test_alarms_are_not_older_than_those_of_other_settings_after_a_state_was_asi
     for message in leak:
         node.on_message(message, 0)
     node.on_stop(0)
-    standing = next(alarm.alarm for alarm in node.alarms.all_alarms() if stands(alarm))
+    standing = next(alarm.alarm for alarm in own(node).alarms.all_alarms() if stands(alarm))
     other = start_node(msgspec.structs.replace(both, order=2), 0)
-    other.alarms.comment(standing, "Anna", "the valve is being repaired")
+    own(other).alarms.comment(standing, "Anna", "the valve is being repaired")
     other.on_tick(0)
     again = start_node(both, 0)
-    assert again.rows == node.rows
-    assert again.alarms.alarm(standing).comment == "the valve is being repaired"
+    assert own(again).rows == own(node).rows
+    assert own(again).alarms.alarm(standing).comment == "the valve is being repaired"
 
 
 def test_a_silence_that_stood_ends_with_the_next_sample(tmp_path: Path, rows: list[Encoded]) -> None:
@@ -268,23 +266,23 @@ def test_a_silence_that_stood_ends_with_the_next_sample(tmp_path: Path, rows: li
     node = start_node(settings_, 0)
     for message in rows[:150]:
         node.on_message(message, 0)
-    signals = node.pipeline.evaluation.signals
+    signals = own(node).pipeline.evaluation.signals
     signals.publish(signals.silence, 0, signals.silence.declare_timeout())
     node.on_tick(0)
     again = start_node(config(tmp_path, order=2), 0)
-    assert stands(again.alarms.alarm("silence/plant"))
+    assert stands(own(again).alarms.alarm("silence/plant"))
     for message in rows[150:]:
         again.on_message(message, 0)
-    assert not stands(again.alarms.alarm("silence/plant"))
+    assert not stands(own(again).alarms.alarm("silence/plant"))
 
 
 # --- fleets ------------------------------------------------------------------------------------------------------
 
 
-def fleet_of(folder: Path, order: int, rows: list[Encoded]) -> FleetNode:
+def fleet_of(folder: Path, order: int, rows: list[Encoded]) -> MonitorNode:
     """A fleet's monitor that watches the plants of its folder, and is stopped after some rows of plant `a`."""
     config_ = MonitorConfig(order=order, isolation=False)
-    node = FleetNode(config_, FleetConfig(plants="reactor/*"), MemoryBus(Exchange()), 0, StateFolder(folder))
+    node = MonitorNode(config_, 0, FleetConfig(plants="reactor/*", state=str(folder)))
     node.on_history_end()
     if rows:
         node.on_alive("reactor/a/alive/plant", True, 0)
@@ -293,7 +291,7 @@ def fleet_of(folder: Path, order: int, rows: list[Encoded]) -> FleetNode:
     return node
 
 
-def test_a_fleet_goes_on_from_what_it_kept_when_its_settings_are_back(tmp_path: Path, rows: list[Encoded]) -> None:
+def test_a_fleet_resumes_from_its_stored_state_when_its_settings_are_back(tmp_path: Path, rows: list[Encoded]) -> None:
     """With the other settings the plant is watched from the start on, before its first sample."""
     fleet_of(tmp_path, 3, rows[:30])
     other = fleet_of(tmp_path, 2, [])
@@ -304,7 +302,7 @@ def test_a_fleet_goes_on_from_what_it_kept_when_its_settings_are_back(tmp_path: 
     assert fleet_of(tmp_path, 3, []).monitor("a").rows == 20
 
 
-def test_a_fleet_s_unusable_state_is_reported_before_its_plant_says_anything(
+def test_a_fleet_s_unusable_state_is_reported_before_its_plant_publishes_anything(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for data in (b"", b"reactorwatch monitor\x00\x01 and then no state"):

@@ -1,4 +1,4 @@
-"""What a monitor remembers outlives it in a file, and a file that is no good costs no more than what was learned."""
+"""The state of a monitor persists in a file, and a damaged file costs no more than what was learned."""
 
 import errno
 import os
@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
+from monitor_node.node import MonitorNode
 from monitor_node.storage.state_files import CLAIM
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode, encode_message
@@ -16,7 +16,7 @@ from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, Health
 from reactorwatch.errors import InputError
 
 from ..samples import leaking_run, samples
-from .restarts import start_node
+from .restarts import own, start_node
 
 SECOND = 1_000_000_000
 END_MIN = 70.0
@@ -43,12 +43,10 @@ def stored_rows(config: MonitorConfig) -> int:
     """Rows of the run that the file knows."""
     copy = Path(str(config.state_file)).with_name("copy.state")
     copy.write_bytes(Path(str(config.state_file)).read_bytes())
-    return start_node(msgspec.structs.replace(config, state_file=str(copy)), 0).rows
+    return own(start_node(msgspec.structs.replace(config, state_file=str(copy)), 0)).rows
 
 
-def test_it_is_stored_when_its_time_has_come_and_something_was_heard(
-    config: MonitorConfig, leak: list[Encoded]
-) -> None:
+def test_it_is_stored_when_it_is_due_and_something_was_received(config: MonitorConfig, leak: list[Encoded]) -> None:
     node = start_node(config, 0)
     path = Path(str(config.state_file))
     for number, message in enumerate(leak[:60]):
@@ -62,13 +60,13 @@ def test_it_is_stored_when_its_time_has_come_and_something_was_heard(
     assert path.stat().st_mtime_ns == before
 
 
-def test_a_change_of_an_alarm_is_stored_before_it_is_told(config: MonitorConfig, leak: list[Encoded]) -> None:
+def test_a_change_of_an_alarm_is_stored_before_it_is_published(config: MonitorConfig, leak: list[Encoded]) -> None:
     node = start_node(config, 0)
     for message in leak:
         said = node.on_message(message, 0)
         if any("/alarm/" in item.key for item in said):
             break
-    assert stored_rows(config) == node.rows
+    assert stored_rows(config) == own(node).rows
 
 
 def test_messages_that_a_kill_kept_from_leaving_are_published_first_after_the_restart(
@@ -99,21 +97,21 @@ def test_at_its_end_it_is_stored(config: MonitorConfig, leak: list[Encoded]) -> 
     for message in leak[:30]:
         node.on_message(message, 0)
     node.on_stop(0)
-    assert start_node(config, 0).rows == 10
+    assert own(start_node(config, 0)).rows == 10
 
 
 @pytest.mark.parametrize("data", [b"", b"reactorw", b"reactorwatch monitor\x00\x01 and then no state"])
-def test_a_damaged_file_is_kept_aside_and_told_in_one_line(
+def test_a_damaged_file_is_kept_aside_and_reported_in_one_line(
     data: bytes, config: MonitorConfig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = Path(str(config.state_file))
     path.write_bytes(data)
     node = start_node(config, 0)
-    assert (node.phase, node.resumed) == ("waiting", False)
+    assert (own(node).phase, node.resumed) == ("waiting", False)
     assert path.with_name("monitor.state.damaged").read_bytes() == data
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "monitor.state" in line]
     assert "it is kept as monitor.state.damaged, and the monitor learns again" in line
-    assert start_node(config, 0).phase == "waiting"
+    assert own(start_node(config, 0)).phase == "waiting"
 
 
 def test_what_was_learned_with_other_settings_is_kept_aside_and_the_setting_named(
@@ -124,11 +122,11 @@ def test_what_was_learned_with_other_settings_is_kept_aside_and_the_setting_name
         node.on_message(message, 0)
     node.on_stop(0)
     other = start_node(msgspec.structs.replace(config, order=2), 0)
-    assert other.rows == 0
+    assert own(other).rows == 0
     assert "was learned with other settings: order was 3 and is 2; it is kept as" in capsys.readouterr().out
     path = Path(str(config.state_file))
     path.with_name("monitor.state.other-settings").replace(path)
-    assert start_node(config, 0).rows == 10
+    assert own(start_node(config, 0)).rows == 10
 
 
 def test_a_file_in_no_folder_is_refused_at_the_start(tmp_path: Path) -> None:
@@ -136,7 +134,7 @@ def test_a_file_in_no_folder_is_refused_at_the_start(tmp_path: Path) -> None:
         start_node(MonitorConfig(state_file=str(tmp_path / "none" / "monitor.state")), 0)
 
 
-def test_a_full_disk_is_told_once_counted_and_stops_no_watch(
+def test_a_full_disk_is_reported_once_counted_and_stops_no_monitor(
     config: MonitorConfig, leak: list[Encoded], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Neither at the start nor later; what was stored before is still there, and it is tried again."""
@@ -152,7 +150,7 @@ def test_a_full_disk_is_told_once_counted_and_stops_no_watch(
         node.on_message(message, number * SECOND)
     count = health(node, 300 * SECOND).not_stored
     assert count > 50
-    assert node.rows == 100
+    assert own(node).rows == 100
     said = [line for line in capsys.readouterr().out.splitlines() if "No space left" in line]
     assert len(said) == 2  # at the start, and then
     path = Path(str(config.state_file))
@@ -173,6 +171,7 @@ def test_an_accepted_command_on_the_baseline_is_stored_before_the_reply(
     key = keys.key(config.plant, keys.COMMAND, "baseline")
     command = BaselineCommand(what="relearn", by="Anna", why="new pump")
     reply, _ = node.on_command(Encoded(key, *encode_message(command)), 0)
+    assert reply is not None
     assert reply.accepted
     resumed = start_node(config, 0)
     published = [item.message for message in leak[30:33] for item in resumed.on_message(message, 0)]

@@ -1,4 +1,4 @@
-"""A plant changes, and its people say so: accept, relearn and restore what it is judged by."""
+"""Baseline commands after a change of the plant: accept, relearn and restore."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ class Run:
         return [item.alarm for item in alarms if item.event == "raised" and item.time_ns >= since * SECOND_NS]
 
 
-def test_relearn_trains_from_the_next_row_on_and_says_who_and_why(plant: tuple[Array, Array]) -> None:
+def test_relearn_trains_from_the_next_row_on_and_publishes_its_author_and_reason(plant: tuple[Array, Array]) -> None:
     run = Run(plant).take_until(CHANGE + 20)
     assert run.raised(CHANGE)
     assert run.ask("relearn").accepted

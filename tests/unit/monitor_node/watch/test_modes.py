@@ -1,4 +1,4 @@
-"""A plant has modes: each has its own reference, start-up is watched by signal checks only, an unseen mode says so."""
+"""Modes of a plant: each has its own reference, start-up has signal checks only, an unseen mode is reported."""
 
 import msgspec
 import numpy as np
@@ -97,7 +97,7 @@ def test_start_up_is_watched_by_signal_checks_only(run: Run) -> None:
     assert stuck.raised(ends[4], ends[5]) == ["stuck/th"]
 
 
-def test_a_mode_not_seen_in_training_says_so_instead_of_alarming_and_is_learned_on_command(run: Run) -> None:
+def test_a_mode_not_seen_in_training_is_reported_instead_of_alarming_and_is_learned_on_command(run: Run) -> None:
     ends = edges()
     assert not any(run.is_judged(row) for row in range(ends[6], ends[7]))
     assert [note for note in run.monitor.notes if "mode 3 was not seen in the training" in note]

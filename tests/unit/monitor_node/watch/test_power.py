@@ -1,4 +1,4 @@
-"""The deviations that the monitor says it would see are those that it sees, by injected faults."""
+"""The stated detectable deviations are those that the monitor detects, by injected faults."""
 
 from functools import lru_cache
 

@@ -22,7 +22,7 @@ ROWS_IN_30_DAYS = 432_000.0
 
 
 def promises(run: Watched) -> list[Promise]:
-    return [item.message for item in run.said if isinstance(item.message, Promise)]
+    return [item.message for item in run.published if isinstance(item.message, Promise)]
 
 
 def wandering(growth: float = 2.5, seed: int = 4) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -49,7 +49,9 @@ def restless() -> Watched:
 def test_the_promise_is_published_when_the_training_ends_and_with_each_snapshot(sound: Watched) -> None:
     published = promises(sound)
     assert [round(item.time_ns / 60e9) for item in published] == [60, 61, 66, 71, 76]
-    assert {item.key for item in sound.said if isinstance(item.message, Promise)} == {"reactor/cstr/promise/monitor"}
+    assert {item.key for item in sound.published if isinstance(item.message, Promise)} == {
+        "reactor/cstr/promise/monitor"
+    }
     assert published[0].expected == pytest.approx(1.0)
     assert 1.0 < published[0].expected_90 < 10.0
     assert published[-1].expected_so_far == pytest.approx(published[-1].rows / ROWS_IN_30_DAYS)
@@ -62,7 +64,9 @@ def test_a_sound_plant_keeps_its_promise(sound: Watched) -> None:
     assert last.expected_in_training == pytest.approx(300 / ROWS_IN_30_DAYS)
 
 
-def test_a_training_that_does_not_bear_the_promise_out_says_so_and_what_can_be_promised(restless: Watched) -> None:
+def test_a_training_that_does_not_bear_the_promise_out_reports_it_and_the_rate_that_can_be_promised(
+    restless: Watched,
+) -> None:
     first = promises(restless)[0]
     assert not first.kept
     assert first.can_keep_per_30_days > 10.0 * first.expected
@@ -70,7 +74,7 @@ def test_a_training_that_does_not_bear_the_promise_out_says_so_and_what_can_be_p
     assert any(note.startswith("promise: in the second half of its training") for note in restless.monitor.notes)
 
 
-def test_an_alarm_of_such_a_plant_says_how_often_false_ones_may_come(restless: Watched) -> None:
+def test_an_alarm_of_such_a_plant_states_the_rate_of_false_alarms(restless: Watched) -> None:
     raised = [item for item in restless.alarms if item.event == "raised"]
     sound_one = watched(*leaking_run(0.2, 70.0, 80.0, seed=3), QUICK)
     assert raised

@@ -1,0 +1,393 @@
+"""Monitor of one plant or of a fleet, with its stored states, liveliness tokens, commands and logs."""
+
+from collections.abc import Iterator
+from functools import partial
+from itertools import chain
+from pathlib import Path
+
+import structlog
+
+from monitor_node.alarms.kpis import is_empty
+from monitor_node.causes import stage
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from monitor_node.diagnosis_worker import DiagnosisWorker
+from monitor_node.fleet.config import ONE_PLANT, FleetConfig, parse_shard
+from monitor_node.fleet.monitor import FleetMonitor, load_kinds
+from monitor_node.health import NODE, OtherMonitors
+from monitor_node.learn.training_diagnosis import read_equations
+from monitor_node.storage.state_files import StateFile, StateFolder
+from reactorwatch.contract import keys
+from reactorwatch.contract.alarm_text import state_word
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, Baseline, CommandReply, Health, Incident
+from reactorwatch.errors import InputError
+from reactorwatch.records.folder import make_folder
+from reactorwatch.runtime.bus import Bus
+from reactorwatch.runtime.metrics import Metrics
+from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
+from reactorwatch.runtime.start import instance_name
+
+log = structlog.get_logger()
+
+POLL_NS = 100_000_000
+"""Interval of looks for findings of diagnoses, for states to store, and of the steps of a preparation.
+
+Such a step takes some hundredths of a second, at most a few tenths; samples are handled between two steps."""
+
+PREPARED = object()
+"""Marks the end of the preparation."""
+
+LOG_INTERVAL_NS = 10_000_000_000
+"""Interval between logs of what the monitors of a fleet have to say."""
+
+MOST_TOKENS = 200
+"""Plants with a liveliness token. Zenoh's time for one grows with their number: 10,000 take minutes."""
+
+MOST_STORED = 20
+"""Plants whose state is stored at a time: half a millisecond each. With thousands, each is stored less often."""
+
+
+class MonitorNode(FleetMonitor):
+    """Monitor of one plant, or of a fleet, as a process.
+
+    The state of one plant is stored in a file before its alarms are published. States of a fleet are stored afterwards,
+    by a thread of their own. The KPIs of a fleet's alarms are published from a plant's first alarm on: before, they
+    would be empty, every minute for each plant, on a key that takes three kilobytes here and as much in the router.
+
+    Args:
+        config: settings of each plant's monitor.
+        start_ns: present time.
+        fleet: settings of the fleet; by default the one plant of the monitor's settings is watched.
+        metrics: metrics of each plant; None: there are none.
+        token: own instance token; empty: a new one, see `instance_token`.
+
+    Raises:
+        InputError: the settings are inconsistent, or a file of the settings or the folder of states is unusable.
+
+    Attributes:
+        expression: key expression of the plants.
+        resumed: True if the monitor of one plant resumed from a stored state.
+        token: instance token of this node.
+        preparation: steps that prepare the end of the training and the search for causes; None: there are none left.
+    """
+
+    def __init__(
+        self,
+        config: MonitorConfig,
+        start_ns: int,
+        fleet: FleetConfig = ONE_PLANT,
+        metrics: Metrics | None = None,
+        token: str = "",
+    ) -> None:
+        self._fleet, self.metrics = fleet, metrics
+        self.expression = plants_of(config, fleet)
+        self.token = token or instance_token(config, fleet)
+        self.preparation: Iterator[None] | None = None
+        self.resumed = False
+        self._is_single = fleet.plants is None
+        self._bus: Bus | None = None
+        self._tokens: set[str] = set()
+        self._worker = DiagnosisWorker()
+        self._others = OtherMonitors(self.token, lambda: self._monitors)
+        self._rate = CommandRateLimiter()
+        self._file: StateFile | None = None
+        self._states: StateFolder | None = None
+        self._every_ns = int(config.state_every_s * 1e9)
+        self._changed: set[str] = set()  # plants with a changed alarm or a command since their state was stored
+        self._round: list[str] = []  # plants to check for new messages
+        self._stored_at: dict[str, int] = {}  # number of messages by plant when its state was stored
+        self._round_ns = self._poll_ns = self._report_ns = start_ns
+        self._repeated: list[Publication] = []  # a kill may have kept them from leaving the process
+        self._logged: dict[str, str] = {}  # the last failure to store a plant's state
+        self._kpi_keys: set[str] = set()  # keys of KPIs that are not empty
+        self._evicted_logged, self._excess_logged = 0, False
+        super().__init__(
+            load_kinds(fleet.share_promise(config), fleet),
+            start_ns,
+            parse_shard(fleet.shard),
+            points=fleet.points or self._is_single,
+            passes=InputError if self._is_single else (),
+            on_watch=self._on_watched,
+            diagnose=self._worker.submit,
+        )
+        if self._is_single:
+            self.register(config.plant, start_ns, verified=True, restore=partial(self._restore_file, config))
+        elif fleet.state is not None:
+            self._states = StateFolder(make_folder(Path(fleet.state), "--state"))
+            self._log_claim(self._states.claim.failure)
+            for plant in self._states.plants:
+                if keys.matches(self.expression, f"{keys.ROOT}/{plant}"):
+                    self.register(plant, start_ns, verified=True, restore=partial(self._restore, plant))
+
+    # --- plants ----------------------------------------------------------------------------------------------
+
+    @property
+    def tokens(self) -> tuple[str, ...]:
+        """Key expressions of the liveliness tokens that it subscribes to: of fleets, plants and plants' monitors."""
+        monitors = keys.monitor_token(self.expression.removeprefix(f"{keys.ROOT}/"), "*")
+        return keys.FLEET_TOKENS, f"{self.expression}/{keys.ALIVE}/*", monitors
+
+    def declare_tokens(self, bus: Bus) -> None:
+        """Declare the liveliness tokens of the plants, and from now on those of new ones."""
+        self._bus = bus
+        for plant in self._monitors:
+            self._declare_token(plant)
+
+    def _declare_token(self, plant: str) -> None:
+        token = keys.key(plant, keys.ALIVE, NODE)
+        if self._bus is not None and len(self._tokens) < MOST_TOKENS:
+            self._tokens.add(token)
+            self._bus.declare_token(token)
+
+    def _on_watched(self, plant: str, watched: bool) -> None:
+        """Show a plant's token and its metrics, or withdraw them."""
+        if not self._is_single:
+            log.info("watching" if watched else "no longer watching", plant=plant)
+        if watched:
+            if self.metrics is not None:
+                self.metrics.add_plant(plant, lambda: self.alarms_of(plant))
+            self._others.check(plant)
+            self._declare_token(plant)
+            return
+        if self.metrics is not None:
+            self.metrics.remove_plant(plant)
+        token = keys.key(plant, keys.ALIVE, NODE)
+        if self._bus is not None and token in self._tokens:
+            self._tokens.remove(token)
+            self._bus.undeclare_token(token)
+
+    # --- event loop ------------------------------------------------------------------------------------------
+
+    def on_history_end(self) -> None:
+        """See `Monitor.on_history_end`; the history of a plant that is cut off comes once its publishers are there."""
+        for monitor in self._monitors.values():
+            if self._is_single or not monitor.awaits_samples:
+                monitor.on_history_end()
+
+    def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
+        """See `FleetMonitor`; alarms are logged and stored."""
+        return self._keep(super().on_messages(messages, now_ns), now_ns)
+
+    def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
+        """See `FleetMonitor`; other monitors of the plants are logged."""
+        self._others.on_token(token, is_alive=is_alive)
+        return super().on_alive(token, is_alive, now_ns)
+
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
+        """See `FleetMonitor`; alarms are logged and stored; too many commands, over all plants, are refused."""
+        topic = keys.parse(question.key)
+        if topic is None or topic.plant not in self._monitors:
+            return None, []
+        monitor, refusal = self._monitors[topic.plant], self._rate.check(sender_name(question), now_ns)
+        if refusal is not None:
+            monitor.memory.received += 1
+            monitor.rejects.add("too_many_commands", refusal)
+            return CommandReply(accepted=False, text=refusal), []
+        reply, publications = super().on_command(question, now_ns)
+        if reply is not None and reply.accepted:
+            self._changed.add(topic.plant)
+            self._poll_ns = 0
+        return reply, self._keep(publications, now_ns)
+
+    def on_tick(self, now_ns: int) -> list[Publication]:
+        """See `FleetMonitor`; a step is prepared, states are stored, and findings and notes are logged."""
+        if now_ns >= self._poll_ns:
+            self._poll_ns = now_ns + POLL_NS
+            if self.preparation is not None and next(self.preparation, PREPARED) is PREPARED:
+                self.preparation = None
+            self._store_due(now_ns)
+            for plant, finding in self._worker.pop_findings():
+                log.info("training diagnosed", plant=plant, verdict=finding.verdict)
+                self.on_finding(plant, finding)
+                if finding.equations and self._is_single:
+                    extended = stage.preparation(self._monitors[plant].config, read_equations(finding.equations))
+                    self.preparation = chain(self.preparation or (), extended)
+        publications = self._keep(super().on_tick(now_ns), now_ns)
+        if self._is_single or now_ns >= self._report_ns:
+            self._report_ns = now_ns + LOG_INTERVAL_NS
+            self._log_notes()
+            self._log_rejects(now_ns)
+        return publications
+
+    def next_tick_ns(self) -> int:
+        """See `FleetMonitor`; or the next look for findings, for states to store or for a step of the preparation."""
+        stored_ns = None if self._file is None else self._file.due_ns()
+        due_ns = super().next_tick_ns() if stored_ns is None else min(super().next_tick_ns(), stored_ns)
+        polls = self.preparation is not None or self._states is not None or self._worker.is_busy
+        return min(due_ns, self._poll_ns) if polls else due_ns
+
+    def on_stop(self, now_ns: int) -> list[Publication]:
+        """See `FleetMonitor`; states are stored for the last time."""
+        self._worker.close()
+        if self._file is not None:
+            self._file.monitor.unconfirmed = []
+            self._store_file(self._file)
+            self._file.claim.close()
+        if self._states is not None:
+            for plant in filter(self.is_worth_storing, self.plants):
+                self._states.put(plant, self._monitors[plant].to_bytes())
+            self._states.close()
+            self._count_failures(self._states)
+        return super().on_stop(now_ns)
+
+    # --- states ----------------------------------------------------------------------------------------------
+
+    def _restore_file(self, config: MonitorConfig, monitor: Monitor) -> None:
+        if config.state_file is not None:
+            self._file = StateFile(Path(config.state_file), monitor, config.state_every_s)
+            log.info(self._file.load())
+            self._log_claim(self._file.claim.failure)
+        self.resumed = monitor.rows > 0
+        self._repeated = monitor.unconfirmed if self.resumed else []
+
+    def _restore(self, plant: str, monitor: Monitor) -> None:
+        assert self._states is not None, "only its plants are restored"
+        if line := self._states.load(plant, monitor):
+            log.warning(line, plant=plant)
+
+    def _log_claim(self, failure: str) -> None:
+        if failure:
+            log.warning(failure)
+
+    def _store_file(self, file: StateFile) -> None:
+        """Store a state; log a failure once. A full disk must not stop the monitor: the next call retries."""
+        plant = file.monitor.config.plant
+        try:
+            file.store()
+        except InputError as error:
+            self._log_failure(plant, str(error))
+        else:
+            self._logged.pop(plant, None)
+
+    def _store_due(self, now_ns: int) -> None:
+        """Store plants with a changed alarm, which is published by now, and some of those with new messages."""
+        if self._states is None:
+            return
+        self._count_failures(self._states)
+        due, self._changed = list(self._changed), set()
+        if not self._round and not 0 <= now_ns - self._round_ns < self._every_ns:
+            self._round, self._round_ns = self.plants, now_ns
+        checked = 0
+        while self._round and checked < MOST_STORED and self._states.has_room:
+            plant, checked = self._round.pop(), checked + 1
+            monitor = self._monitors.get(plant)
+            if monitor is not None and monitor.memory.received != self._stored_at.get(plant):
+                due.append(plant)
+        for plant in filter(self.is_worth_storing, due):
+            monitor = self._monitors[plant]
+            self._states.put(plant, monitor.to_bytes())
+            self._stored_at[plant] = monitor.memory.received
+
+    def _count_failures(self, states: StateFolder) -> None:
+        """Count failures to store states, and log each reason once."""
+        for plant, why in states.pop_failures():
+            self._stored_at.pop(plant, None)
+            if plant in self._monitors:
+                self._monitors[plant].stats.not_stored += 1
+            self._log_failure(plant, why)
+
+    def _log_failure(self, plant: str, why: str) -> None:
+        if self._logged.get(plant) != why:
+            self._logged[plant] = why
+            log.warning(why, plant=plant)
+
+    # --- publications and logs -------------------------------------------------------------------------------
+
+    def _keep(self, publications: list[Publication], now_ns: int) -> list[Publication]:
+        """Log what is published next, and store it or mark it for storing; returns it.
+
+        Raises:
+            InputError: another monitor has claimed the state, and publishes these alarms.
+        """
+        if self._repeated:
+            publications, self._repeated = self._repeated + publications, []
+        if publications:
+            publications = self._log(publications)
+        if self._is_single:
+            self._log_notes()
+        if self._file is not None:
+            monitor = self._file.monitor
+            repeatable = [item for item in publications if not isinstance(item.message, Health)]
+            monitor.unconfirmed = repeatable or monitor.unconfirmed
+            if self._file.is_due(now_ns):
+                self._store_file(self._file)
+        return publications
+
+    def _log(self, publications: list[Publication]) -> list[Publication]:
+        """Log alarms and incidents, and mark plants with changes; returns publications without a fleet's empty KPIs."""
+        kept, claims_checked = list[Publication](), False
+        for publication in publications:
+            message = publication.message
+            if isinstance(message, AlarmKpis) and not self._is_single and publication.key not in self._kpi_keys:
+                if is_empty(message):
+                    continue
+                self._kpi_keys.add(publication.key)
+            kept.append(publication)
+            if isinstance(message, Health) and self._is_single:
+                message.waiting_for = next(iter(self._logged.values()), "")
+            topic = keys.parse(publication.key) if isinstance(message, Alarm | Baseline | Incident) else None
+            plant = topic.plant if topic is not None else ""
+            if isinstance(message, Alarm | Baseline):
+                self._changed.add(plant)
+                self._poll_ns = 0  # as soon as it is published
+            if isinstance(message, Alarm):
+                if not claims_checked:
+                    self._check_claims()
+                    claims_checked = True
+                log.info(
+                    "alarm", plant=plant, alarm=message.alarm, change=message.event, by=message.by, text=message.text
+                )
+            elif isinstance(message, Incident):
+                suspects = ", ".join(f"{item.cause} {item.probability:.2f}" for item in message.suspects)
+                state, text = state_word(message.state), message.text
+                log.info("incident", plant=plant, number=message.number, state=state, suspects=suspects, text=text)
+        return kept
+
+    def _check_claims(self) -> None:
+        for store in (self._file, self._states):
+            if store is not None:
+                store.claim.check()
+
+    def _log_notes(self) -> None:
+        for plant, monitor in self._monitors.items():
+            while monitor.notes:
+                log.warning(monitor.notes.pop(0), plant=plant)
+            while monitor.failures.tracebacks:
+                log.debug("traceback", plant=plant, traceback=monitor.failures.tracebacks.pop(0))
+
+    def _log_rejects(self, now_ns: int) -> None:
+        """Log refused messages, at most once a minute for each plant, evictions and plants beyond the promise."""
+        for plant, monitor in self._monitors.items():
+            if (refused := monitor.rejects.report(now_ns)) is not None:
+                log.warning(refused, plant=plant)
+        if (excess := self._promise_excess) is not None and not self._excess_logged:
+            self._excess_logged = True
+            log.warning(excess)
+        if self.evictions > self._evicted_logged:
+            self._evicted_logged = self.evictions
+            log.warning("unverified plants without messages were evicted", so_far=self.evictions)
+
+    @property
+    def _promise_excess(self) -> str | None:
+        """Text for more plants than share the false alarms of the fleet; None: there are not more."""
+        promised, plants = self._fleet.false_alarms_per_day, len(self._monitors)
+        if promised is None or plants <= self._fleet.divisor:
+            return None
+        return (
+            f"the fleet has {plants} plants, and false_alarms_per_day is divided among {self._fleet.divisor}: up to "
+            f"{promised * plants / self._fleet.divisor:.3g} false alarms a day may come; set [fleet] most_plants"
+        )
+
+
+def plants_of(config: MonitorConfig, fleet: FleetConfig) -> str:
+    """Key expression of the plants of a fleet, or of the one plant of the monitor's settings."""
+    return fleet.plants or f"{keys.ROOT}/{config.plant}"
+
+
+def instance_token(config: MonitorConfig, fleet: FleetConfig) -> str:
+    """New instance token of a monitor, which tells its plants and its shard to others."""
+    if fleet.plants is None:
+        return keys.monitor_token(config.plant, instance_name())
+    shard = parse_shard(fleet.shard)
+    return keys.fleet_token(fleet.plants, str(shard.of), str(shard.number), instance_name())
