@@ -324,7 +324,7 @@ class ArxPredictor(Memory, dict=True):
 
         Args:
             parameters: parameters of the model of scaled signals, shape (parameters,).
-            covariance: their covariance, shape (parameters, parameters).
+            covariance: covariance of `parameters`, shape (parameters, parameters).
             condition: condition number of the regressors.
             rows: number of rows that the model has learned from.
             forgetting: forgetting factor.

@@ -141,7 +141,7 @@ class ArxReference(Reference):
     ) -> RowPrediction:
         """See `Reference`. Predictions with an input beyond the training are extrapolations."""
         if self.stays_as_fitted:
-            predictions = self._predict_as_fitted(inputs, values, follows=follows)
+            predictions = self._predict_by_matrix(inputs, values, follows=follows)
         else:
             pairs = zip(self.predictors, values, strict=True)
             predictions = [predictor.update(time_ns, inputs, value, follows=follows) for predictor, value in pairs]
@@ -197,8 +197,8 @@ class ArxReference(Reference):
                 needed[i, : structure.history, :inputs] = 1.0
         self._theta, self._needed = theta.reshape(outputs, -1), needed.reshape(outputs, -1)
 
-    def _predict_as_fitted(self, inputs: Sequence[float], values: Sequence[float], *, follows: bool) -> list[float]:
-        """Predict all outputs of a row from the rows before; NaN for an output without a prediction."""
+    def _predict_by_matrix(self, inputs: Sequence[float], values: Sequence[float], *, follows: bool) -> list[float]:
+        """Predict all outputs of a row from the rows before; NaN where there is no prediction."""
         past, row = self._memory.past, np.array([*inputs, *values])
         assert past is not None
         before = past.ravel() if follows else np.full(past.size, nan)
