@@ -315,7 +315,7 @@ class Monitor:
             settings={},
             alignment=self._aligner.memory,
             board=self.alarms.memory,
-            watch=self.pipeline.state,
+            watch=self.pipeline.memory,
             unconfirmed=[encode(item)[:3] for item in self.unconfirmed],
         )
 
@@ -329,7 +329,7 @@ class Monitor:
         try:
             pipeline = self._new_pipeline(board)
             board.restore(state.board)
-            pipeline.restore(state.watch, self.stats.start_ns)
+            pipeline.resume(state.watch, self.stats.start_ns)
             unconfirmed = [
                 Publication(key, cast(Body, decode(payload, encoding))) for key, payload, encoding in state.unconfirmed
             ]
@@ -444,13 +444,13 @@ class Monitor:
         promise = self.pipeline.evaluation.promises.promise
         if promise is None:
             return None
-        return promise.message(self.memory.last_ns or 0, self.pipeline.evaluation.rows_watched)
+        return promise.message(self.memory.last_ns or 0, self.pipeline.evaluation.memory.rows_watched)
 
     @property
     def excluded_signals(self) -> dict[str, str]:
         """Signals that are not monitored, with the reason: no value came, or the training could not use them."""
         never_came = (signal for signal in self._signals if signal not in self.memory.heard_from_ns)
-        return dict.fromkeys(never_came, NO_VALUE) | self.pipeline.evaluation.left_out
+        return dict.fromkeys(never_came, NO_VALUE) | self.pipeline.evaluation.memory.left_out
 
     @property
     def notes(self) -> list[str]:

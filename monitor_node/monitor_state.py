@@ -15,7 +15,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import AlignmentMemory
 from monitor_node.ingest.samples import UnusableSamples
 from monitor_node.ingest.sequence_check import SequenceCheck
-from monitor_node.watch.pipeline_state import PipelineState
+from monitor_node.watch.pipeline_memory import PipelineMemory
 from reactorwatch.errors import InputError
 from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.model import ProcessModel
@@ -77,7 +77,7 @@ def _digest(body: bytes) -> bytes:
 
 
 MAGIC = b"reactorwatch monitor"
-SEAL = Seal(MAGIC, 6, "state of a monitor")
+SEAL = Seal(MAGIC, 7, "state of a monitor")
 
 NOT_LEARNED_BY = frozenset({"process", "state_file", "state_every_s", "health_period_s", "diagnose_training"})
 """Settings that do not change what was learned; the model is identified by its equations, not by its file."""
@@ -142,7 +142,7 @@ class MonitorState(MonitorMemory, kw_only=True):
         settings: settings of the training, see `learning_settings`.
         alignment: state of the alignment.
         board: memory of the alarms.
-        watch: state of the pipeline.
+        watch: memory of the pipeline.
         unconfirmed: the newest publications, which may not have left the process; empty if they have.
         build: build of the software that stored it, see `reactorwatch.version`; empty before version 0.3.
     """
@@ -150,7 +150,7 @@ class MonitorState(MonitorMemory, kw_only=True):
     settings: dict[str, Any]
     alignment: AlignmentMemory
     board: AnnunciatorMemory
-    watch: PipelineState
+    watch: PipelineMemory
     unconfirmed: list[tuple[str, bytes, str]] = msgspec.field(default_factory=list)  # key, payload and encoding
     build: str = ""
 

@@ -4,7 +4,7 @@ A part's memory is one such structure (`Memory`): it is what runs, and what is s
 stored as consecutive doubles (`pack_numbers`): shorter than a list of MessagePack, and much faster to read. A field may
 be an array of doubles (NumPy's, or the growing one of `array`) or of records, or an object that has a `memory` of its
 `memory_type` and is made from it by `resume`: it is stored as the array's numbers, with the shape of a matrix, or as
-the object's memory.
+the object's memory. A message of the bus is stored as it is sent.
 """
 
 from array import array
@@ -133,6 +133,8 @@ def _encode(value: Any) -> Any:
         return value.item()
     if isinstance(value, array):
         return value.typecode, value.tobytes()
+    if hasattr(value, "SerializeToString"):
+        return value.SerializeToString()
     if not isinstance(value, np.ndarray):
         return value.memory
     if value.dtype.names is not None:
@@ -153,6 +155,8 @@ def _decode(kind: Any, data: Any) -> Any:
             return unpack_numbers(data, 1)[:, 0]
         shape, numbers = data
         return unpack_numbers(numbers, 1).reshape(shape)
+    if hasattr(kind, "FromString"):
+        return kind.FromString(data)
     if not hasattr(kind, "resume"):  # a field of any type
         return data
     return kind.resume(read_memory(data, kind.memory_type))

@@ -111,7 +111,7 @@ def watch(job: Job) -> Result:
     for item in samples_of(sound_record(job.inputs, job.noise, job.seed, job.span_min), config.plant):
         publications = monitor.on_message(encode(item), 0)
         alarms += sum(isinstance(item.message, Alarm) and item.message.event == "raised" for item in publications)
-    rows, promise = monitor.pipeline.evaluation.rows_watched, monitor.promise
+    rows, promise = monitor.pipeline.evaluation.memory.rows_watched, monitor.promise
     kept = promise is None or promise.kept
     return Result(
         alarms,

@@ -11,6 +11,8 @@ reference follows it, or learns it.
 
 from math import isfinite, nan
 
+import numpy as np
+
 from monitor_node.alarms.alarms import AlarmChange, Explanation
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.charts import chart_point
@@ -22,7 +24,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.spc.charts.base import Judgement, format_quantity
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.step_test import ONSETS, STEP_TEST, StepTests
-from reactorwatch.stored_state import pack_records, unpack_records
+from reactorwatch.stored_state import Records, place_records
 
 NAME = "shift"
 """Name of the chart."""
@@ -59,17 +61,18 @@ class ShiftWatch:
         self.is_active = self._tests is not None
 
     @property
-    def memory(self) -> bytes:
-        """Numbers of the tests; empty without tests. The alarms belong to the board."""
-        return b"" if self._tests is None else pack_records(self._tests.numbers)
+    def memory(self) -> Records | None:
+        """Numbers of the tests; None without tests. The alarms belong to the board."""
+        return None if self._tests is None else self._tests.numbers
 
-    def resume(self, memory: bytes) -> None:
+    def resume(self, memory: Records | None) -> None:
         """Go on from a memory; after the board.
 
         Raises:
             ValueError: the memory is of other outputs.
         """
-        self._tests = StepTests(unpack_records(memory, STEP_TEST, len(self._outputs))) if memory else None
+        numbers = None if memory is None else place_records(memory, np.zeros(len(self._outputs), STEP_TEST))
+        self._tests = None if numbers is None else StepTests(numbers)
         self.is_active = self._tests is not None
 
     @property

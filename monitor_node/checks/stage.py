@@ -7,6 +7,7 @@ sample is overdue.
 
 from collections.abc import Mapping, Sequence
 from math import nan
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.training_errors import TrainingErrors
-from reactorwatch.stored_state import Records
+from reactorwatch.stored_state import Records, read_memory
 
 SENSOR = "sensor"
 """Kind of the causes that checks suspect."""
@@ -100,15 +101,15 @@ class SignalChecks:
     # --- memory ----------------------------------------------------------------------------------------------
 
     @property
-    def memory(self) -> dict[str, bytes]:
-        """Memory of each check as it is stored, by name; the alarms belong to the board."""
-        return {check.name: check.memory.to_bytes() for check in self._checks if check.memory is not None}
+    def memory(self) -> dict[str, Any]:
+        """Memory of each check by name; the alarms belong to the board."""
+        return {check.name: check.memory for check in self._checks if check.memory is not None}
 
-    def resume(self, memory: Mapping[str, bytes], now_ns: int | None = None) -> None:
+    def resume(self, memory: Mapping[str, Any], now_ns: int | None = None) -> None:
         """Resume from the memory of checks with the same settings; the alarms are restored before.
 
         Args:
-            memory: memory of each check.
+            memory: memory of each check, as it was read.
             now_ns: present time, from which the data timeout counts; None: the data timeouts stay as they are.
 
         Raises:
@@ -119,7 +120,7 @@ class SignalChecks:
             raise ValueError(f"the state must be of the checks {sorted(checks)}, got {sorted(memory)}")
         for name, check in checks.items():
             if now_ns is not None or check is not self.silence:
-                check.memory = check.memory.from_bytes(memory[name])
+                check.memory = read_memory(memory[name], type(check.memory))
         self._use_numbers()
         if now_ns is not None:
             self.silence.of_plant.arm(now_ns)

@@ -27,6 +27,7 @@ from reactorwatch.identification.identify import WORST_MINUS_LOG10_P
 from reactorwatch.identification.regressor import Rows, rows_of
 from reactorwatch.identification.residual_tests import ResidualTest, independence, whiteness
 from reactorwatch.identification.structure import Structure
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import Memory, copy_of
 
 MARGIN = 0.1
@@ -40,21 +41,30 @@ MOSTLY = 0.5
 """Least share of the output's values that a simpler structure must predict; it is no cure for irregular rows."""
 
 
-class ArxMemory(Memory):
-    """Memory of the identified models.
+class ArxMemory(Memory, tag="arx"):
+    """Memory of the identified models as reference, beside the models.
 
     Attributes:
-        predictors: the models, one an output.
-        low: lower end of the range in which the models hold, one an input; empty before the fit.
+        low: lower end of the range in which the models hold, one an input.
         high: upper end of it.
         past: where the models stay as fitted, signals of the rows before the next one, the inputs first and the newest
             row first, shape (rows, signals), NaN where missing; None elsewhere.
     """
 
-    predictors: list[ArxPredictor]
     low: list[float] = msgspec.field(default_factory=list)
     high: list[float] = msgspec.field(default_factory=list)
     past: Array | None = None
+
+    def reference(
+        self, equations: ProcessModel | None, outputs: tuple[str, ...], models: "ArxReference"
+    ) -> "ArxReference":
+        """The identified models, which judge from now on as this memory has it.
+
+        Raises:
+            ValueError: the memory is of other settings.
+        """
+        models.judge_by(copy_of(self))
+        return models
 
 
 class ArxReference(Reference):
@@ -66,6 +76,7 @@ class ArxReference(Reference):
 
     Attributes:
         points: see above.
+        predictors: the models, one an output; always the same list.
     """
 
     kind = "arx"
@@ -74,47 +85,60 @@ class ArxReference(Reference):
     def __init__(self, config: MonitorConfig, *, points: bool) -> None:
         self._config, self.points = config, points
         self._sds = [1.0] * len(config.outputs)
+        self.predictors: list[ArxPredictor] = []
         self.forget()
 
     def forget(self) -> None:
         """Start models that know nothing."""
         structure, forgetting = arx_structure(self._config), self._config.forgetting
-        self._use(ArxMemory([ArxPredictor.of(structure, forgetting) for _ in self._config.outputs]))
+        self.predictors[:] = [ArxPredictor.of(structure, forgetting) for _ in self._config.outputs]
+        self.judge_by(ArxMemory())
 
-    def _use(self, memory: ArxMemory) -> None:
-        self._memory, self.predictors = memory, memory.predictors
-        self._uses_inputs = np.array([predictor.structure.inputs > 0 for predictor in self.predictors])
-        ranges = zip(memory.low, memory.high, strict=True)
-        self._ranges = list(enumerate(ranges)) if self._uses_inputs.any() else []
-        self._beyond: list[int] = []
-        if memory.past is not None:
-            self._set_matrices(*memory.past.shape)
+    def resume(self, predictors: Sequence[ArxPredictor], *, follows: bool) -> None:
+        """Resume from models of the same settings.
 
-    @property
-    def memory(self) -> ArxMemory:
-        """See `Reference`; the models are part of it."""
-        return self._memory
+        Args:
+            predictors: the models, which are copied.
+            follows: True if the next row follows the ones before.
 
-    def resume(self, memory: ArxMemory) -> None:
-        """Resume from a copy of a `memory` of the same settings.
+        Raises:
+            ValueError: the models are of other settings.
+        """
+        wanted = arx_structure(self._config)
+        for predictor in predictors:
+            if predictor.wanted != wanted or predictor.structure not in (wanted, *simpler_structures(wanted)):
+                raise ValueError(f"the state must be of {wanted}, got {predictor.wanted}")
+        self.predictors[:] = map(copy_of, predictors)
+        self.judge_by(ArxMemory())
+        if not follows:
+            self.restart()
+
+    def judge_by(self, memory: ArxMemory) -> None:
+        """Take over the ranges in which the models hold, and the rows before the next one.
 
         Raises:
             ValueError: the memory is of other settings.
         """
-        wanted = arx_structure(self._config)
-        for predictor in memory.predictors:
-            if predictor.wanted != wanted or predictor.structure not in (wanted, *simpler_structures(wanted)):
-                raise ValueError(f"the state must be of {wanted}, got {predictor.wanted}")
-        past, signals = memory.past, len(self._config.signals)
-        if past is not None and past.shape != (wanted.history, signals):
-            raise ValueError(f"rows before must have shape {(wanted.history, signals)}, got {past.shape}")
-        self._use(copy_of(memory))
+        shape = arx_structure(self._config).history, len(self._config.signals)
+        if memory.past is not None and memory.past.shape != shape:
+            raise ValueError(f"rows before must have shape {shape}, got {memory.past.shape}")
+        self._memory, self._beyond = memory, list[int]()
+        self._uses_inputs = np.array([predictor.structure.inputs > 0 for predictor in self.predictors])
+        ranges = zip(memory.low, memory.high, strict=True)
+        self._ranges = list(enumerate(ranges)) if self._uses_inputs.any() else []
+        if memory.past is not None:
+            self._set_matrices(*shape)
 
     def copy(self) -> "ArxReference":
-        """Models that stand where these do."""
+        """Models that stand where these do, and judge nothing."""
         copy = ArxReference(self._config, points=self.points)
-        copy.resume(self._memory)
+        copy.resume(self.predictors, follows=True)
         return copy
+
+    @property
+    def memory(self) -> ArxMemory:
+        """See `Reference`; the models are stored beside it."""
+        return self._memory
 
     @property
     def typical_sd(self) -> list[float]:
@@ -236,13 +260,13 @@ class ArxReference(Reference):
 
     def start_judging(self, time_min: Array, inputs: Array, outputs: Array) -> None:
         """Judge the rows after a training; arguments as for `fit`, with values of each input."""
-        memory, low, high = self._memory, np.nanmin(inputs, axis=0), np.nanmax(inputs, axis=0)
+        low, high = np.nanmin(inputs, axis=0), np.nanmax(inputs, axis=0)
         margin = MARGIN * (high - low)
         if inputs.shape[1] > 1:  # an input that did not move has no coefficient
             values = np.count_nonzero(np.isfinite(inputs), axis=0)
             reach = np.where(high > low, np.nanstd(inputs, axis=0) * np.sqrt(MOST_LEVERAGE * values), np.inf)
             margin = np.maximum(margin, reach - 0.5 * (high - low))
-        memory.low, memory.high = (low - margin).tolist(), (high + margin).tolist()
+        memory = ArxMemory((low - margin).tolist(), (high + margin).tolist())
         if self._config.has_values_only:
             history, late = arx_structure(self._config).history, np.flatnonzero(~regular_intervals(time_min))
             newest = np.column_stack([inputs, outputs])[(late[-1] + 1 if late.size else 0) :][: -history - 1 : -1]
@@ -251,7 +275,7 @@ class ArxReference(Reference):
         else:
             for predictor in self.predictors:
                 predictor.start_judging()
-        self._use(memory)
+        self.judge_by(memory)
 
 
 def fit_model(

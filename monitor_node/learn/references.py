@@ -75,7 +75,7 @@ class Reference(ABC):
     @property
     @abstractmethod
     def memory(self) -> Any:
-        """The memory, without the equations; `reference` of a filter's makes one that resumes from a copy of it."""
+        """The memory, without equations and models; its `reference` makes one that resumes from a copy of it."""
 
     @property
     @abstractmethod

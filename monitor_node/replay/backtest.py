@@ -11,7 +11,7 @@ from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.learn.arx import arx_structure, fewest_rows
 from monitor_node.learn.training import FEWEST_ROWS
-from monitor_node.watch.pipeline_state import PipelineState
+from monitor_node.watch.pipeline_memory import PipelineMemory
 from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_states import Event
@@ -21,6 +21,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Incident, Promis
 from reactorwatch.errors import UnfitRecordError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
+from reactorwatch.stored_state import copy_of
 
 
 class LoggedRow(NamedTuple):
@@ -94,12 +95,12 @@ class TrainedPlant(NamedTuple):
 
     Attributes:
         rows: number of rows of the training.
-        state: the trained pipeline.
+        memory: memory of the trained pipeline.
         notes: notes on the training.
     """
 
     rows: int
-    state: PipelineState
+    memory: PipelineMemory
     notes: list[str]
 
 
@@ -193,7 +194,7 @@ def train(
             monitor.on_message(message, message.received_ns)
     monitor.finish()
     monitor.pipeline.end_training(monitor.memory.last_ns or 0)
-    return TrainedPlant(monitor.pipeline.training_rows, monitor.pipeline.state, [*monitor.notes])
+    return TrainedPlant(monitor.pipeline.training_rows, copy_of(monitor.pipeline.memory), [*monitor.notes])
 
 
 def run(
@@ -220,7 +221,7 @@ def run(
     """
     monitor = _make_monitor(config, zero_ns, model)
     if trained is not None:
-        monitor.pipeline.restore(trained.state, 0)
+        monitor.pipeline.resume(copy_of(trained.memory), 0)
         monitor.pipeline.start_run()
     alarms, incidents = list[Alarm](), list[Incident]()
     first_ns: int | None = None

@@ -26,7 +26,7 @@ from monitor_node.learn.training import NO_VALUE, TrainingResult
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.budget import AlarmBudget
 from monitor_node.watch.estimates import chart_limits, estimate_keys, estimates
-from monitor_node.watch.pipeline_state import TrainedState
+from monitor_node.watch.pipeline_memory import EvaluationMemory
 from monitor_node.watch.power import Watch
 from monitor_node.watch.promise import PromiseStage
 from monitor_node.watch.row_step import EVENT, VIOLATING, OrdinaryRows
@@ -34,8 +34,8 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Check
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.spc.prewhitening import WHITENER, Prewhitener, Prewhitening, expected_values, innovations
-from reactorwatch.stored_state import copy_of, pack_records, unpack_records
+from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening, expected_values, innovations
+from reactorwatch.stored_state import place_records
 
 
 class Evaluation:
@@ -58,11 +58,7 @@ class Evaluation:
         is_process: True if the plant is the model's.
         is_ordinary: True if the compiled step may take the next row, see `row_step`.
         needs_rows: True if there is anything to publish or to update after a row that the compiled step has taken.
-        left_out: signals that are not monitored, with the reason.
-        checks: checks of the training.
-        rows_watched: number of evaluated rows.
-        has_judged: True if a chart could judge one of them since this object was made.
-        incident: rows since an alarm without a known cause is active; None: there is none.
+        has_judged: True if a chart could judge an evaluated row since this object was made.
         notes: notes to log, oldest first; the caller empties the list.
     """
 
@@ -83,6 +79,7 @@ class Evaluation:
         self._paths, self._paths_beside = estimate_keys(config), estimate_keys(config, ArxReference.kind)
         self._is_process_given = is_process
         self.reference: Reference | None = None
+        self.is_ordinary, self.needs_rows = False, True
         self._ranges, self._stated = possible_ranges(config, model), stated_ranges(config)
         self._charts = ChartWatch(config, board)
         self.ordinary = OrdinaryRows(config, self._ranges)
@@ -92,82 +89,66 @@ class Evaluation:
         self._shift = ShiftWatch(config, board)
         self._budget = AlarmBudget(config, self._charts.design, self.signals, self._shift, self._drift)
         self._suspicion: Suspicion | None = None
-        self._whiteners: list[Prewhitener] = []
+        self._whitener_numbers = self.ordinary.numbers["whiteners"][0]
+        self._whiteners = [Prewhitener(None, self._whitener_numbers[i : i + 1]) for i in range(len(config.outputs))]
         self._whitened_sds: list[float] = []
-        self._arl0 = 0.0
-        self._quarantined = (False,) * len(config.outputs)
+        self._memory = self._new_memory()
         self._evaluated = [True] * len(config.outputs)
         self._noted: set[str] = set()
-        self.is_ordinary = False
-        self.needs_rows = True
-        self.left_out: dict[str, str] = {}
-        self.checks: list[Check] = []
-        self.rows_watched, self.has_judged = 0, False
-        self.incident: TrainingRows | None = None
+        self.has_judged = False
         self.notes: list[str] = []
 
-    # --- state -----------------------------------------------------------------------------------------------
+    # --- memory ----------------------------------------------------------------------------------------------
 
-    def trained_state(self, reference: Reference, baseline: bytes) -> TrainedState:
-        """A copy of the state after the training, without the identified models and the signal checks.
-
-        Args:
-            reference: the reference.
-            baseline: change of the model in force, see `TrainedState`.
-        """
+    @property
+    def memory(self) -> EvaluationMemory:
+        """The memory that runs, with what filter and compiled step keep elsewhere; the alarms belong to the board."""
+        memory = self._memory
         if self.is_ordinary:
             self._charts.store(self.ordinary.numbers[0])
-        return TrainedState(
-            None if reference is self._models else copy_of(reference.memory),
-            [(check.name, check.result) for check in self.checks],
-            dict(self.left_out),
-            pack_records(self.ordinary.numbers["whiteners"][0]),
-            copy_of(self._charts.memory),
-            None if self._suspicion is None else copy_of(self._suspicion.memory),
-            self._arl0,
-            list(self._quarantined),
-            self.rows_watched,
-            self._drift.until_next,
-            baseline,
-            self._shift.memory,
-            None if self.promises.promise is None else copy_of(self.promises.promise),
-        )
+        memory.reference = None if self.reference is None else self.reference.memory
+        memory.until_drift = self._drift.until_next
+        return memory
 
-    def restore(self, state: TrainedState, equations: ProcessModel | None) -> None:
-        """Resume from a state; the alarms, the signal checks and the identified models are restored before.
+    def resume(
+        self, memory: EvaluationMemory, equations: ProcessModel | None, now_ns: int | None = None, *, follows: bool
+    ) -> None:
+        """Go on from a memory of the same settings, which is then the one that runs; the alarms are restored before.
 
         Args:
-            state: the state.
+            memory: the memory, as it was read.
             equations: process model in force; None: there is none.
+            now_ns: present time, from which the data timeout counts; None: the data timeouts stay as they are.
+            follows: True if the next row follows the ones before.
 
         Raises:
-            ValueError: the state is damaged.
+            ValueError: the memory is damaged, or of other settings.
         """
-        self.restore_baseline(state, equations)
-        if (state.suspicion is None) != (self._suspicion is None):
-            raise ValueError("the state must tell of the search for causes as it is set")
-        if state.suspicion is not None and self.reference is not None:
-            self._suspicion = self._new_suspicion(self.reference, copy_of(state.suspicion))
-
-    def restore_baseline(self, state: TrainedState, equations: ProcessModel | None) -> None:
-        """Take over what was learned, as `restore`; the search for causes starts with the next row."""
-        self._drift.until_next = state.until_drift
-        self.promises.promise = None if state.promise is None else copy_of(state.promise)
-        self.checks = [Check(name=name, result=result) for name, result in state.checks]
-        outputs = len(self._config.outputs)
-        if len(state.withheld) != outputs:
-            raise ValueError(f"the state must be of {outputs} outputs, got {len(state.withheld)}")
-        numbers = self.ordinary.numbers["whiteners"][0]
-        numbers[:] = unpack_records(state.whiteners, WHITENER, outputs)
-        self._whiteners = [Prewhitener(None, numbers[i : i + 1]) for i in range(outputs)]
+        outputs = self._config.outputs
+        if len(memory.quarantined) != len(outputs):
+            raise ValueError(f"the state must be of {len(outputs)} outputs, got {len(memory.quarantined)}")
+        self.signals.resume(memory.signals, now_ns)
+        self._models.resume(memory.predictors, follows=follows)
+        self._memory, self._drift.until_next = memory, memory.until_drift
+        memory.signals, memory.predictors = self.signals.memory, self._models.predictors
+        memory.whiteners = place_records(memory.whiteners, self._whitener_numbers)
+        self.promises.promise = memory.promise
+        self._leave_out(memory.left_out)
+        if memory.reference is None:
+            return
         learned = [whitener.autoregression for whitener in self._whiteners]
-        self._leave_out(state.left_out)
-        stored = state.reference
-        reference = self._models if stored is None else stored.reference(equations, self._config.outputs)
-        self._set_reference(reference, learned, state.arl0)
-        self._charts.resume(copy_of(state.charts), self._evaluated)
-        self._shift.resume(state.shift)
-        self._quarantined, self.rows_watched = tuple(state.withheld), state.rows_watched
+        self._set_reference(memory.reference.reference(equations, outputs, self._models), learned, memory.suspicion)
+        self._charts.resume(memory.charts, self._evaluated)
+        self._shift.resume(memory.shift)
+        memory.shift = self._shift.memory
+
+    def _new_memory(self) -> EvaluationMemory:
+        return EvaluationMemory(
+            predictors=self._models.predictors,
+            signals=self.signals.memory,
+            whiteners=self._whitener_numbers,
+            quarantined=(False,) * len(self._config.outputs),
+        )
 
     # --- start and stop --------------------------------------------------------------------------------------
 
@@ -188,19 +169,20 @@ class Evaluation:
         )
         period_min = period_ns / MINUTE_NS
         arl0 = self._budget.share(self._evaluated, period_min, trained.checks)
-        self.checks = trained.checks
-        self._set_reference(trained.reference, trained.learned, arl0)
-        self._whiteners = [
-            Prewhitener(item, self.ordinary.numbers["whiteners"][0, i : i + 1])
-            for i, item in enumerate(trained.learned)
-        ]
+        memory = self._memory
+        memory.checks, memory.arl0 = trained.checks, arl0
+        self._set_reference(trained.reference, trained.learned)
+        for whitener, item in zip(self._whiteners, trained.learned, strict=True):
+            whitener.start(item)
         self._charts.start(trained.learned, trained.e, trained.values, arl0)
         self._shift.start(trained.responses if self._shift.is_active else None, trained.z, trained.learned, arl0)
+        memory.charts, memory.shift = self._charts.memory, self._shift.memory
         values, e = trained.measured.T.tolist(), trained.e.T.tolist()
         self.signals.start(CheckTraining(values, e, trained.outliers, period_ns, arl0))
         watch = self._watch(trained, units, period_min) if self.promises.states_power else None
         rates = self._budget.alarm_rates(trained, self._evaluated, arl0)
         self.promises.start(rates, self.chance_alarms / arl0, period_min, trained.excess_rate(arl0), watch)
+        memory.promise = self.promises.promise
         if not again:
             self.notes += self._drift.start(self._models.predictors, self._evaluated, arl0)
         self.notes += [f"training: {check.result}" for check in trained.checks if check.result != "ok"]
@@ -209,21 +191,22 @@ class Evaluation:
         return Watch(
             self._config,
             trained.reference,
-            self._models.predictors,
             trained.learned,
-            self._charts.design.detectors(trained.learned, trained.e, self._arl0),
+            self._charts.design.detectors(trained.learned, trained.e, self._memory.arl0),
             self._shift.sensitivities,
             self._evaluated,
             dict(zip(self._config.outputs, units, strict=True)),
             period_min,
         )
 
-    def _set_reference(self, reference: Reference, learned: list[Prewhitening], arl0: float) -> None:
-        """Set the reference for the rows to come."""
-        self.reference, self._arl0 = reference, arl0
+    def _set_reference(
+        self, reference: Reference, learned: list[Prewhitening], suspicion: SuspicionMemory | None = None
+    ) -> None:
+        """Set the reference for the rows to come; the search for causes goes on from its memory."""
+        self.reference = reference
         self._use_ranges()
         self._whitened_sds = [item.sd for item in learned]
-        self._suspicion = self._new_suspicion(reference)
+        self._start_search(reference, suspicion)
         self.ordinary.start(reference)
 
     def _use_ranges(self) -> None:
@@ -233,7 +216,7 @@ class Evaluation:
 
     def _leave_out(self, left_out: dict[str, str]) -> None:
         """Exclude signals from monitoring."""
-        self.left_out = dict(left_out)
+        self._memory.left_out = dict(left_out)
         self._evaluated = [name not in left_out for name in self._config.outputs]
 
     def stop(self) -> None:
@@ -241,9 +224,8 @@ class Evaluation:
         self.reference = self._suspicion = None
         self.ordinary.stop()
         self._use_ranges()
+        self._memory, self.promises.promise = self._new_memory(), None
         self._leave_out({})
-        self.rows_watched = 0
-        self.promises.promise = None
 
     def restart(self) -> None:
         """Judge the next row without those before it, as after a gap; charts and alarms keep their memory."""
@@ -262,7 +244,7 @@ class Evaluation:
 
     def release_values(self) -> None:
         """Take no value for a possible spike any more."""
-        self._quarantined = (False,) * len(self._config.outputs)
+        self._memory.quarantined = (False,) * len(self._config.outputs)
 
     # --- rates -----------------------------------------------------------------------------------------------
 
@@ -274,7 +256,8 @@ class Evaluation:
     @property
     def expected_false_alarms(self) -> float:
         """Mean number of false alarms expected so far."""
-        return self.rows_watched * self.chance_alarms / self._arl0 if self._arl0 else 0.0
+        memory = self._memory
+        return memory.rows_watched * self.chance_alarms / memory.arl0 if memory.arl0 else 0.0
 
     # --- ordinary rows ---------------------------------------------------------------------------------------
 
@@ -284,7 +267,12 @@ class Evaluation:
         if self.ordinary.kalman is None or self._board.has_unexplained or not self._charts.is_ordinary:
             return False
         assert reference is not None
-        if self.left_out or True in self._quarantined or sampling.learned_ns is None or sampling.spacing_ns is None:
+        if (
+            self._memory.left_out
+            or True in self._memory.quarantined
+            or sampling.learned_ns is None
+            or sampling.spacing_ns is None
+        ):
             return False
         if not (self.signals.is_ordinary and reference.is_ordinary(time_min)):
             return False
@@ -313,7 +301,8 @@ class Evaluation:
             self._charts.store_delays(self.ordinary.numbers[0])
         inputs = values[: self._inputs]
         reference.accept_row(time_min, inputs)
-        self.rows_watched, self.has_judged = self.rows_watched + 1, True
+        self._memory.rows_watched += 1
+        self.has_judged = True
         if self._suspicion is not None:
             self._suspicion.add(time_min, inputs, values[self._inputs :])
         return True
@@ -340,7 +329,9 @@ class Evaluation:
     def _count_alarms(self, row: MeasuredRow, before: int) -> None:
         """Count a row's alarms that chance can raise, among its publications from an index on."""
         alarms = [item.message for item in row.publications[before:] if isinstance(item.message, Alarm)]
-        if alarms and (note := self.promises.count_alarms(row.time_ns, self.rows_watched, alarms, row.publications)):
+        if alarms and (
+            note := self.promises.count_alarms(row.time_ns, self._memory.rows_watched, alarms, row.publications)
+        ):
             self.notes.append(note)
 
     # --- events ----------------------------------------------------------------------------------------------
@@ -363,7 +354,7 @@ class Evaluation:
         """Evaluate a row, stage by stage; its changes of alarms, with those given, are applied once."""
         reference, time_ns, units, publications = self.reference, row.time_ns, row.units, row.publications
         assert reference is not None
-        if self.left_out:
+        if self._memory.left_out:
             self._mask_signals(row)
         stuck = self.signals.check_values(time_ns, row.values, units, changes)
         if True in stuck:
@@ -372,7 +363,7 @@ class Evaluation:
         if row.interval.is_gap:  # the input in it is unknown
             self.restart()
         predictions, sds, extrapolation = reference.update(
-            time_ns, row.inputs, values, self._quarantined, row.interval.missing, follows=row.follows
+            time_ns, row.inputs, values, self._memory.quarantined, row.interval.missing, follows=row.follows
         )
         z = [(value - prediction) / sd for value, prediction, sd in zip(values, predictions, sds, strict=True)]
         tested = z
@@ -380,15 +371,16 @@ class Evaluation:
             tested = [(value - known) / sd for value, known, sd in zip(values, *extrapolation, strict=True)]
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
-            expected = expected_values(self.ordinary.numbers["whiteners"][0])
+            expected = expected_values(self._whitener_numbers)
             limits = chart_limits(predictions, sds, scales, expected, self._charts.memory.widths)
             publications.extend(estimates(row, self._paths, predictions, limits))
-        e = innovations(self.ordinary.numbers["whiteners"][0], z)
-        self.rows_watched += 1
+        e = innovations(self._whitener_numbers, z)
+        self._memory.rows_watched += 1
         if not self.has_judged:
             judged = (*e, *(tested if self._shift.is_active else ()), *(values if self._charts.reads_values else ()))
             self.has_judged = any(map(isfinite, judged))
-        self._quarantined = quarantined = tuple(self.signals.check_residuals(time_ns, e, scales, units, changes))
+        quarantined = tuple(self.signals.check_residuals(time_ns, e, scales, units, changes))
+        self._memory.quarantined = quarantined
         if True in quarantined:
             for whitener, outlier in zip(self._whiteners, quarantined, strict=True):
                 if outlier:
@@ -422,19 +414,20 @@ class Evaluation:
 
     def _keep_incident(self, row: MeasuredRow) -> None:
         """Keep the rows since an alarm without a known cause is active."""
+        memory = self._memory
         if not self._board.has_unexplained:
-            self.incident = None
+            memory.incident = None
             return
-        sample = row.time_ns, row.inputs, list(row.values)
-        if self.incident is None:
-            self.incident = TrainingRows([0] * len(self._config.outputs))
-        self.incident.add(*sample)
+        if memory.incident is None:
+            memory.incident = TrainingRows([0] * len(self._config.outputs))
+        memory.incident.add(row.time_ns, row.inputs, row.values)
 
-    def _new_suspicion(self, reference: Reference, memory: SuspicionMemory | None = None) -> Suspicion | None:
-        plant = reference.plant
-        if plant is None or not has_causes(self._config, plant.equations):
-            return None
-        return Suspicion(self._config, self._board, plant, memory)
+    def _start_search(self, reference: Reference, memory: SuspicionMemory | None = None) -> None:
+        """Start the search for causes, or go on with it, if there is one."""
+        plant, self._suspicion = reference.plant, None
+        if plant is not None and has_causes(self._config, plant.equations):
+            self._suspicion = Suspicion(self._config, self._board, plant, memory)
+        self._memory.suspicion = None if self._suspicion is None else self._suspicion.memory
 
     def _search_causes(self, row: MeasuredRow, stuck: Sequence[bool]) -> list[Publication]:
         """Search the causes of alarms; an error there costs the state of the search, and no alarm."""
@@ -444,7 +437,7 @@ class Evaluation:
         except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
             self._failures.add("isolation", error, "the search for the cause of this alarm starts again")
             assert self.reference is not None
-            self._suspicion = self._new_suspicion(self.reference)
+            self._start_search(self.reference)
             return []
 
     def _note_unjudged(self, reference: Reference) -> None:
@@ -456,13 +449,14 @@ class Evaluation:
 
     def _mask_signals(self, row: MeasuredRow) -> None:
         """Mask the signals that are left out, as in the training; note once each that comes after it."""
+        left_out = self._memory.left_out
         for name, value in zip(self._config.signals, (*row.inputs, *row.values), strict=True):
-            if self.left_out.get(name) == NO_VALUE and isfinite(value):
-                self.left_out[name] = "its first value came after the training"
+            if left_out.get(name) == NO_VALUE and isfinite(value):
+                left_out[name] = "its first value came after the training"
                 self.notes.append(
                     f"{name} comes now, and is not watched: start the monitor without its state to learn it"
                 )
         row.inputs = tuple(
-            0.0 if name in self.left_out else value for name, value in zip(self._config.inputs, row.inputs, strict=True)
+            0.0 if name in left_out else value for name, value in zip(self._config.inputs, row.inputs, strict=True)
         )
         row.values = [value if evaluated else nan for value, evaluated in zip(row.values, self._evaluated, strict=True)]

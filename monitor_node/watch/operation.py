@@ -50,6 +50,9 @@ class Operation:
         config: settings of the monitor.
         bounds: bounds of each input.
         units: units by signal.
+
+    Attributes:
+        memory: states of modes and set points, by signal.
     """
 
     def __init__(self, config: MonitorConfig, bounds: Sequence[SignalRange], units: Mapping[str, str]) -> None:
@@ -57,26 +60,11 @@ class Operation:
         self._bounds = list(zip(config.inputs, bounds, strict=True))
         self.inputs: Sequence[float] = ()
         """Inputs of the row that is being evaluated; empty between rows."""
-        self._carried = {name: CarriedState() for name in config.carried_signals}
-
-    @property
-    def state(self) -> dict[str, CarriedState]:
-        """A copy of the state, by signal."""
-        return {name: msgspec.structs.replace(state) for name, state in self._carried.items()}
-
-    def restore(self, state: dict[str, CarriedState]) -> None:
-        """Resume from a state of the same settings.
-
-        Raises:
-            ValueError: the state is of other signals.
-        """
-        if set(state) != set(self._carried):
-            raise ValueError(f"the state must be of {sorted(self._carried)}, got {sorted(state)}")
-        self._carried = {name: state[name] for name in self._carried}
+        self.memory = {name: CarriedState() for name in config.carried_signals}
 
     def on_sample(self, signal: str, time_ns: int, value: float) -> None:
         """Process a sample of a mode or a set point; one that is not newer than the newest is ignored."""
-        state = self._carried[signal]
+        state = self.memory[signal]
         if time_ns <= state.time_ns:
             return
         state.time_ns = time_ns
@@ -92,16 +80,16 @@ class Operation:
     @property
     def values(self) -> dict[str, float]:
         """Newest value of each mode and set point; NaN before the first."""
-        return {name: state.value for name, state in self._carried.items()}
+        return {name: state.value for name, state in self.memory.items()}
 
     def on_restart(self) -> None:
         """Forget times: the plant's clock was set back, or the plant was restarted."""
-        for name, state in self._carried.items():
-            self._carried[name] = CarriedState(state.value, usual=state.usual)
+        for name, state in self.memory.items():
+            self.memory[name] = CarriedState(state.value, usual=state.usual)
 
     def end_training(self) -> None:
         """Take the present modes as the usual ones."""
-        for state in self._carried.values():
+        for state in self.memory.values():
             state.usual = state.value
 
     def describe(self, time_ns: int) -> str:
@@ -113,13 +101,13 @@ class Operation:
         return "; ".join(filter(None, parts))
 
     def _describe_mode(self, name: str) -> str:
-        state = self._carried[name]
+        state = self.memory[name]
         if state.value == state.usual or state.usual != state.usual:
             return ""
         return f"{name} is {state.value:.6g}, and was {state.usual:.6g} at the end of the training"
 
     def _describe_move(self, name: str, time_ns: int) -> str:
-        state = self._carried[name]
+        state = self.memory[name]
         if state.before != state.before or time_ns - state.changed_ns > self._config.incident_min * MINUTE_NS:
             return ""
         now, minutes = (

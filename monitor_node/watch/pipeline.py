@@ -20,20 +20,18 @@ from monitor_node.learn.signal_range import input_bounds
 from monitor_node.learn.training import TrainingResult
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding, equations_text
 from monitor_node.learn.training_rows import TrainingRows
+from monitor_node.watch.baselines import Baselines
 from monitor_node.watch.budget import check_promise
 from monitor_node.watch.estimates import model_snapshots
 from monitor_node.watch.evaluation import Evaluation
-from monitor_node.watch.kept_baselines import KeptBaselines
-from monitor_node.watch.operating_modes import OperatingModes
 from monitor_node.watch.operation import Operation
-from monitor_node.watch.pipeline_state import PipelineState
+from monitor_node.watch.pipeline_memory import PipelineMemory
 from monitor_node.watch.promise import PromiseStage
 from monitor_node.watch.row_frame import Records
 from monitor_node.watch.row_step import FilterNumbers
 from monitor_node.watch.training_stage import TIMES_FEWEST, TrainingStage
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Baseline
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -103,65 +101,47 @@ class PlantPipeline:
         )
         self._training = TrainingStage(config, self.model, self.models)
         self.model_update = ModelUpdate(config, deque() if changes is None else changes)
-        self.baselines = KeptBaselines(self.model, self.models, self._training, self.evaluation, self.model_update)
-        self._modes: OperatingModes | None = None
-        if config.modes:
-            self._modes = OperatingModes(config, self.models, self._training, self.evaluation, self.baselines)
+        self.baselines = Baselines(config, self.model, self.models, self._training, self.evaluation, self.model_update)
 
-    # --- state -----------------------------------------------------------------------------------------------
+    # --- memory ----------------------------------------------------------------------------------------------
 
     @property
-    def state(self) -> PipelineState:
-        """A copy of the state between two rows, without the alarms."""
-        evaluation, training, reference = self.evaluation, self._training, self.evaluation.reference
-        change = self.model_update.baseline if reference is None else None
-        return PipelineState(
-            copy_of(self._sampling),
-            evaluation.signals.memory,
-            copy_of(self.models.memory),
-            training.refusals,
-            training.began_ns,
-            self.model_update.rows or copy_of(training.rows),
-            None if reference is None else self.baselines.trained_state(reference),
-            self.operation.state,
-            list(self.baselines.kept),
-            b"" if change is None else change.SerializeToString(),
-            None if evaluation.incident is None else copy_of(evaluation.incident),
-            None if self._modes is None else self._modes.copy_state(),
-            [command.SerializeToString() for command in self.model_update.commands],
+    def memory(self) -> PipelineMemory:
+        """The memory between two rows, composed of those that run; the alarms belong to the board."""
+        return PipelineMemory(
+            self._sampling,
+            self.operation.memory,
+            self._training.memory,
+            self.evaluation.memory,
+            self.baselines.modes,
+            self.baselines.kept,
+            self.model_update.baseline,
+            self.model_update.rows,
+            self.model_update.commands,
         )
 
-    def restore(self, state: PipelineState, now_ns: int) -> None:
-        """Resume bit-identically from a state of the same settings; the alarms are restored before.
+    def resume(self, memory: PipelineMemory, now_ns: int) -> None:
+        """Resume bit-identically from a memory of the same settings; the alarms are restored before.
 
         Args:
-            state: the state.
+            memory: the memory, which is then the one that runs.
             now_ns: present time, from which the data timeout counts.
 
         Raises:
-            ValueError: the state is damaged.
+            ValueError: the memory is damaged.
         """
-        self._sampling = copy_of(state.sampling)
-        self.operation.restore(state.operation)
-        self.evaluation.signals.resume(state.signals, now_ns)
-        self.models.resume(state.models)
-        self._training.refusals, self._training.began_ns = state.refusals, state.began_ns
-        self.baselines.kept = list(state.kept)
-        self.model_update.changes.extend(ScheduledChange(None, Baseline.FromString(item)) for item in state.commands)
-        watched = state.watched
-        change = state.change if watched is None or not watched.baseline else watched.baseline
-        if change:
-            self.model_update.baseline = Baseline.FromString(change)
-        if state.incident is not None:
-            self.evaluation.incident = copy_of(state.incident)
-        if self._modes is not None and state.modes is not None:
-            self._modes.restore(state.modes)
-        if watched is None:
-            self._training.rows = copy_of(state.training)
-            return
-        if state.training.times and self._config.diagnose_training:
-            self.model_update.rows = state.training
-        self.evaluation.restore(watched, self.baselines.equations)
+        update, baselines = self.model_update, self.baselines
+        if set(memory.operation) != set(self.operation.memory):
+            raise ValueError(f"the state must be of {sorted(self.operation.memory)}, got {sorted(memory.operation)}")
+        self._sampling, self.operation.memory, self._training.memory = (
+            memory.sampling,
+            memory.operation,
+            memory.training,
+        )
+        baselines.modes, baselines.kept, update.baseline = memory.modes, memory.kept, memory.change
+        update.changes.extend(ScheduledChange(None, change) for change in memory.commands)
+        update.rows = memory.undiagnosed if self._config.diagnose_training else None
+        self.evaluation.resume(memory.evaluation, baselines.equations, now_ns, follows=True)
 
     def resume_from_alarms(self) -> None:
         """Follow alarms that were set from outside."""
@@ -188,7 +168,7 @@ class PlantPipeline:
     @property
     def is_judged(self) -> bool:
         """False in a mode in which signals are checked only."""
-        return self._modes is None or self._modes.state.is_judged
+        return self.baselines.modes.is_judged
 
     @property
     def reference(self) -> str:
@@ -198,7 +178,7 @@ class PlantPipeline:
     @property
     def newest_reference(self) -> str:
         """Kind of the reference that judges, or judged last; empty before there was one."""
-        return self.reference or ("" if self._modes is None else self._modes.state.reference)
+        return self.reference or self.baselines.modes.reference
 
     @property
     def noise_levels(self) -> dict[str, dict[str, float]] | None:
@@ -224,7 +204,7 @@ class PlantPipeline:
     @property
     def expected_false_alarms(self) -> float:
         """Mean number of false alarms expected so far."""
-        return (self.evaluation if self._modes is None else self._modes).expected_false_alarms
+        return self.baselines.expected_false_alarms
 
     # --- rows ------------------------------------------------------------------------------------------------
 
@@ -239,8 +219,8 @@ class PlantPipeline:
         evaluation, time_ns = self.evaluation, row.time_ns
         if self.model_update.changes:
             self._change_baseline(time_ns, publications)
-        if self._modes is not None and self._modes.is_change(self.operation.values):
-            self._note(self._modes.change(self.operation.values))
+        if self._config.modes and self.baselines.is_mode_change(self.operation.values):
+            self._note(self.baselines.change_mode(self.operation.values))
         interval = self._sampling.update(time_ns)
         if evaluation.is_ordinary:
             if not row.restarted and evaluation.step(row):
@@ -256,8 +236,8 @@ class PlantPipeline:
         changes: list[AlarmChange] = []
         usable = evaluation.signals.check_row(time_ns, row.values, changes)
         measured.inputs, measured.values = usable[: self._inputs], list(usable[self._inputs :])
-        if self._modes is not None and not self.is_judged:
-            if self._modes.state.is_learned:
+        if not self.is_judged:
+            if self.baselines.modes.is_learned:
                 evaluation.signals.check_values(time_ns, measured.values, units, changes)
             publications.extend(self._board.apply(time_ns, changes))
         elif evaluation.reference is None:
@@ -281,9 +261,8 @@ class PlantPipeline:
             check_promise(config, self._sampling.period_ns / MINUTE_NS)
             self._promise_checked = True
         training.start_clock(time_ns)
-        is_over = training.share(self._sampling.period_ns, self._rows_in_other_modes) >= 1.0
-        if self._modes is not None and self._modes.state.is_resumed:
-            is_over = True
+        share = training.share(self._sampling.period_ns, self.baselines.rows_in_other_modes)
+        is_over = share >= 1.0 or self.baselines.modes.is_resumed
         timed_out = self.evaluation.signals.silence.silent[self._inputs :]
         if is_over and not training.is_open and training.is_enough(timed_out):
             rows, trained = training.finish()
@@ -293,15 +272,10 @@ class PlantPipeline:
                 publications.extend(self.snapshots(time_ns))
                 publications.extend(self._promise_messages(time_ns))
                 return
-            training.refusals, training.refused = training.refusals + 1, trained.refused
+            training.memory.refusals, training.refused = training.memory.refusals + 1, trained.refused
             self._note(f"the training starts again: {trained.refused}")
             training.restart(time_ns)
         training.add(row)
-
-    @property
-    def _rows_in_other_modes(self) -> int:
-        """Number of rows of the trainings of other modes, until one is learned."""
-        return 0 if self._modes is None or self._modes.state.is_learned else self._modes.rows
 
     def _note(self, text: str) -> None:
         if text:
@@ -312,7 +286,9 @@ class PlantPipeline:
         if not self._points:
             return []
         publications, evaluation = self._promise_messages(time_ns), self.evaluation
-        snapshots = model_snapshots(self._config, self.models.predictors, evaluation.reference, evaluation.checks)
+        snapshots = model_snapshots(
+            self._config, self.models.predictors, evaluation.reference, evaluation.memory.checks
+        )
         for key, of_output in zip(self._model_keys, snapshots, strict=True):
             for snapshot in of_output:
                 snapshot.time_ns = time_ns
@@ -320,7 +296,7 @@ class PlantPipeline:
         return publications
 
     def _promise_messages(self, time_ns: int) -> list[Publication]:
-        return self.evaluation.promises.messages(time_ns, self.evaluation.rows_watched)
+        return self.evaluation.promises.messages(time_ns, self.evaluation.memory.rows_watched)
 
     # --- training --------------------------------------------------------------------------------------------
 
@@ -360,15 +336,13 @@ class PlantPipeline:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
         _, trained = self._training.finish_early(times=TIMES_FEWEST)
-        state = self.state
-        memory = None if trained.reference is self.models else copy_of(trained.reference.memory)
+        memory, reference = copy_of(self.memory), copy_of(trained.reference.memory)
 
         def start(config: MonitorConfig) -> "PlantPipeline":
             pipeline = PlantPipeline(config, Annunciator(config), points=False, model=self.model)
-            pipeline.restore(state, 0)
-            equations = pipeline.baselines.equations
-            reference = pipeline.models if memory is None else memory.reference(equations, config.outputs)
-            pipeline._start(trained._replace(reference=reference, checks=list(trained.checks)))
+            pipeline.resume(copy_of(memory), 0)
+            of_pipeline = reference.reference(pipeline.baselines.equations, config.outputs, pipeline.models)
+            pipeline._start(trained._replace(reference=of_pipeline, checks=list(trained.checks)))
             return pipeline
 
         return start
@@ -382,8 +356,8 @@ class PlantPipeline:
 
     def _start(self, trained: TrainingResult, *, again: bool = False) -> None:
         """Start to evaluate rows, see `Evaluation.start`."""
-        if self._modes is not None:
-            self._modes.state.is_learned, self._modes.state.reference = True, trained.reference.kind
+        modes = self.baselines.modes
+        modes.is_learned, modes.reference = True, trained.reference.kind
         self.evaluation.start(trained, self._sampling.period_ns, self._units, again=again)
         if not again:
             self.operation.end_training()
@@ -393,7 +367,7 @@ class PlantPipeline:
         evaluation, reference = self.evaluation, self.evaluation.reference
         if reference is not None:
             model = self.baselines.equations if reference.follows_equations else None
-            self._note(evaluation.promises.check(rows, model, reference.kind, evaluation.rows_watched))
+            self._note(evaluation.promises.check(rows, model, reference.kind, evaluation.memory.rows_watched))
 
     # --- changes of the baseline -----------------------------------------------------------------------------
 
@@ -416,8 +390,6 @@ class PlantPipeline:
         elif (change := self.model_update.pop_due(time_ns)) is not None:
             self.evaluation.leave_ordinary()
             self.baselines.execute(change)
-            if self._modes is not None and not self.watching:
-                self._modes.state.is_judged, self._modes.state.is_resumed = True, False
             publications.append(Publication(self._baseline_key, change))
 
     def _change_model(self, time_ns: int, publications: list[Publication]) -> bool:
@@ -439,7 +411,9 @@ class PlantPipeline:
         self._start(trained, again=True)
         self._check_training(rows)
         publications.append(Publication(self._baseline_key, change))
-        if self.evaluation.rows_watched:  # the filter stands at the end of the training, and rows have come since
+        if (
+            self.evaluation.memory.rows_watched
+        ):  # the filter stands at the end of the training, and rows have come since
             trained.reference.restart()
             self.evaluation.release_values()
             publications.extend(self.snapshots(time_ns))

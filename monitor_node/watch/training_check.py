@@ -102,5 +102,5 @@ def _watch(pipeline: PlantPipeline, rows: Sequence[Row], units: list[str]) -> _T
     for row in rows:
         pipeline.update(row, units, [])
     evaluation = pipeline.evaluation
-    opportunities = float(evaluation.rows_watched * evaluation.chance_alarms)
-    return _Trial(promise, evaluation.rows_watched, evaluation.promises.alarm_rates, opportunities)
+    opportunities = float(evaluation.memory.rows_watched * evaluation.chance_alarms)
+    return _Trial(promise, evaluation.memory.rows_watched, evaluation.promises.alarm_rates, opportunities)

@@ -10,6 +10,7 @@ from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.training import MOST_REFUSALS, Training, TrainingResult
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.estimates import estimate_keys, estimates
+from monitor_node.watch.pipeline_memory import TrainingMemory
 from reactorwatch.errors import UnfitRecordError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -27,9 +28,7 @@ class TrainingStage:
         models: identified models, which start again with each training.
 
     Attributes:
-        rows: the rows so far.
-        began_ns: start of the present or last training; None before its first row.
-        refusals: number of refused trainings.
+        memory: the rows so far, and the refusals before.
         refused: reason of the last refusal; empty before one.
         trained_rows: number of rows of the training, after its end.
         is_open: True to train until the caller ends it.
@@ -38,26 +37,30 @@ class TrainingStage:
     def __init__(self, config: MonitorConfig, model: ProcessModel | None, models: ArxReference) -> None:
         self._config, self._model, self._models = config, model, models
         self._paths = estimate_keys(config)
-        self.refusals = self.trained_rows = 0
+        self.memory = TrainingMemory(self._no_rows)
+        self.trained_rows = 0
         self.is_open, self.refused = False, ""
         self.restart(None)
+
+    @property
+    def _no_rows(self) -> TrainingRows:
+        return TrainingRows([0] * len(self._config.outputs))
 
     def restart(self, time_ns: int | None) -> None:
         """Start again without a row."""
         self._models.forget()
         self._training = Training(self._config, self._model, self._models)
-        self.rows = TrainingRows([0] * len(self._config.outputs))
-        self.began_ns = time_ns
+        self.memory.rows, self.memory.began_ns = self._no_rows, time_ns
 
     def take_over(self, rows: TrainingRows) -> None:
         """Train on with the rows of an incident, by which the identified models are updated."""
-        self.rows, self.began_ns = rows, rows.times_ns[0]
+        self.memory.rows, self.memory.began_ns = rows, rows.times_ns[0]
         self._models.learn_again(rows.time_min, rows.inputs, rows.outputs)
 
     def open(self) -> None:
         """Train until the caller ends it, on all rows until then."""
         self.is_open = True
-        self.rows.keeps_all = True
+        self.memory.rows.keeps_all = True
 
     def is_enough(self, timed_out: Sequence[bool] = ()) -> bool:
         """True if there are enough rows with a value of each output.
@@ -65,13 +68,15 @@ class TrainingStage:
         Args:
             timed_out: one flag an output: its data timeout is active, so it is disregarded; empty: none is.
         """
-        counts = list(compress(self.rows.counts, map(not_, timed_out))) if timed_out else self.rows.counts
+        counts = self.memory.rows.counts
+        if timed_out:
+            counts = list(compress(counts, map(not_, timed_out)))
         return min(counts, default=0) >= self._training.fewest_rows
 
     def start_clock(self, time_ns: int) -> None:
         """Count time from a row, unless an earlier one was first."""
-        if self.began_ns is None or time_ns < self.began_ns:
-            self.began_ns = time_ns
+        if self.memory.began_ns is None or time_ns < self.memory.began_ns:
+            self.memory.began_ns = time_ns
 
     def share(self, period_ns: float, rows_before: int = 0) -> float:
         """Share of the training that is done, at most 1.
@@ -82,12 +87,12 @@ class TrainingStage:
         """
         if not period_ns:
             return 0.0
-        rows = self._config.training_length.count_rows(period_ns / MINUTE_NS)
-        return min((self.rows.dropped + len(self.rows.times) + rows_before) / rows, 1.0)
+        rows, wanted = self.memory.rows, self._config.training_length.count_rows(period_ns / MINUTE_NS)
+        return min((rows.dropped + len(rows.times) + rows_before) / wanted, 1.0)
 
     def add(self, row: MeasuredRow) -> None:
         """Add a row, and update the identified models with it."""
-        self.rows.add(row.time_ns, row.inputs, row.values)
+        self.memory.rows.add(row.time_ns, row.inputs, row.values)
         if predictions := self._models.adapt(row):
             row.publications.extend(estimates(row, self._paths, predictions))
 
@@ -97,8 +102,8 @@ class TrainingStage:
         Args:
             last_chance: True to use the training even if it is disturbed; None: after some refusals.
         """
-        rows, self.rows = self.rows, TrainingRows([0] * len(self._config.outputs))
-        is_last = self.refusals >= MOST_REFUSALS if last_chance is None else last_chance
+        rows, self.memory.rows = self.memory.rows, self._no_rows
+        is_last = self.memory.refusals >= MOST_REFUSALS if last_chance is None else last_chance
         result = self._training.learn(rows, last_chance=is_last)
         self.trained_rows = len(rows.times)
         return rows, result
@@ -113,10 +118,10 @@ class TrainingStage:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
         fewest = times * self._training.fewest_rows
-        if len(self.rows.times) < fewest or not self.is_enough():
+        count = len(self.memory.rows.times)
+        if count < fewest or not self.is_enough():
             raise UnfitRecordError(
-                f"must have at least {fewest} rows with a value of each output to learn from, got "
-                f"{len(self.rows.times)} rows"
+                f"must have at least {fewest} rows with a value of each output to learn from, got {count} rows"
             )
         rows, result = self.finish(last_chance=True)
         if result.refused:

@@ -262,13 +262,16 @@ class Prewhitener:
     def __init__(self, learned: Prewhitening | None, numbers: NDArray[np.void] | None = None) -> None:
         self.numbers = np.zeros(1, WHITENER) if numbers is None else numbers
         if learned is not None:
-            order = len(learned.coefficients)
-            past = np.zeros(LARGEST_ORDER)
-            coefficients = np.array([*learned.coefficients, *past[order:]])
-            self.numbers[0] = (
-                *(learned.constant, coefficients, learned.sd, learned.sd_variance, learned.passed_variance),
-                *(past, 0.0, learned.rows, order, 0),
-            )
+            self.start(learned)
+
+    def start(self, learned: Prewhitening) -> None:
+        """Start with an autoregression, before the first value."""
+        order, past = len(learned.coefficients), np.zeros(LARGEST_ORDER)
+        coefficients = np.array([*learned.coefficients, *past[order:]])
+        self.numbers[0] = (
+            *(learned.constant, coefficients, learned.sd, learned.sd_variance, learned.passed_variance),
+            *(past, 0.0, learned.rows, order, 0),
+        )
 
     @property
     def autoregression(self) -> Prewhitening:
