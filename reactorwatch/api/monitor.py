@@ -7,7 +7,6 @@ from typing import Any
 import msgspec
 from google.protobuf.message import Message
 
-from monitor_node.alarms.alarms import suspect_messages
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor as MonitorCore
 from monitor_node.diagnosis_worker import find_deviations
@@ -155,7 +154,7 @@ class Monitor:
 
     def _newest_suspects(self) -> dict[int, list[SuspectMessage]]:
         """Suspects of the incidents that may change, by number."""
-        return {item.number: suspect_messages(item.suspects) for item in self._core.alarms.memory.incidents}
+        return {item.number: [cause.message for cause in item.suspects] for item in self._core.alarms.memory.incidents}
 
     def _change(self, message: Message) -> AlarmChange | None:
         """Change of an alarm, or new suspects of an incident at its first-out alarm; None for another message."""

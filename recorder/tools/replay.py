@@ -30,7 +30,7 @@ from reactorwatch.runtime.liveliness import wait_alive
 from reactorwatch.runtime.node_main import main
 from reactorwatch.runtime.start import instance_name, join
 from recorder.config import ReplayConfig
-from recorder.files.recording import no_samples_error, read_messages, sample_topics_in
+from recorder.files.recording import Recording
 from recorder.tools.convert import plant_name
 from recorder.tools.inspect import zero_ns_of
 from recorder.tools.player import (
@@ -203,10 +203,11 @@ def open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Itera
         zero_ns = record.stored_zero_ns
         return (plant,), lambda: filter_time(samples_of(record, plant, zero_ns), *_span_ns(config, zero_ns))
     signals = None if choice.is_default else {signal.name for signal in choice.load().signals}
-    topics = [topic for topic in sample_topics_in(path) if signals is None or topic.name in signals]
+    recording = Recording(path)
+    topics = [topic for topic in recording.sample_topics if signals is None or topic.name in signals]
     plants = tuple(sorted({topic.plant for topic in topics}))
     if not plants:
-        raise no_samples_error(path)
+        raise recording.no_samples_error()
     if not config.plant:
         for plant in plants:
             try:
@@ -218,10 +219,10 @@ def open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Itera
         raise InputError(f"{path}: holds samples of {', '.join(plants)}; they cannot all be played as {config.plant!r}")
     kinds = EVERYTHING if config.everything else SAMPLES
     whole = (config.from_min, config.to_min) == (-inf, inf)
-    from_ns, to_ns = _span_ns(config, 0 if whole else zero_ns_of(path))
+    from_ns, to_ns = _span_ns(config, 0 if whole else zero_ns_of(recording))
 
     def tape() -> Iterator[Publication]:
-        played = filter_playable(read_messages(path, kinds), config.plant, kinds, signals)
+        played = filter_playable(recording.messages(kinds), config.plant, kinds, signals)
         return filter_time(played, from_ns, to_ns)
 
     return (config.plant,) if config.plant else plants, tape
