@@ -9,7 +9,7 @@ import numpy as np
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
-from monitor_node.learn.arx_fit import arx_structure, fewest_rows
+from monitor_node.learn.arx import arx_structure, fewest_rows
 from monitor_node.learn.training import FEWEST_ROWS
 from monitor_node.watch.pipeline_memory import PipelineMemory
 from monitor_node.watched_process import load_process
