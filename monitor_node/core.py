@@ -352,12 +352,6 @@ class Monitor:
         self.alarms.restore(copy_of(memory))
         self.pipeline.resume_from_alarms()
 
-    @property
-    def changes(self) -> int:
-        """Count of changes that a restart must preserve: of alarms, and of the baseline when accepted and executed."""
-        executed = 0 if self.baseline is None else self.baseline.id
-        return self.alarms.changes + 2 * executed + len(self.pipeline.model_update.commands)
-
     def schedule(self, baseline: Baseline) -> None:
         """Schedule a recorded change of the baseline for the row that it names."""
         self._changes.append(ScheduledChange(baseline.time_ns, baseline))
