@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from monitor_node.config import MonitorConfig
 from monitor_node.health import NODE
-from monitor_node.learn.identified_models import IdentifiedModels
+from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.model_update import ACCEPT, RESTORE, TRAINED, ModelUpdate, ScheduledChange, check_command
 from monitor_node.learn.training_diagnosis import read_equations
 from monitor_node.watch.evaluation import Evaluation
@@ -42,7 +42,7 @@ class Baselines:
         self,
         config: MonitorConfig,
         model: ProcessModel | None,
-        models: IdentifiedModels,
+        models: ArxReference,
         training: TrainingStage,
         evaluation: Evaluation,
         update: ModelUpdate,
@@ -62,8 +62,7 @@ class Baselines:
     def _judge_by(self, kept: EvaluationMemory) -> None:
         """Judge by a baseline that was replaced; its filters and charts start with the next row."""
         memory = copy_of(kept)
-        memory.suspicion = memory.bank = None
-        self._models.restart()
+        memory.suspicion = None
         self._evaluation.resume(memory, self._equations(memory.change), follows=False)
         self._evaluation.restart_charts()
 

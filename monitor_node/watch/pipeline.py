@@ -14,7 +14,7 @@ from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.health import NODE, Failures
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import Interval, SamplingPeriod
-from monitor_node.learn.identified_models import IdentifiedModels
+from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.model_update import ModelUpdate, ScheduledChange, is_command
 from monitor_node.learn.signal_range import input_bounds
 from monitor_node.learn.training import TrainingResult
@@ -89,7 +89,7 @@ class PlantPipeline:
         self._promise_checked = False
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
-        self.models = IdentifiedModels(config, points=points)
+        self.models = ArxReference(config, points=points)
         self.evaluation = Evaluation(
             config,
             board,
@@ -341,7 +341,7 @@ class PlantPipeline:
         def start(config: MonitorConfig) -> "PlantPipeline":
             pipeline = PlantPipeline(config, Annunciator(config), points=False, model=self.model)
             pipeline.resume(copy_of(memory), 0)
-            of_pipeline = reference.reference(pipeline.baselines.equations, config.outputs)
+            of_pipeline = reference.reference(pipeline.baselines.equations, config.outputs, pipeline.models)
             pipeline._start(trained._replace(reference=of_pipeline, checks=list(trained.checks)))
             return pipeline
 
@@ -401,7 +401,7 @@ class PlantPipeline:
             return False
         self.evaluation.leave_ordinary()
         try:
-            trained = self.model_update.relearn(change, self.models.predictors)
+            trained = self.model_update.relearn(change, self.models)
         except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
             self._failures.add("baseline", error, "the plant is judged by the equations as given")
             return False

@@ -119,6 +119,29 @@ def test_messages_repeated_at_the_start_of_a_file_count_too() -> None:
     assert sum(room.admit(Channel(f"reactor/{n}/sample/T", "", is_product=True), 0) for n in range(100)) == 50
 
 
+def test_a_new_file_has_channels_for_other_programs_again() -> None:
+    room = ChannelBudget(100)
+    others = [Channel(f"weather/{n}", "", is_product=False) for n in range(MAX_OTHER_CHANNELS + 1)]
+    assert [room.admit(item, 0) for item in others] == [True] * MAX_OTHER_CHANNELS + [False]
+    room.reset(latched=0)
+    assert not room.has(others[0])
+    assert room.admit(others[-1], 0)
+
+
+@pytest.mark.parametrize(("inactive", "is_needed"), [(9, False), (10, True)])
+def test_a_full_file_is_followed_by_another_if_a_tenth_of_its_keys_is_inactive(inactive: int, is_needed: bool) -> None:
+    room = ChannelBudget(100)
+    own = [Channel(f"reactor/{n}/sample/T", "", is_product=True) for n in range(101)]
+    for n in range(100):
+        room.admit(own[n], 0 if n < inactive else 1)
+    assert room.needs_new_file(own[100], keep.INACTIVE_NS) == is_needed
+    assert not room.needs_new_file(own[100], keep.INACTIVE_NS + keep.CHECK_INTERVAL_NS)  # asked once an interval
+
+
+def test_latched_messages_take_at_most_half_of_the_keys_of_a_file() -> None:
+    assert ChannelBudget(100).max_latched_messages == 50
+
+
 def test_a_channel_beyond_those_that_the_format_can_number_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
