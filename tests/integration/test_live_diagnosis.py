@@ -16,7 +16,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.records.record import Record
-from recorder.tools.replay import samples_of
+from recorder.tools.player import samples_of
 from tests.memory_bus import Exchange, MemoryBus
 
 ZERO_NS = 1_780_000_000 * 10**9
