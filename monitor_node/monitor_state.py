@@ -19,8 +19,6 @@ from monitor_node.watch.pipeline_memory import PipelineMemory
 from reactorwatch.errors import InputError
 from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.spc.charts.catalogue import CHARTS
-from reactorwatch.spc.value_chart import ValueChart
 from reactorwatch.stored_state import Memory
 from reactorwatch.version import this_build
 
@@ -84,10 +82,6 @@ NOT_LEARNED_BY = frozenset({"process", "state_file", "state_every_s", "health_pe
 
 TRAINING = ("training_min", "training_rows")
 """Settings that are compared only where they are stated."""
-
-
-ROLES = ("setpoints", "modes", "startup_modes", "labels", "bounds", "resolution")
-"""Settings of signals that a state has only where there are any; earlier versions had none."""
 
 
 class OtherSettingsError(InputError):
@@ -167,13 +161,6 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
     for name in TRAINING:
         if fields[name] is None:
             del fields[name]
-    for name in ROLES:
-        if not fields[name]:
-            del fields[name]
-    for kind in CHARTS:
-        if issubclass(kind, ValueChart) and kind.name not in config.charts:  # earlier versions had none
-            for setting in kind.settings:
-                del fields[setting.key]
     if model is not None:
         del fields["units"]  # the equations have their own
     fields |= {"points": points, "equations": "" if model is None else fingerprint(model)}

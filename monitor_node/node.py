@@ -354,23 +354,12 @@ class MonitorNode(FleetMonitor):
         for plant, monitor in self._monitors.items():
             if (refused := monitor.rejects.report(now_ns)) is not None:
                 log.warning(refused, plant=plant)
-        if (excess := self._promise_excess) is not None and not self._excess_logged:
+        if (excess := self._fleet.describe_excess(len(self._monitors))) is not None and not self._excess_logged:
             self._excess_logged = True
             log.warning(excess)
         if self.evictions > self._evicted_logged:
             self._evicted_logged = self.evictions
             log.warning("unverified plants without messages were evicted", so_far=self.evictions)
-
-    @property
-    def _promise_excess(self) -> str | None:
-        """Text for more plants than share the false alarms of the fleet; None: there are not more."""
-        promised, plants = self._fleet.false_alarms_per_day, len(self._monitors)
-        if promised is None or plants <= self._fleet.divisor:
-            return None
-        return (
-            f"the fleet has {plants} plants, and false_alarms_per_day is divided among {self._fleet.divisor}: up to "
-            f"{promised * plants / self._fleet.divisor:.3g} false alarms a day may come; set [fleet] most_plants"
-        )
 
 
 def plants_of(config: MonitorConfig, fleet: FleetConfig) -> str:

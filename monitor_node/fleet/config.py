@@ -119,6 +119,16 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Share of a plant in the false alarms of the fleet, in 30 days; None: nothing is promised for the fleet."""
         return None if self.false_alarms_per_day is None else DAYS * self.false_alarms_per_day / self.divisor
 
+    def describe_excess(self, plants: int) -> str | None:
+        """Text for more plants than share the false alarms of the fleet; None: there are not more."""
+        promised = self.false_alarms_per_day
+        if promised is None or plants <= self.divisor:
+            return None
+        return (
+            f"the fleet has {plants} plants, and false_alarms_per_day is divided among {self.divisor}: up to "
+            f"{promised * plants / self.divisor:.3g} false alarms a day may come; set [fleet] most_plants"
+        )
+
     def share_promise(self, config: MonitorConfig) -> MonitorConfig:
         """Settings of a plant's monitor with its share of the false alarms, or its own number where that is smaller."""
         shares = [item for item in (self.share_per_30_days, config.false_alarms_per_30_days) if item is not None]

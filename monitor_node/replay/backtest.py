@@ -1,7 +1,8 @@
 """Back-test: run the monitor's core over a recording at full speed, after checks of the record that it learns from."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.learn.arx import arx_structure, fewest_rows
 from monitor_node.learn.training import FEWEST_ROWS
+from monitor_node.monitor_state import MonitorMemory
 from monitor_node.watch.pipeline_memory import PipelineMemory
 from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
@@ -22,6 +24,8 @@ from reactorwatch.errors import UnfitRecordError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 from reactorwatch.stored_state import copy_of
+
+RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
 
 
 class LoggedRow(NamedTuple):
@@ -45,23 +49,23 @@ class RowLog:
         self.rows: list[LoggedRow] = []
         self._active: set[str] = set()
 
-    def add(self, time_ns: int, publications: Sequence[Publication], *, judged: bool) -> None:
-        """Add a row.
+    def add(self, memory: MonitorMemory, time_ns: int, publications: Sequence[Publication]) -> None:
+        """Add a row; one of the training is logged without alarms.
 
         Args:
+            memory: memory of the monitor.
             time_ns: time of the row.
             publications: publications because of the row.
-            judged: False for a row of the training, which is logged without alarms.
         """
-        raised = False
+        judged, raised = memory.watching_since_ns is not None, False
         for publication in publications:
             message = publication.message
             if not isinstance(message, Alarm):
                 continue
-            if message.event == Event.RAISED.value:
+            if message.event == RAISED:
                 self._active.add(message.alarm)
                 raised = True
-            elif message.event == Event.CLEARED.value or message.cleared_ns:
+            elif message.event == CLEARED or message.cleared_ns:
                 self._active.discard(message.alarm)
         self.rows.append(LoggedRow(time_ns, judged and bool(self._active), judged and raised))
 
@@ -85,9 +89,6 @@ def rows_of_file(logged: Sequence[LoggedRow], times_ns: Sequence[int]) -> list[L
         else:
             rows.append(LoggedRow(time_ns, bool(rows) and rows[-1].in_alarm, raised=False))
     return rows
-
-
-RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
 
 
 class TrainedPlant(NamedTuple):
@@ -188,11 +189,8 @@ def train(
     """
     monitor = _make_monitor(config, zero_ns, model)
     monitor.pipeline.open_training()
-    prefix = keys.key(config.plant, keys.SAMPLE, "")
-    for message in messages:
-        if message.key.startswith(prefix):
-            monitor.on_message(message, message.received_ns)
-    monitor.finish()
+    for _ in _publications(monitor, messages):
+        pass
     monitor.pipeline.end_training(monitor.memory.last_ns or 0)
     return TrainedPlant(monitor.pipeline.training_rows, copy_of(monitor.pipeline.memory), [*monitor.notes])
 
@@ -223,32 +221,20 @@ def run(
     if trained is not None:
         monitor.pipeline.resume(copy_of(trained.memory), 0)
         monitor.pipeline.start_run()
+    if log is not None:
+        monitor.on_row_end = partial(log.add, monitor.memory)
     alarms, incidents = list[Alarm](), list[Incident]()
     first_ns: int | None = None
-    if log is not None:
-        rows = log  # the same log for the checker of types
-
-        def log_row(time_ns: int, publications: list[Publication]) -> None:
-            rows.add(time_ns, publications, judged=monitor.memory.watching_since_ns is not None)
-
-        monitor.on_row_end = log_row
-
-    def keep(publications: list[Publication]) -> None:
-        alarms.extend(item.message for item in publications if isinstance(item.message, Alarm))
-        incidents.extend(item.message for item in publications if isinstance(item.message, Incident))
-
-    prefix = keys.key(config.plant, keys.SAMPLE, "")
-    for message in messages:
-        if message.key.startswith(prefix) and (publications := monitor.on_message(message, message.received_ns)):
-            keep(publications)
+    for publications in _publications(monitor, messages):
         if first_ns is None:
             first_ns = monitor.memory.first_ns
-    keep(monitor.finish())
+        alarms += (item.message for item in publications if isinstance(item.message, Alarm))
+        incidents += (item.message for item in publications if isinstance(item.message, Incident))
     return Backtest(
         inputs=monitor.config.inputs,
         outputs=monitor.config.outputs,
         rows=monitor.rows,
-        first_ns=(monitor.memory.first_ns or 0) if first_ns is None else first_ns,
+        first_ns=first_ns or 0,
         last_ns=monitor.memory.last_ns or 0,
         span_ns=monitor.span_ns,
         runs=1 + monitor.aligner.memory.counts.restarts,
@@ -266,6 +252,15 @@ def run(
         promise=monitor.promise,
         not_watched=_describe_obstacle(monitor),
     )
+
+
+def _publications(monitor: Monitor, messages: Iterable[Encoded]) -> Iterator[list[Publication]]:
+    """Publications of a monitor because of each sample of its plant, and of the end of the record."""
+    prefix = keys.key(monitor.config.plant, keys.SAMPLE, "")
+    for message in messages:
+        if message.key.startswith(prefix):
+            yield monitor.on_message(message, message.received_ns)
+    yield monitor.finish()
 
 
 def _describe_obstacle(monitor: Monitor) -> str:
