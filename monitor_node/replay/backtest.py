@@ -251,7 +251,7 @@ def run(
         first_ns=(monitor.memory.first_ns or 0) if first_ns is None else first_ns,
         last_ns=monitor.memory.last_ns or 0,
         span_ns=monitor.span_ns,
-        runs=1 + monitor.restarts,
+        runs=1 + monitor.aligner.memory.counts.restarts,
         watching_since_ns=monitor.memory.watching_since_ns,
         expected_false_alarms=monitor.pipeline.expected_false_alarms,
         alarm_messages=alarms,
