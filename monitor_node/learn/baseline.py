@@ -25,6 +25,7 @@ from monitor_node.learn.references import Reference
 from monitor_node.learn.signal_range import possible_ranges
 from monitor_node.learn.training_rows import (
     AfterMoves,
+    RowArrays,
     Screening,
     TrainingRows,
     compare_after_moves,
@@ -144,11 +145,11 @@ def learn_baseline(
         last_chance: True to use the training even if it is disturbed.
     """
     choice, outputs = _Choice(config, models, rows), config.outputs
-    time_min, inputs, measured, left_out = choice.time_min, choice.inputs, choice.measured, choice.left_out
+    (time_min, inputs, measured), left_out = choice.rows, choice.left_out
     reference, z, screenings = choice.choose(model)
     if not reference.follows_equations:
         left_out |= _too_few_values(config.inputs, inputs)
-    left_out |= _too_few_residuals(outputs, z, time_min, inputs, left_out)
+    left_out |= _too_few_residuals(outputs, z, choice.rows, left_out)
     evaluated = [name not in left_out for name in outputs]
     refused = _refusal(outputs, screenings, evaluated)
     if not any(evaluated):
@@ -178,7 +179,7 @@ def learn_baseline(
     if choice.without_black_box and config.reference == "black-box":
         found[BlackBoxReference.kind].append(f"the ARX models judge: {choice.without_black_box}")
     if reference.is_identified:
-        models.start_judging(time_min, choice.given_inputs, measured)
+        models.start_judging(choice.given)
         found["model"] = _simplifications(outputs, models, evaluated)
     found["signals"] = [f"{name} is left out: {why}" for name, why in left_out.items()]
     inputs = np.where([name not in left_out for name in config.inputs], inputs, np.nan)
@@ -212,10 +213,8 @@ class _Choice:
     """Choice of the reference; arguments as for `learn_baseline`.
 
     Attributes:
-        time_min: times of the rows in minutes, shape (n,).
-        inputs: shape (n, inputs).
-        given_inputs: the inputs, 0 for those with too few values.
-        measured: outputs, shape (n, outputs); NaN where left out.
+        rows: rows of the training; outputs that cannot be monitored are NaN.
+        given: the same, with 0 for inputs that have too few values.
         steps: resolution of each output; 0 if it has none.
         smallest: smallest standard deviation of each output.
         left_out: outputs that cannot be monitored, with the reason.
@@ -225,16 +224,17 @@ class _Choice:
 
     def __init__(self, config: MonitorConfig, models: ArxReference, rows: TrainingRows) -> None:
         self._config, self._models, outputs = config, models, config.outputs
-        self.time_min, self.inputs, self.measured = rows.time_min, rows.inputs, rows.outputs
-        columns = list(zip(outputs, self.measured.T, strict=True))
+        self.rows = rows.arrays
+        columns = list(zip(outputs, self.rows.outputs.T, strict=True))
         self.steps = [resolution_sd(column, config.resolution.get(name)) for name, column in columns]
         self.smallest = [
             max(config.smallest_sd.get(name, 0.0), sd, 1e-12) for name, sd in zip(outputs, self.steps, strict=True)
         ]
-        self.left_out = _too_few_values(outputs, self.measured) | self._constant_outputs()
-        self.measured[:, [name in self.left_out for name in outputs]] = np.nan
-        has_values = np.count_nonzero(np.isfinite(self.inputs), axis=0) >= FEWEST_ROWS
-        self.given_inputs, self._has_all_inputs = np.where(has_values, self.inputs, 0.0), bool(has_values.all())
+        self.left_out = _too_few_values(outputs, self.rows.outputs) | self._constant_outputs()
+        self.rows.outputs[:, [name in self.left_out for name in outputs]] = np.nan
+        has_values = np.count_nonzero(np.isfinite(self.rows.inputs), axis=0) >= FEWEST_ROWS
+        self.given = self.rows._replace(inputs=np.where(has_values, self.rows.inputs, 0.0))
+        self._has_all_inputs = bool(has_values.all())
         self.weakness = self.without_black_box = ""
 
     def _constant_outputs(self) -> dict[str, str]:
@@ -242,7 +242,7 @@ class _Choice:
         return {
             name: f"it reads {np.nanmax(column):.6g} in the whole training; train on rows in which it changes, or "
             "state its smallest_sd or resolution"
-            for name, column, step in zip(self._config.outputs, self.measured.T, self.steps, strict=True)
+            for name, column, step in zip(self._config.outputs, self.rows.outputs.T, self.steps, strict=True)
             if not step and not self._config.smallest_sd.get(name) and np.isfinite(column).any()
         }
 
@@ -250,13 +250,13 @@ class _Choice:
         """Fit the references that the settings allow, and choose one."""
         wanted, models = self._config.reference, self._models
         if not self._has_all_inputs:
-            models.learn_again(self.time_min, self.given_inputs, self.measured)
-        identified = self._fit(lambda rows: (models, models.fit(self.time_min, self.given_inputs, rows)), self.measured)
+            models.learn_again(self.given)
+        identified = self._fit(lambda rows: (models, models.fit(rows)), self.given)
         equations = self._fit_equations(model) if model is not None and self._has_all_inputs else None
         if equations is not None and (wanted == "equations" or _predicts_as_well(equations, identified)):
             return equations
         is_driven = bool(self._config.inputs and self._has_all_inputs)  # without inputs there is nothing to simulate
-        is_long = len(self.time_min) >= FEWEST_FAMILIAR_ROWS
+        is_long = len(self.rows.time_min) >= FEWEST_FAMILIAR_ROWS
         if wanted == "black-box" or (wanted == "auto" and is_driven and is_long):
             black_box = self._fit_black_box()
             if black_box is not None:
@@ -267,41 +267,35 @@ class _Choice:
 
     def _fit_equations(self, model: ProcessModel) -> _Candidate | None:
         """Fit the filter of a process model; None if too many values are impossible: it is another process."""
-        columns, ranges = np.column_stack([self.inputs, self.measured]), possible_ranges(self._config, model)
+        columns, ranges = np.column_stack(self.rows[1:]), possible_ranges(self._config, model)
         lower, upper = np.array([(item.lower, item.upper) for item in ranges]).T
         out = np.isfinite(columns) & ((columns < lower) | (columns > upper))
         if self._config.reference != "equations" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):
             return None
-        columns = np.where(out, np.nan, columns)
-        time_min, inputs, measured = self.time_min, *np.hsplit(columns, [self.inputs.shape[1]])
+        inputs, outputs = np.hsplit(np.where(out, np.nan, columns), [len(self._config.inputs)])
+        possible = RowArrays(self.rows.time_min, inputs, outputs)
 
-        def fit(rows: Array) -> tuple[Reference, Array]:
-            found = ProcessReference.fit(model, self._config.outputs, time_min, inputs, rows, self.smallest)
-            return found, found.run(time_min, inputs, measured)[1]
+        def fit(rows: RowArrays) -> tuple[Reference, Array]:
+            found = ProcessReference.fit(model, self._config.outputs, rows, self.smallest)
+            return found, found.run(possible)
 
-        return self._fit(fit, measured)
+        return self._fit(fit, possible)
 
     def _fit_black_box(self) -> _Candidate | None:
         """Fit a black box; None if the rows do not allow it."""
-        time_min, delay = self.time_min, self._config.delay
 
-        def fit(rows: Array) -> tuple[Reference, Array]:
-            return BlackBoxReference.learn(time_min, self.given_inputs, rows, self.measured, self.smallest, delay)
+        def fit(rows: RowArrays) -> tuple[Reference, Array]:
+            return BlackBoxReference.learn(rows, self.rows.outputs, self.smallest, self._config.delay)
 
         try:
-            return self._fit(fit, self.measured)
+            return self._fit(fit, self.given)
         except InputError as error:
             self.without_black_box = str(error)
             return None
 
-    def _fit(self, fit: Callable[[Array], tuple[Reference, Array]], measured: Array) -> _Candidate:
-        """Fit a reference, screen its residuals, and fit it again without disturbed rows.
-
-        Args:
-            fit: fits a reference to outputs; returns it with the normalised residuals.
-            measured: outputs, shape (n, outputs).
-        """
-        reference, z = fit(measured)
+    def _fit(self, fit: Callable[[RowArrays], tuple[Reference, Array]], rows: RowArrays) -> _Candidate:
+        """Fit a reference, screen its normalised residuals, and fit it again without disturbed rows."""
+        reference, z = fit(rows)
         if reference.is_identified:  # its residuals have the unit of the output
             minor = [max(MINOR * sd, step) for sd, step in zip(self.smallest, self.steps, strict=True)]
         else:
@@ -310,7 +304,7 @@ class _Choice:
         is_clean = not any(item.disturbed_intervals or item.outliers for item in screenings)
         if not is_clean and not any(item.refused for item in screenings):
             kept = np.column_stack([item.usable for item in screenings]) | ~np.isfinite(z)
-            reference, z = fit(np.where(kept, measured, np.nan))
+            reference, z = fit(rows._replace(outputs=np.where(kept, rows.outputs, np.nan)))
         return _Candidate(reference, z, screenings)
 
 
@@ -374,14 +368,12 @@ def _too_few_values(names: tuple[str, ...], columns: Array) -> dict[str, str]:
     }
 
 
-def _too_few_residuals(
-    outputs: tuple[str, ...], z: Array, time_min: Array, inputs: Array, left_out: dict[str, str]
-) -> dict[str, str]:
+def _too_few_residuals(outputs: tuple[str, ...], z: Array, rows: RowArrays, left_out: dict[str, str]) -> dict[str, str]:
     """Outputs with values, but too few predictions, with the reason."""
     counts = np.count_nonzero(np.isfinite(z), axis=0).tolist()
     return {
         name: f"only {count} of its {len(z)} rows could be predicted, {FEWEST_ROWS} are needed: "
-        f"{_prediction_obstacle(time_min, inputs)}"
+        f"{_prediction_obstacle(rows.time_min, rows.inputs)}"
         for name, count in zip(outputs, counts, strict=True)
         if count < FEWEST_ROWS and name not in left_out
     }

@@ -85,7 +85,7 @@ class Training:
     def take_over(self, rows: TrainingRows) -> None:
         """Train on with the rows of an incident, by which the identified models are updated."""
         self.memory.rows, self.memory.began_ns = rows, rows.times_ns[0]
-        self._models.learn_again(rows.time_min, rows.inputs, rows.outputs)
+        self._models.learn_again(rows.arrays)
 
     def open(self) -> None:
         """Train until the caller ends it, on all rows until then."""

@@ -35,6 +35,20 @@ MOST_ROWS = 10_000
 """The newest rows used of a longer training; memory stays bounded."""
 
 
+class RowArrays(NamedTuple):
+    """Rows of one plant as arrays.
+
+    Attributes:
+        time_min: times in minutes, shape (n,).
+        inputs: shape (n, inputs); NaN if missing.
+        outputs: shape (n, outputs); NaN if missing or left out.
+    """
+
+    time_min: Array
+    inputs: Array
+    outputs: Array
+
+
 class TrainingRows(Memory):
     """The newest rows of one plant, in two arrays. The object is its own state.
 
@@ -77,19 +91,12 @@ class TrainingRows(Memory):
         return self.times.tolist()
 
     @property
-    def time_min(self) -> Array:
-        """Times of the rows in minutes, shape (n,)."""
-        return np.array(self.times_ns) / MINUTE_NS
-
-    @property
-    def inputs(self) -> Array:
-        """Inputs of the rows, shape (n, inputs)."""
-        return np.ascontiguousarray(self._matrix()[:, : -len(self.counts)])
-
-    @property
-    def outputs(self) -> Array:
-        """Outputs of the rows, shape (n, outputs)."""
-        return np.ascontiguousarray(self._matrix()[:, -len(self.counts) :])
+    def arrays(self) -> RowArrays:
+        """A copy of the rows as arrays."""
+        inputs, outputs = np.hsplit(self._matrix(), [-len(self.counts)])
+        return RowArrays(
+            np.array(self.times_ns) / MINUTE_NS, np.ascontiguousarray(inputs), np.ascontiguousarray(outputs)
+        )
 
     def values(self) -> list[list[float]]:
         """Inputs and outputs of each row."""
