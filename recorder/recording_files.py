@@ -100,6 +100,11 @@ class RecordingFiles:
         """Size of the file being written; 0 if there is none."""
         return self._writer.size_bytes if self._writer is not None else 0
 
+    @property
+    def free_bytes(self) -> int:
+        """Free space on the disk of the folder."""
+        return free_bytes(self._names.folder)
+
     def recover_orphans(self) -> None:
         """Repair files of a crashed recorder in the background."""
         for part in self._orphans:
