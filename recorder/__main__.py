@@ -2,17 +2,11 @@
 
 import sys
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import msgspec
-import tomli_w
-
 from reactorwatch.contract import keys
-from reactorwatch.description.plants import PlantProcesses
 from reactorwatch.errors import InputError, is_passing
-from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.metrics import Metrics, serve_metrics
@@ -20,11 +14,8 @@ from reactorwatch.runtime.node_main import main
 from reactorwatch.runtime.start import instance_name, join, wait_ready
 from recorder.config import RecorderConfig
 from recorder.core import COMMANDS, NODE
-from recorder.files.ages import BootClock, read_boot_clock
-from recorder.files.part_file import PartFile
-from recorder.keep import DAY_NS, FileNames, Limits
-from recorder.node import MB, RecorderNode
-from recorder.recording_files import RecordingFiles, free_bytes
+from recorder.node import RecorderNode
+from recorder.recording_files import RecordingFiles, file_names, free_bytes
 
 HISTORY_MARGIN_NS = 10_000_000_000
 """Largest delay from publication, which dates a message on the bus, to receipt, which dates it in a file."""
@@ -66,12 +57,12 @@ def record(
     history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
 
     def start() -> tuple[RecordingFiles, RecorderNode]:
-        files, start_ns = open_files(config), time.time_ns()
+        files, start_ns = RecordingFiles(config), time.time_ns()
         fingerprints = files.fingerprints_since(start_ns - history_ns)
         return files, RecorderNode(config, files, start_ns, fingerprints, start_ns + history_ns)
 
     try:  # errors in the settings are raised before waiting for a router
-        open_files(config)
+        RecordingFiles(config)
     except (InputError, OSError) as error:
         if not is_passing(error):
             raise
@@ -90,49 +81,6 @@ def record(
             bus.declare_token(keys.key(config.plant, keys.ALIVE, NODE))
             loop.run()
             return files.path
-
-
-def open_files(
-    config: RecorderConfig,
-    open_part: Callable[[Path], PartFile] = PartFile,
-    read_clock: Callable[[], BootClock] = read_boot_clock,
-) -> RecordingFiles:
-    """Recording files of the settings, whose folder is made if it does not exist.
-
-    Args:
-        config: the settings.
-        open_part: see `RecordingFiles`.
-        read_clock: see `RecordingFiles`.
-
-    Raises:
-        InputError: as `run`.
-    """
-    names = file_names(config)
-    if names.dated and not names.folder.suffix[1:].isalpha():  # run.csv is a file of another kind, not a folder's name
-        make_folder(names.folder, "--out")
-    metadata = {
-        "plant": config.plant,
-        "key_expression": config.key_expression,
-        "configuration": tomli_w.dumps(msgspec.to_builtins(config)),
-        **config.about,
-    }
-    limits = Limits(config.keep_mb * MB, config.keep_days * DAY_NS, config.keep_files)
-    synced = config.fsync != "never"
-    return RecordingFiles(
-        names,
-        metadata,
-        limits,
-        synced=synced,
-        open_part=open_part,
-        read_clock=read_clock,
-        find_process=PlantProcesses(config.processes).find,
-    )
-
-
-def file_names(config: RecorderConfig) -> FileNames:
-    """File names of the settings."""
-    out = Path(config.out)
-    return FileNames.of(out, config.plant, is_folder=out.is_dir())
 
 
 if __name__ == "__main__":

@@ -8,13 +8,12 @@ from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.config import RecorderConfig
+from recorder.config import MB, RecorderConfig
 from recorder.core import NODE, PRIORITIES, ReceivedMessage, Recorder
 from recorder.files.writer import WriteError
 from recorder.keep import STATES, AlarmInterval, BlackBox, ChannelBudget, FlushAndRotation, LatchedMessages
 from recorder.recording_files import RecordingFiles
 
-MB = 1_000_000
 RETRY_NS = 2_000_000_000
 """Time between two attempts to resume on a full disk."""
 
