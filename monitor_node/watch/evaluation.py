@@ -20,9 +20,9 @@ from monitor_node.health import Failures
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.learn.arx_reference import ArxReference
+from monitor_node.learn.baseline import NO_VALUE, TrainingResult
 from monitor_node.learn.references import Reference
 from monitor_node.learn.signal_range import possible_ranges, stated_ranges
-from monitor_node.learn.training import NO_VALUE, TrainingResult
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.budget import AlarmBudget
 from monitor_node.watch.estimates import chart_limits, estimate_keys, estimates
