@@ -19,6 +19,7 @@ from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_states import State
 from reactorwatch.contract.messages_pb2 import Priority, Suspect
+from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.m_of_n import check_rule
 from reactorwatch.stored_state import Memory
@@ -40,7 +41,20 @@ TimeNs: TypeAlias = Annotated[int, msgspec.Meta(ge=-(2**63), le=LAST_NS)]
 
 
 class SuspectedCause(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A possible cause of an alarm; the fields of a `Suspect` message."""
+    """A possible cause of an alarm; the fields of a `Suspect` message.
+
+    Attributes:
+        cause: name of the cause.
+        probability: posterior probability.
+        profile: `step` or `ramp`; empty if not known.
+        size: size in `unit`; of a ramp in the newest row.
+        size_sd: standard deviation of the size.
+        unit: unit of the size.
+        onset_ns: time of the onset.
+        onset_sd_min: standard deviation of the onset.
+        kind: `sensor` or `process`; empty if not known.
+        text: the cause in words.
+    """
 
     cause: str
     probability: float
@@ -52,6 +66,11 @@ class SuspectedCause(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     onset_sd_min: float = 0.0
     kind: str = ""
     text: str = ""
+
+    @property
+    def onset_min(self) -> float:
+        """Time of the onset in minutes."""
+        return self.onset_ns / MINUTE_NS
 
     @property
     def message(self) -> Suspect:

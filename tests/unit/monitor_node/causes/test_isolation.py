@@ -2,13 +2,14 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
-from math import isnan, nan
+from math import nan
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from monitor_node.causes.isolation import PROCESS, SENSOR, UNKNOWN, Isolation, Suspect, causes_of
+from monitor_node.alarms.alarms import SuspectedCause
+from monitor_node.causes.isolation import PROCESS, SENSOR, UNKNOWN, Isolation, causes_of
 from monitor_node.causes.window import Row
 from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.effect import Effect
@@ -40,12 +41,12 @@ def isolation() -> Isolation:
     return Isolation(cstr(), SENSORS)
 
 
-def suspects_of(isolation: Isolation, rows: Iterable[Row]) -> list[Suspect]:
+def suspects_of(isolation: Isolation, rows: Iterable[Row]) -> list[SuspectedCause]:
     isolation.fitter.progress = None
     return isolation.suspects(list(rows))
 
 
-def of_cause(suspects: list[Suspect], cause: str) -> Suspect:
+def of_cause(suspects: list[SuspectedCause], cause: str) -> SuspectedCause:
     return next(item for item in suspects if item.cause == cause)
 
 
@@ -129,10 +130,8 @@ def test_where_nothing_is_wrong_no_cause_is_likely(isolation: Isolation) -> None
 )
 def test_what_no_single_cause_explains_is_unknown(isolation: Isolation, faults: tuple[str, ...]) -> None:
     suspects = suspects_of(isolation, rows_of(*faults, seed=3, after_min=10.0))
-    assert suspects[0].cause == suspects[0].kind == UNKNOWN
     assert suspects[0].probability > 0.99
-    assert isnan(suspects[0].size)
-    assert isnan(suspects[0].onset_min)
+    assert suspects[0] == SuspectedCause(UNKNOWN, suspects[0].probability), "it has no size and no onset"
 
 
 def spoiled(rows: list[Row], seed: int) -> list[Row]:
