@@ -3,7 +3,6 @@
 import sys
 import time
 from collections.abc import Callable, Collection
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 
@@ -175,11 +174,6 @@ def file_names(config: RecorderConfig) -> FileNames:
     """File names of the settings."""
     out = Path(config.out)
     return FileNames.of(out, config.plant, is_folder=out.is_dir())
-
-
-def first_file(config: RecorderConfig, now: datetime) -> Path:
-    """Name of the first file."""
-    return file_names(config).first(now)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_states import State
 from reactorwatch.contract.messages_pb2 import Priority, Suspect
-from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.m_of_n import check_rule
 from reactorwatch.stored_state import Memory
@@ -66,11 +65,6 @@ class SuspectedCause(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     onset_sd_min: float = 0.0
     kind: str = ""
     text: str = ""
-
-    @property
-    def onset_min(self) -> float:
-        """Time of the onset in minutes."""
-        return self.onset_ns / MINUTE_NS
 
     @property
     def message(self) -> Suspect:

@@ -81,7 +81,6 @@ class Annunciator:
 
     Attributes:
         memory: memory of the alarms.
-        changes: count of changes that a restart must preserve.
         incident: number of the latest incident; 0 before the first.
         has_unexplained: True if an alarm is active that does not name its cause itself.
     """
@@ -96,7 +95,7 @@ class Annunciator:
         )
         self._shelved: list[ChartAlarm] = []
         self.memory = AnnunciatorMemory()
-        self.changes = self.incident = 0
+        self.incident = 0
         self.has_unexplained = False
         self.describe_operation: Callable[[int], str] = lambda time_ns: ""
         """Operation of the plant at a time, which the text of a raised alarm then states; empty: as usual."""
@@ -205,7 +204,6 @@ class Annunciator:
             incident = self.memory.incidents[-1]
             incident.suspects, incident.text = list(suspects), STOPPED if stopped else ""
             self.memory.incidents_due = True
-            self.changes += 1
 
     def is_at_rest(self, counting: Iterable[ChartAlarm]) -> bool:
         """True if no alarm is active or shelved, and no alarms but the given ones remember points."""
@@ -237,7 +235,6 @@ class Annunciator:
         if not isinstance(action, Event):
             if not comment:
                 raise InputError("comment must say something, got ''")
-            self.changes += 1
             memory.by, memory.comment = by, comment
             return [self._publication(alarm, action, time_ns)]
         if action is Event.SHELVE and not 0 < minutes <= longest:
@@ -323,7 +320,6 @@ class Annunciator:
             if not memory.incident:
                 self._assign(alarm, time_ns)
         self._refresh()
-        self.changes += 1
         self.memory.kpis_due = self.memory.incidents_due = True
 
     def _refresh(self) -> None:

@@ -72,18 +72,19 @@ def rank_suspects(candidates: Sequence[Candidate], none: float) -> list[Suspecte
     for effect in dict.fromkeys(item.effect for item in candidates):
         indices = [index for index, item in enumerate(candidates) if item.effect is effect]
         item = candidates[max(indices, key=weights.__getitem__)]
+        size, onset_min = item.parameters[:2].tolist()
         suspects.append(
             SuspectedCause(
-                effect.name,
+                cause=effect.name,
                 probability=sum(weights[index] for index in indices) / total,
                 profile=(Step if item.profile is Step else Ramp).name,
-                size=float(item.parameters[0]),
+                size=size,
                 size_sd=item.size_sd,
                 unit=effect.unit,
-                onset_ns=round(item.onset_min * MINUTE_NS),
+                onset_ns=round(onset_min * MINUTE_NS),
                 onset_sd_min=item.onset_sd_min,
                 kind=SENSOR if isinstance(effect, SensorEffect) else PROCESS,
-                text=effect.describe(float(item.parameters[0])),
+                text=effect.describe(size),
             )
         )
     return sorted(suspects, key=lambda item: -item.probability)

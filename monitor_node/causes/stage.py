@@ -253,8 +253,8 @@ class Suspicion:
         isolation.fitter.progress = self.memory.progress
         suspects = isolation.suspects(self._rows_of_look(since), min(since, FEW_ROWS))
         self.memory.progress = isolation.fitter.progress
-        causes = [item for item in suspects if item.probability >= LEAST]
-        self._board.set_suspects(causes, stopped=isolation.stopped)
+        shown = [item for item in suspects if item.probability >= LEAST]
+        self._board.set_suspects(shown, stopped=isolation.stopped)
         self._follow(suspects[0])
 
     def add(self, time_min: float, inputs: Sequence[float], values: Sequence[float]) -> Sequence[float]:
@@ -278,7 +278,7 @@ class Suspicion:
         effect = self._effects.get(suspect.cause)
         output = effect.output if isinstance(effect, SensorEffect) else ""
         if suspect.probability >= CONVINCED and output in self._config.outputs:
-            self._reconstruct(output, suspect.cause, suspect.onset_min, self.memory.rows.rows())
+            self._reconstruct(output, suspect.cause, suspect.onset_ns / MINUTE_NS, self.memory.rows.rows())
         elif self._reconstructed_cause != STUCK_SENSOR:
             self._stop_reconstruction()
 

@@ -13,8 +13,7 @@ from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.charts import chart_point
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import MeasuredRow
-from monitor_node.learn.arx import JUDGING_FORGETTING, ArxPredictor
-from monitor_node.learn.arx_fit import arx_structure
+from monitor_node.learn.arx import JUDGING_FORGETTING, ArxPredictor, arx_structure
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError

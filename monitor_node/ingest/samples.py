@@ -142,6 +142,11 @@ class RejectCounter:
                 example if len(example) <= LONGEST_EXAMPLE else f"{example[:LONGEST_EXAMPLE]}..."
             )
 
+    @property
+    def total(self) -> int:
+        """Total over all reasons."""
+        return sum(self.by_reason.values())
+
     def report(self, now_ns: int) -> str | None:
         """One line on messages rejected since the last report; None if there are none, or the report is too recent."""
         if not self._pending_report or (

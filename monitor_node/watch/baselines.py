@@ -8,12 +8,12 @@ from collections.abc import Mapping
 
 from monitor_node.config import MonitorConfig
 from monitor_node.health import NODE
-from monitor_node.learn.identified_models import IdentifiedModels
-from monitor_node.learn.model_update import ACCEPT, RESTORE, TRAINED, ModelUpdate, ScheduledChange, check_command
+from monitor_node.learn.arx_reference import ArxReference
+from monitor_node.learn.model_update import ACCEPT, RESTORE, TRAINED, ModelUpdate, check_command
+from monitor_node.learn.training import Training
 from monitor_node.learn.training_diagnosis import read_equations
 from monitor_node.watch.evaluation import Evaluation
 from monitor_node.watch.pipeline_memory import EvaluationMemory, ModesMemory
-from monitor_node.watch.training_stage import TrainingStage
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import copy_of
@@ -42,8 +42,8 @@ class Baselines:
         self,
         config: MonitorConfig,
         model: ProcessModel | None,
-        models: IdentifiedModels,
-        training: TrainingStage,
+        models: ArxReference,
+        training: Training,
         evaluation: Evaluation,
         update: ModelUpdate,
     ) -> None:
@@ -62,8 +62,7 @@ class Baselines:
     def _judge_by(self, kept: EvaluationMemory) -> None:
         """Judge by a baseline that was replaced; its filters and charts start with the next row."""
         memory = copy_of(kept)
-        memory.suspicion = memory.bank = None
-        self._models.restart()
+        memory.suspicion = None
         self._evaluation.resume(memory, self._equations(memory.change), follows=False)
         self._evaluation.restart_charts()
 
@@ -96,7 +95,7 @@ class Baselines:
         kept = [item.id for item in self.all[:-1]]
         has_rows, has_alarm = self._training.memory.began_ns is not None, self._evaluation.memory.incident is not None
         change = check_command(command, kept, has_rows=has_rows, has_alarm=has_alarm)
-        self._update.changes.append(ScheduledChange(None, change))
+        self._update.changes.append(change)
         return change
 
     def execute(self, change: Baseline) -> None:

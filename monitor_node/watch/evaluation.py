@@ -20,10 +20,9 @@ from monitor_node.health import Failures
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.learn.arx_reference import ArxReference
-from monitor_node.learn.identified_models import IdentifiedModels, RowHistory
+from monitor_node.learn.baseline import NO_VALUE, TrainingResult
 from monitor_node.learn.references import Reference
 from monitor_node.learn.signal_range import possible_ranges, stated_ranges
-from monitor_node.learn.training import NO_VALUE, TrainingResult
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.budget import AlarmBudget
 from monitor_node.watch.estimates import chart_limits, estimate_keys, estimates
@@ -67,7 +66,7 @@ class Evaluation:
         self,
         config: MonitorConfig,
         board: Annunciator,
-        models: IdentifiedModels,
+        models: ArxReference,
         *,
         model: ProcessModel | None,
         is_process: bool,
@@ -87,7 +86,6 @@ class Evaluation:
         self.signals = SignalChecks(config, board, self._ranges, self.ordinary.numbers)
         self._use_ranges()
         self._drift = DriftWatch(config, board, publish=self._points)
-        models.adapts = self._drift.wanted
         self._shift = ShiftWatch(config, board)
         self._budget = AlarmBudget(config, self._charts.design, self.signals, self._shift, self._drift)
         self._suspicion: Suspicion | None = None
@@ -139,7 +137,7 @@ class Evaluation:
         if memory.reference is None:
             return
         learned = [whitener.autoregression for whitener in self._whiteners]
-        self._set_reference(memory.reference.reference(equations, outputs), learned, memory.suspicion, memory.bank)
+        self._set_reference(memory.reference.reference(equations, outputs, self._models), learned, memory.suspicion)
         self._charts.resume(memory.charts, self._evaluated)
         self._shift.resume(memory.shift)
         memory.shift = self._shift.memory
@@ -193,7 +191,6 @@ class Evaluation:
         return Watch(
             self._config,
             trained.reference,
-            self._models.predictors,
             trained.learned,
             self._charts.design.detectors(trained.learned, trained.e, self._memory.arl0),
             self._shift.sensitivities,
@@ -203,20 +200,13 @@ class Evaluation:
         )
 
     def _set_reference(
-        self,
-        reference: Reference,
-        learned: list[Prewhitening],
-        suspicion: SuspicionMemory | None = None,
-        bank: RowHistory | None = None,
+        self, reference: Reference, learned: list[Prewhitening], suspicion: SuspicionMemory | None = None
     ) -> None:
-        """Set the reference for the rows to come; the search for causes and the bank go on from their memories."""
+        """Set the reference for the rows to come; the search for causes goes on from its memory."""
         self.reference = reference
         self._use_ranges()
         self._whitened_sds = [item.sd for item in learned]
         self._start_search(reference, suspicion)
-        self._models.use_bank(identified=reference.is_identified, memory=bank)
-        self._memory.bank = None if self._models.bank is None else self._models.bank.memory
-        reference.use_models(self._models)
         self.ordinary.start(reference)
 
     def _use_ranges(self) -> None:
@@ -231,7 +221,7 @@ class Evaluation:
 
     def stop(self) -> None:
         """Evaluate no rows."""
-        self.reference = self._suspicion = self._models.bank = None
+        self.reference = self._suspicion = None
         self.ordinary.stop()
         self._use_ranges()
         self._memory, self.promises.promise = self._new_memory(), None
@@ -410,9 +400,11 @@ class Evaluation:
     def _update_drift(self, row: MeasuredRow) -> list[AlarmChange]:
         if not self._drift.wanted:
             return []
-        is_beside = self.reference is None or not self.reference.is_identified
-        if is_beside and (predictions := self._models.update(row)):
-            row.publications.extend(estimates(row, self._paths_beside, predictions))
+        is_beside = self.reference is not self._models
+        if is_beside or self._models.stays_as_fitted:
+            predictions = self._models.adapt(row)
+            if is_beside and predictions:
+                row.publications.extend(estimates(row, self._paths_beside, predictions))
         return self._drift.update(row, self._models.predictors)
 
     def _set_learning(self) -> None:

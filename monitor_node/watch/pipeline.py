@@ -14,24 +14,25 @@ from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.health import NODE, Failures
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import Interval, SamplingPeriod
-from monitor_node.learn.identified_models import IdentifiedModels
-from monitor_node.learn.model_update import ModelUpdate, ScheduledChange, is_command
+from monitor_node.learn.arx_reference import ArxReference
+from monitor_node.learn.baseline import TrainingResult
+from monitor_node.learn.model_update import ModelUpdate, is_command
 from monitor_node.learn.signal_range import input_bounds
-from monitor_node.learn.training import TrainingResult
+from monitor_node.learn.training import TIMES_FEWEST, Training
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding, equations_text
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.baselines import Baselines
 from monitor_node.watch.budget import check_promise
-from monitor_node.watch.estimates import model_snapshots
+from monitor_node.watch.estimates import estimate_keys, estimates, model_snapshots
 from monitor_node.watch.evaluation import Evaluation
 from monitor_node.watch.operation import Operation
 from monitor_node.watch.pipeline_memory import PipelineMemory
 from monitor_node.watch.promise import PromiseStage
 from monitor_node.watch.row_frame import Records
 from monitor_node.watch.row_step import FilterNumbers
-from monitor_node.watch.training_stage import TIMES_FEWEST, TrainingStage
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Baseline
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -71,7 +72,7 @@ class PlantPipeline:
         points: bool = True,
         model: ProcessModel | None = None,
         failures: Failures | None = None,
-        changes: deque[ScheduledChange] | None = None,
+        changes: deque[Baseline] | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
         promises: PromiseStage | None = None,
     ) -> None:
@@ -88,8 +89,9 @@ class PlantPipeline:
         self._sampling = SamplingPeriod()
         self._promise_checked = False
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
+        self._estimate_keys = estimate_keys(config)
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
-        self.models = IdentifiedModels(config, points=points)
+        self.models = ArxReference(config, points=points)
         self.evaluation = Evaluation(
             config,
             board,
@@ -99,7 +101,7 @@ class PlantPipeline:
             failures=self._failures,
             promises=promises or PromiseStage(config, board, self._failures, points=points),
         )
-        self._training = TrainingStage(config, self.model, self.models)
+        self._training = Training(config, self.model, self.models)
         self.model_update = ModelUpdate(config, deque() if changes is None else changes)
         self.baselines = Baselines(config, self.model, self.models, self._training, self.evaluation, self.model_update)
 
@@ -139,7 +141,7 @@ class PlantPipeline:
             memory.training,
         )
         baselines.modes, baselines.kept, update.baseline = memory.modes, memory.kept, memory.change
-        update.changes.extend(ScheduledChange(None, change) for change in memory.commands)
+        update.changes.extend(memory.commands)
         update.rows = memory.undiagnosed if self._config.diagnose_training else None
         self.evaluation.resume(memory.evaluation, baselines.equations, now_ns, follows=True)
 
@@ -265,17 +267,16 @@ class PlantPipeline:
         is_over = share >= 1.0 or self.baselines.modes.is_resumed
         timed_out = self.evaluation.signals.silence.silent[self._inputs :]
         if is_over and not training.is_open and training.is_enough(timed_out):
-            rows, trained = training.finish()
+            trained = training.finish()
             if not trained.refused:
-                self._end_training(time_ns, rows, trained, publications)
+                self._end_training(time_ns, trained, publications)
                 self.evaluation.evaluate(row, [])
                 publications.extend(self.snapshots(time_ns))
                 publications.extend(self._promise_messages(time_ns))
                 return
-            training.memory.refusals, training.refused = training.memory.refusals + 1, trained.refused
-            self._note(f"the training starts again: {trained.refused}")
-            training.restart(time_ns)
-        training.add(row)
+            self._note(training.refuse(trained.refused, time_ns))
+        if predictions := training.add(row):
+            publications.extend(estimates(row, self._estimate_keys, predictions))
 
     def _note(self, text: str) -> None:
         if text:
@@ -313,19 +314,16 @@ class PlantPipeline:
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
-        rows, trained = self._training.finish_early()
-        self._end_training(time_ns, rows, trained, [])
+        self._end_training(time_ns, self._training.finish_early(), [])
 
-    def _end_training(
-        self, time_ns: int, rows: TrainingRows, trained: TrainingResult, publications: list[Publication]
-    ) -> None:
+    def _end_training(self, time_ns: int, trained: TrainingResult, publications: list[Publication]) -> None:
         self._start(trained)
         if self._config.diagnose_training and equations_text(self.model):
-            self.model_update.rows = rows
+            self.model_update.rows = trained.rows
         if self._diagnose is not None and (job := self.diagnosis_job) is not None:
             self.on_finding(self._diagnose(job))
         if not self._change_model(time_ns, publications):
-            self._check_training(rows)
+            self._check_training(trained.rows)
 
     def new_trials(self) -> Callable[[MonitorConfig], "PlantPipeline"]:
         """Learn from the rows so far; returns a function that makes pipelines which start with what was learned.
@@ -335,13 +333,13 @@ class PlantPipeline:
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
-        _, trained = self._training.finish_early(times=TIMES_FEWEST)
+        trained = self._training.finish_early(times=TIMES_FEWEST)
         memory, reference = copy_of(self.memory), copy_of(trained.reference.memory)
 
         def start(config: MonitorConfig) -> "PlantPipeline":
             pipeline = PlantPipeline(config, Annunciator(config), points=False, model=self.model)
             pipeline.resume(copy_of(memory), 0)
-            of_pipeline = reference.reference(pipeline.baselines.equations, config.outputs)
+            of_pipeline = reference.reference(pipeline.baselines.equations, config.outputs, pipeline.models)
             pipeline._start(trained._replace(reference=of_pipeline, checks=list(trained.checks)))
             return pipeline
 
@@ -374,7 +372,7 @@ class PlantPipeline:
     @property
     def diagnosis_job(self) -> DiagnosisJob | None:
         """The diagnosis of the training, while it is pending."""
-        return self.model_update.job(equations_text(self.model)) if self.model_update.is_pending else None
+        return self.model_update.job(self.model)
 
     def on_finding(self, finding: Finding) -> None:
         """Process the result of a diagnosis; a change holds from the next row on."""
@@ -385,7 +383,7 @@ class PlantPipeline:
 
     def _change_baseline(self, time_ns: int, publications: list[Publication]) -> None:
         """Execute the change that holds from a row on, if there is one."""
-        if not is_command(self.model_update.changes[0].baseline):
+        if not is_command(self.model_update.changes[0]):
             self._change_model(time_ns, publications)
         elif (change := self.model_update.pop_due(time_ns)) is not None:
             self.evaluation.leave_ordinary()
@@ -394,14 +392,14 @@ class PlantPipeline:
 
     def _change_model(self, time_ns: int, publications: list[Publication]) -> bool:
         """Learn the baseline again with the model of a change, if one holds from this row on; returns True if so."""
-        if self.model_update.changes and is_command(self.model_update.changes[0].baseline):
+        if self.model_update.changes and is_command(self.model_update.changes[0]):
             return False
-        rows, change = self.model_update.rows, self.model_update.pop_due(time_ns)
-        if change is None or rows is None:
+        change = self.model_update.pop_due(time_ns)
+        if change is None or self.model_update.rows is None:
             return False
         self.evaluation.leave_ordinary()
         try:
-            trained = self.model_update.relearn(change, self.models.predictors)
+            trained = self.model_update.relearn(change, self.models)
         except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
             self._failures.add("baseline", error, "the plant is judged by the equations as given")
             return False
@@ -409,7 +407,7 @@ class PlantPipeline:
             self._note("the identified models predict the training better; the baseline stays as it is")
             return False
         self._start(trained, again=True)
-        self._check_training(rows)
+        self._check_training(trained.rows)
         publications.append(Publication(self._baseline_key, change))
         if (
             self.evaluation.memory.rows_watched

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from monitor_node.config import MonitorConfig
 from monitor_node.node import MonitorNode
-from monitor_node.storage.state_files import StateFolder
+from monitor_node.storage.state_files import StateStore
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError, UnavailableError, is_passing
@@ -55,8 +55,8 @@ STARTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "a recorder's folder to list": ("iterdir", start_recorder),
     "a recorder's first file": ("open", start_recorder),
     "a recorder's only file": ("open", lambda folder: start_recorder(folder / "run.mcap")),
-    "a fleet's folder to make": ("mkdir", lambda folder: StateFolder(make_folder(folder / "new"))),
-    "a fleet's folder to list": ("iterdir", StateFolder),
+    "a fleet's folder to make": ("mkdir", lambda folder: StateStore(make_folder(folder / "new"))),
+    "a fleet's folder to list": ("iterdir", StateStore),
     "a monitor's state": ("read_bytes", lambda path: MonitorNode(MonitorConfig(state_file=str(path / "state")), 0)),
 }
 """What nodes need of a folder at their start: the call of the system that is refused, and who makes it."""
