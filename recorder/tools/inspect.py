@@ -119,7 +119,7 @@ def overview(recording: Iterable[RecordedMessage]) -> Overview:
     seen = Overview()
     lists: dict[str, _GapList | None] = {}
     splitters: dict[str, RunSplitter] = {}
-    active: dict[str, int] = {}
+    active: dict[str, int] = {}  # index of the newest alarm, by key
     for entry in recording:
         if not entry.latched:
             _count(seen, entry)
@@ -130,7 +130,7 @@ def overview(recording: Iterable[RecordedMessage]) -> Overview:
             continue
         message = content_of(entry)
         if isinstance(message, messages.Alarm):
-            _follow(seen, active, message)
+            _follow(seen, active, entry.key, message)
         elif isinstance(message, messages.Sample) and message.quality != messages.QUALITY_UNSPECIFIED:
             of_key.update(message)
     seen.runs = {plant: splitter.runs for plant, splitter in splitters.items() if splitter.runs}
@@ -157,12 +157,12 @@ def _count(seen: Overview, entry: RecordedMessage) -> None:
     seen.last_ns = max(seen.last_ns, at_ns)
 
 
-def _follow(seen: Overview, active: dict[str, int], alarm: messages.Alarm) -> None:
+def _follow(seen: Overview, active: dict[str, int], key: str, alarm: messages.Alarm) -> None:
     """Add a raised or latched alarm, or the time at which it cleared."""
-    number = active.get(alarm.alarm)
+    number = active.get(key)
     known = number is not None and seen.alarms[number].raised_ns == alarm.raised_ns
     if alarm.raised_ns and not known and (alarm.event == "raised" or not alarm.cleared_ns):
-        active[alarm.alarm] = len(seen.alarms)
+        active[key] = len(seen.alarms)
         seen.alarms.append(Raised(alarm.alarm, alarm.priority, alarm.raised_ns, None, alarm.text))
     elif number is not None and known and alarm.cleared_ns and seen.alarms[number].cleared_ns is None:
         seen.alarms[number] = seen.alarms[number]._replace(cleared_ns=alarm.cleared_ns)
