@@ -370,23 +370,23 @@ class Monitor:
     def changes(self) -> int:
         """Count of changes that a restart must preserve: of alarms, and of the baseline when accepted and executed."""
         executed = 0 if self.baseline is None else self.baseline.id
-        return self.alarms.changes + 2 * executed + len(self.pipeline.model_update.commands)
+        return self.alarms.changes + 2 * executed + len(self.pipeline.baselines.update.commands)
 
     # --- diagnosis of the training ---------------------------------------------------------------------------
 
     @property
     def awaits_diagnosis(self) -> bool:
         """True while there is a `diagnosis_job`."""
-        return self.pipeline.model_update.is_pending
+        return self.pipeline.baselines.update.is_pending
 
     @property
     def diagnosis_job(self) -> DiagnosisJob | None:
         """The diagnosis of the training, from its end until `on_finding`; None: there is none to make."""
-        return self.pipeline.diagnosis_job
+        return self.pipeline.baselines.diagnosis_job
 
     def on_finding(self, finding: Finding) -> None:
         """Process the result of `diagnosis_job`; what it found holds from the next row on."""
-        self.pipeline.on_finding(finding)
+        self.pipeline.baselines.on_finding(finding)
 
     def schedule(self, baseline: Baseline) -> None:
         """Schedule a recorded change of the baseline for the row that it names."""
@@ -395,7 +395,7 @@ class Monitor:
     @property
     def baseline(self) -> Baseline | None:
         """Change of the baseline in force; None: rows are evaluated by the equations as given."""
-        return self.pipeline.model_update.baseline
+        return self.pipeline.baselines.update.baseline
 
     # --- status ----------------------------------------------------------------------------------------------
 
@@ -410,7 +410,8 @@ class Monitor:
     def is_ordinary(self) -> bool:
         """True if rows are evaluated and nothing happens: no command or change of a unit, no history, no event."""
         pipeline, history = self.pipeline, self._replay_filter
-        is_quiet = not (pipeline.model_update.commands or self._sample_units.converted or self.memory.unusable.reasons)
+        has_commands = bool(pipeline.baselines.update.commands)
+        is_quiet = not (has_commands or self._sample_units.converted or self.memory.unusable.reasons)
         return is_quiet and pipeline.watching and pipeline.is_ordinary and (history is None or history.is_done)
 
     @property

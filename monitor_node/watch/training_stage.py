@@ -9,7 +9,6 @@ from monitor_node.ingest.alignment import MeasuredRow
 from monitor_node.learn.identified_models import IdentifiedModels
 from monitor_node.learn.training import MOST_REFUSALS, Training, TrainingResult
 from monitor_node.learn.training_rows import TrainingRows
-from monitor_node.watch.estimates import estimate_keys, estimates
 from monitor_node.watch.pipeline_memory import TrainingMemory
 from reactorwatch.errors import UnfitRecordError
 from reactorwatch.process.model import ProcessModel
@@ -36,7 +35,6 @@ class TrainingStage:
 
     def __init__(self, config: MonitorConfig, model: ProcessModel | None, models: IdentifiedModels) -> None:
         self._config, self._model, self._models = config, model, models
-        self._paths = estimate_keys(config)
         self.memory = TrainingMemory(self._no_rows)
         self.trained_rows = 0
         self.is_open, self.refused = False, ""
@@ -90,11 +88,10 @@ class TrainingStage:
         rows, wanted = self.memory.rows, self._config.training_length.count_rows(period_ns / MINUTE_NS)
         return min((rows.dropped + len(rows.times) + rows_before) / wanted, 1.0)
 
-    def add(self, row: MeasuredRow) -> None:
-        """Add a row, and update the identified models with it."""
+    def add(self, row: MeasuredRow) -> list[float]:
+        """Add a row, and update the identified models with it; returns their predictions if they are published."""
         self.memory.rows.add(row.time_ns, row.inputs, row.values)
-        if predictions := self._models.update(row):
-            row.publications.extend(estimates(row, self._paths, predictions))
+        return self._models.update(row)
 
     def finish(self, *, last_chance: bool | None = None) -> tuple[TrainingRows, TrainingResult]:
         """Learn from the rows; returns them and the result.
