@@ -25,7 +25,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication, encode
 from reactorwatch.process.library.cstr.model import cstr
 from recorder import RecordedMessage
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 
 UNITS = cstr().units
@@ -90,7 +90,7 @@ def draw(path: Path) -> None:
     from recorder.columns.run_reader import read_segments
     from recorder.view.file import write_rrd
 
-    write_rrd(read_segments(read_messages(path)), path.with_suffix(".rrd"))
+    write_rrd(read_segments(Recording(path).messages()), path.with_suffix(".rrd"))
 
 
 TASKS = {"bare": read_bare, "draw": draw}

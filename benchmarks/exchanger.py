@@ -16,9 +16,9 @@ import numpy as np
 
 from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig, ReferenceName
 from monitor_node.core import Monitor
-from monitor_node.ingest.alignment import Row
 from reactorwatch.arrays import Array
-from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
 
 ROWS, TRAINING = 4000, 1000
 CELLS, SUBSTEPS = 5, 4
@@ -164,7 +164,10 @@ def watch(flow: Array, measured: Array, config: MonitorConfig, sizes: Sequence[f
 
 def _take_row(monitor: Monitor, row: int, values: tuple[float, float]) -> list[str]:
     """Process a row; returns the alarms that it raises, but for spikes."""
-    publications = monitor.on_rows([Row(row * SECOND_NS, values, False)])
+    publications = list[Publication]()
+    for signal, value in zip(monitor.config.signals, values, strict=True):
+        sample = Sample(time_ns=row * SECOND_NS, sequence=row, value=value, quality=Quality.QUALITY_GOOD)
+        publications += monitor.on_sample(signal, sample, 0)
     raised = [
         item.message for item in publications if isinstance(item.message, Alarm) and item.message.event == "raised"
     ]

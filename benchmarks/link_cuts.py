@@ -32,7 +32,7 @@ from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint, free_port
 from recorder.__main__ import record
 from recorder.config import RecorderConfig
-from recorder.files.recording import read_messages, recordings_in
+from recorder.files.recording import Recording
 
 CUTS_S = (1.0, 5.0, 30.0)
 Manner = Literal["closed", "stalled"]
@@ -308,7 +308,7 @@ def read_content(files: Sequence[Path], publisher: Publisher) -> Found:
     """Read the content of consecutive recordings."""
     numbers: dict[str, list[int]] = {}
     behind, newest = 0, 0
-    for entry in (entry for path in files for entry in read_messages(path, {keys.SAMPLE})):
+    for entry in (entry for path in files for entry in Recording(path).messages({keys.SAMPLE})):
         sample = decode(entry.payload, entry.encoding)
         assert isinstance(sample, Sample)
         numbers.setdefault(entry.key, []).append(sample.sequence)
@@ -356,7 +356,7 @@ def stick(
             process.send_signal(signal.SIGCONT)
             load.publisher.close()
             assert heard.wait(load.publisher.sequence * SIGNALS), "the recorder that was stuck does not keep up"
-    return load.found[0], read_content(recordings_in(stuck), load.publisher)
+    return load.found[0], read_content(Recording(stuck).files, load.publisher)
 
 
 @contextlib.contextmanager

@@ -18,7 +18,8 @@ from collections.abc import Iterable, Sequence
 from statistics import median
 from typing import NamedTuple
 
-from monitor_node.causes.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation, Suspect
+from monitor_node.alarms.alarms import SuspectedCause
+from monitor_node.causes.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
 from monitor_node.causes.stage import FEW_ROWS, LOOKS, ROWS_BEFORE, preparation
 from monitor_node.causes.window import Row
 from monitor_node.config import MonitorConfig
@@ -59,7 +60,7 @@ class TimedIsolation:
     def __enter__(self) -> "TimedIsolation":
         looks, original = self.looks, self._suspects
 
-        def suspects(self: Isolation, rows: Sequence[Row], since_rows: int = 0) -> list[Suspect]:
+        def suspects(self: Isolation, rows: Sequence[Row], since_rows: int = 0) -> list[SuspectedCause]:
             began = time.process_time()
             found = original(self, rows, since_rows)
             looks.append(Look(time.process_time() - began, self.budget.spent, self.stopped))

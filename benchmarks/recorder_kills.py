@@ -30,7 +30,7 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint
-from recorder.files.recording import read_messages, recordings_in
+from recorder.files.recording import Recording
 
 KILLS = 50
 RATE_PER_S = 5_000
@@ -204,7 +204,7 @@ def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Kil
         hub.close()
     left = [path.name for path in folder.iterdir() if path.suffix not in (".mcap", ".toml")]
     assert not left, f"not recovered: {left}"
-    files = [_numbers_and_end(path) for path in recordings_in(folder)]
+    files = [_numbers_and_end(path) for path in Recording(folder).files]
     recorded = {key: set[int]().union(*(numbers.get(key, ()) for numbers, _ in files)) for key in files[0][0]}
     found = []
     for (numbers, last_ns), at_ns, alive in zip(files, killed_ns, alive_at, strict=False):
@@ -224,7 +224,7 @@ def _numbers_and_end(path: Path) -> tuple[dict[str, list[int]], int]:
     """Sequence numbers of the samples in a file, by key, and the time from which not every key has one."""
     numbers: dict[str, list[int]] = {}
     last_ns: dict[str, int] = {}
-    for entry in read_messages(path, {keys.SAMPLE}):
+    for entry in Recording(path).messages({keys.SAMPLE}):
         sample = decode(entry.payload, entry.encoding)
         assert isinstance(sample, messages.Sample)
         numbers.setdefault(entry.key, []).append(sample.sequence)

@@ -33,7 +33,7 @@ from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
 from recorder.files.part_file import PartFile
-from recorder.files.recording import read_messages, read_metadata
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.keep import Fsync
 from recorder.tools.convert import read_record
@@ -93,7 +93,7 @@ def through_a_router(folder: Path, sent: list[Encoded], rate_per_s: float | None
         plant.close()
         rate = len(sent) / (time.perf_counter() - start)
     hub.close()
-    entries = list(read_messages(path))
+    entries = list(Recording(path).messages())
     lags = [decode(entry.payload, entry.encoding) for entry in entries if keys.HEALTH in entry.key]
     longest_s = max(report.lag_ms for report in lags if isinstance(report, messages.Health)) / 1e3
     return rate, sum("/sample/" in entry.key for entry in entries) / len(sent), longest_s
@@ -158,14 +158,14 @@ def files(folder: Path) -> None:
         f"recording / bare writer                  {recorder_rate / bare_rate:5.2f}   ({recorder_rate:,.0f} messages/s)"
     )
     ordered, unordered = rate_of(lambda: read_bare(in_order=True)), rate_of(lambda: read_bare(in_order=False))
-    reading = rate_of(lambda: exhaust(read_messages(path)))
-    decoded = rate_of(lambda: exhaust(decode(entry.payload, entry.encoding) for entry in read_messages(path)))
+    reading = rate_of(lambda: exhaust(Recording(path).messages()))
+    decoded = rate_of(lambda: exhaust(decode(entry.payload, entry.encoding) for entry in Recording(path).messages()))
     record_rate = rate_of(lambda: read_record(path))
     print(f"reading / bare reader, in order          {reading / ordered:5.2f}   ({reading:,.0f} messages/s)")
     print(f"reading / bare reader, in file order     {reading / unordered:5.2f}")
     print(f"reading decoded / bare reader, in order  {decoded / ordered:5.2f}   ({decoded:,.0f} messages/s)")
     print(f"reading as a record / bare, in order     {record_rate / ordered:5.2f}   ({record_rate:,.0f} messages/s)")
-    assert read_metadata(path)
+    assert Recording(path).metadata
 
 
 class Timed(PartFile):

@@ -36,43 +36,18 @@ RECORDING = "record.mcap"
 DRAIN_TIMEOUT_S = 0.5
 
 
-class Command:
-    """Runs `reactorwatch` as a process that can be terminated."""
-
-    def __init__(self) -> None:
-        self._process: subprocess.Popen[str] | None = None
-        self._ended = False
-
-    def __call__(self, arguments: list[str]) -> tuple[int, str, str]:
-        """Run `reactorwatch` with arguments; returns exit code, standard output and standard error."""
-        command = [sys.executable, "-P", "-m", "reactorwatch", *arguments]
-        self._process = subprocess.Popen(  # noqa: S603 (our own command)
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        if self._ended:
-            self._process.terminate()
-        output, errors = self._process.communicate()
-        return self._process.returncode, output, errors or "it was stopped"
-
-    def end(self) -> None:
-        """Terminate the running process, if any, and every later one."""
-        self._ended = True
-        if self._process is not None and self._process.poll() is None:
-            self._process.terminate()
-
-
 class DiagnosisRunner:
-    """Records samples and diagnoses them in a thread, one diagnosis at a time.
+    """Records samples and diagnoses them in a thread and a process, one diagnosis at a time.
 
     Args:
-        config: settings.
-        out: folder for the reports.
-        run: runs the command.
+        config: settings; `out` is the folder for the reports.
     """
 
-    def __init__(self, config: DiagnosisConfig, out: Path, run: Command) -> None:
-        self._config, self._out, self._run = config, out, run
+    def __init__(self, config: DiagnosisConfig) -> None:
+        self._config, self._out = config, Path(config.out or "")
         self._thread: threading.Thread | None = None
+        self._process: subprocess.Popen[str] | None = None
+        self._ended = False
 
     @property
     def busy(self) -> bool:
@@ -89,10 +64,28 @@ class DiagnosisRunner:
         if self._thread is not None:
             self._thread.join()
 
+    def end(self) -> None:
+        """Terminate a running diagnosis, and every later one."""
+        self._ended = True
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+        self.wait()
+
+    def execute(self, arguments: list[str]) -> tuple[int, str, str]:
+        """Run `reactorwatch` with arguments; returns exit code, standard output and standard error."""
+        command = [sys.executable, "-P", "-m", "reactorwatch", *arguments]
+        self._process = subprocess.Popen(  # noqa: S603 (our own command)
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        if self._ended:
+            self._process.terminate()
+        output, errors = self._process.communicate()
+        return self._process.returncode, output, errors or "it was stopped"
+
     def _diagnose(self, request: DiagnosisRequest) -> None:
         try:
             folder = self._write_record(request)
-            code, output, errors = self._run([*self._command(folder), "--json"])
+            code, output, errors = self.execute([*self._command(folder), "--json"])
             if code != 0:
                 why = (errors.strip().splitlines() or ["no reason was given"])[-1]
                 log.warning("not diagnosed", alarm=request.alarm, why=why, folder=str(folder))
@@ -104,7 +97,9 @@ class DiagnosisRunner:
 
     def _write_record(self, request: DiagnosisRequest) -> Path:
         """Write the samples to a new folder, which is returned."""
-        folder = make_folder(self._free_folder(request.raised_ns), may_exist=False)
+        name = f"{self._config.plant}-{datetime.fromtimestamp(request.raised_ns // 10**9, UTC):%Y%m%dT%H%M%SZ}"
+        taken = sum(path.name == name or path.name.startswith(f"{name}-") for path in self._out.glob(f"{name}*"))
+        folder = make_folder(self._out / (f"{name}-{taken + 1}" if taken else name), may_exist=False)
         metadata = {"plant": self._config.plant, "alarm": request.alarm, "raised_ns": str(request.raised_ns)}
         with atomic_write(folder / RECORDING) as temporary, RecordingWriter(temporary, metadata) as writer:
             for time_ns, item in request.samples:
@@ -112,12 +107,6 @@ class DiagnosisRunner:
                     RecordedMessage(item.key, item.payload, item.encoding, item.received_ns or time_ns, time_ns)
                 )
         return folder
-
-    def _free_folder(self, raised_ns: int) -> Path:
-        moment = datetime.fromtimestamp(raised_ns // 10**9, UTC)
-        name = f"{self._config.plant}-{moment:%Y%m%dT%H%M%SZ}"
-        taken = sum(path.name == name or path.name.startswith(f"{name}-") for path in self._out.glob(f"{name}*"))
-        return self._out / (f"{name}-{taken + 1}" if taken else name)
 
     def _command(self, folder: Path) -> list[str]:
         command = ["diagnose", str(folder / RECORDING), "--plant", self._config.plant, "--out", str(folder)]
@@ -136,8 +125,7 @@ def run(config: DiagnosisConfig, bus_config: BusConfig) -> None:
     """
     if config.out is None:
         raise InputError("settings [diagnosis]: out must be a folder for the reports")
-    command = Command()
-    diagnoses = DiagnosisRunner(config, Path(config.out), command)
+    diagnoses = DiagnosisRunner(config)
     node = DiagnosisTrigger(config, diagnoses.start, lambda: diagnoses.busy)
     token = keys.instance_token(config.plant, NODE, instance_name())
     with stop_on_signals() as stop, join(bus_config, NODE, stop, token) as bus:
@@ -150,10 +138,9 @@ def run(config: DiagnosisConfig, bus_config: BusConfig) -> None:
             bus.declare_token(keys.key(config.plant, keys.ALIVE, NODE))
             loop.run()
         finally:
-            command.end()
-            diagnoses.wait()
+            diagnoses.end()
             if node.waiting is not None:
-                log.warning("not diagnosed", alarm=node.waiting, why="stopped before enough data came")
+                log.warning("not diagnosed", alarm=node.waiting[0], why="stopped before enough data came")
 
 
 def _summary(result: dict[str, Any]) -> dict[str, Any]:

@@ -99,6 +99,9 @@ class DiagnosisTrigger:
         config: settings.
         diagnose: starts a diagnosis, without waiting for its end.
         busy: returns True while a diagnosis runs, which delays the next one.
+
+    Attributes:
+        waiting: alarm of the pending diagnosis and the time when it was raised; None if there is none.
     """
 
     finished = False
@@ -108,7 +111,7 @@ class DiagnosisTrigger:
     ) -> None:
         self._config, self._diagnose, self._busy = config, diagnose, busy
         self._samples: deque[tuple[int, Encoded]] = deque(maxlen=MAX_SAMPLES)
-        self._waiting: tuple[str, int] | None = None
+        self.waiting: tuple[str, int] | None = None
         self._suppressed_until_ns = -NEVER_NS
         self._timeout_ns = NEVER_NS
 
@@ -131,46 +134,40 @@ class DiagnosisTrigger:
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Start a pending diagnosis if no data arrive."""
-        if self._waiting is not None and now_ns >= self._timeout_ns:
+        if self.waiting is not None and now_ns >= self._timeout_ns:
             self._timeout_ns = now_ns + TIMEOUT_NS
-            self._start(self._waiting)
+            self._start(self.waiting)
         return []
 
     def next_tick_ns(self) -> int:
         """Time at which the plant is considered stopped, if a diagnosis is pending."""
-        return NEVER_NS if self._waiting is None else self._timeout_ns
+        return NEVER_NS if self.waiting is None else self._timeout_ns
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish nothing."""
         return []
 
-    @property
-    def waiting(self) -> str | None:
-        """Name of the alarm of the pending diagnosis; None if there is none."""
-        return None if self._waiting is None else self._waiting[0]
-
     def _on_alarm(self, alarm: Alarm) -> None:
         is_raised = alarm.event == "raised" and alarm.state not in HIDDEN_STATES
-        if not is_raised or alarm.alarm.startswith(NO_DATA):
-            return
-        if self._waiting is None and alarm.raised_ns >= self._suppressed_until_ns:
-            self._waiting = (alarm.alarm, alarm.raised_ns)
+        is_new = self.waiting is None and alarm.raised_ns >= self._suppressed_until_ns
+        if is_raised and is_new and not alarm.alarm.startswith(NO_DATA):
+            self.waiting = (alarm.alarm, alarm.raised_ns)
 
     def _keep(self, time_ns: int, message: Encoded) -> None:
         """Store a sample and drop those before the window; all are dropped if the plant's time steps back before it."""
         window_ns = int(self._config.window_min * MINUTE_NS)
         if self._samples and time_ns < self._samples[0][0]:
             self._samples.clear()
-            self._waiting, self._suppressed_until_ns = None, -NEVER_NS
+            self.waiting, self._suppressed_until_ns = None, -NEVER_NS
         self._samples.append((time_ns, message))
         while self._samples[0][0] < time_ns - window_ns:
             self._samples.popleft()
-        if self._waiting is not None and time_ns >= self._waiting[1] + self._config.after_min * MINUTE_NS:
-            self._start(self._waiting)
+        if self.waiting is not None and time_ns >= self.waiting[1] + self._config.after_min * MINUTE_NS:
+            self._start(self.waiting)
 
     def _start(self, waiting: tuple[str, int]) -> None:
         if self._busy() or not self._samples:
             return
-        self._waiting = None
+        self.waiting = None
         self._suppressed_until_ns = self._samples[-1][0] + int(self._config.apart_min * MINUTE_NS)
         self._diagnose(DiagnosisRequest(*waiting, tuple(self._samples)))

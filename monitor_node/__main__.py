@@ -90,7 +90,7 @@ def run(
             length = monitor.config.training_length
             log.info("training", plant=config.plant, training_min=length.minutes, training_rows=length.rows or None)
             wanted = drift.preparation(monitor.config, wanted=True)
-            node.preparation = chain(wanted, stage.preparation(monitor.config, monitor.equations))
+            node.preparation = chain(wanted, stage.preparation(monitor.config, monitor.pipeline.baselines.equations))
             # All samples published since the state was stored, however long ago; the node skips those it knows.
             history_s = inf if node.resumed else 0.0
         else:  # a plant of which no state was stored yet has a history, too

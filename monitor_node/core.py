@@ -7,7 +7,7 @@ follow from its samples and from operators' actions. So a replay reproduces them
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, cast
 
@@ -19,7 +19,7 @@ from monitor_node.alarms.commands import COMMANDS as ALARM_COMMANDS
 from monitor_node.alarms.commands import execute_command
 from monitor_node.checks.silence import SilenceCheck
 from monitor_node.config import MonitorConfig
-from monitor_node.health import HEARD_AGAIN_NS, NODE, STALL_NS, Failures, ReceiveStats, health_message
+from monitor_node.health import HEARD_AGAIN_NS, NODE, STALL_NS, Failures, ReceiveStats
 from monitor_node.ingest.alignment import Aligner, Row
 from monitor_node.ingest.samples import (
     LARGEST_NUMBER,
@@ -49,11 +49,12 @@ from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import OTHER_VERSION, Body, DecodeError, Encoded, Publication, decode, encode
 from reactorwatch.contract.commands import decode_command
-from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply, Promise, Sample
+from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply, Health, Promise, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import copy_of
+from reactorwatch.version import version
 
 COMMANDS: Mapping[str, type[Message]] = {**ALARM_COMMANDS, BASELINE: BaselineCommand}
 """Message type by command."""
@@ -67,8 +68,8 @@ class Monitor:
         start_ns: present time.
         points: True to publish estimates and chart points; a back-test does without.
         model: process model, in minutes since 1970-01-01 UTC; None: the nominal reactor.
-        diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`, and
-            hands the result to `on_finding`.
+        diagnose: diagnoses the training before the first row is evaluated; None: the caller takes the pipeline's
+            `diagnosis_job`, and hands the result to its `on_finding`.
         power: True to state the deviations that would be seen; None: with points.
 
     Raises:
@@ -78,6 +79,7 @@ class Monitor:
         rejects: rejected messages.
         failures: contained errors of this software.
         alarms: alarms of the plant.
+        aligner: makes rows of the samples, and counts them.
         pipeline: pipeline of the plant's rows.
         memory: what the monitor remembers beside its parts.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
@@ -112,7 +114,7 @@ class Monitor:
         self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in known}
         self._label_keys = {keys.key(config.plant, keys.SAMPLE, signal) for signal in config.labels}
         self._indices = {signal: place for place, signal in enumerate(self._signals)}
-        self._aligner = Aligner(self._signals, config.reorder_rows)
+        self.aligner = Aligner(self._signals, config.reorder_rows)
         self._replay_filter: ReplayFilter | None = None
         self._alarms_with_other_settings: AnnunciatorMemory | None = None
         self.alarms = Annunciator(config)
@@ -173,7 +175,7 @@ class Monitor:
             self.pipeline.operation.on_sample(signal, sample.time_ns, value)
             return []
         if self._replay_filter is not None and self._replay_filter.is_duplicate(index, sample.time_ns, sample.sequence):
-            self._aligner.memory.counts.duplicated += 1
+            self.aligner.memory.counts.duplicated += 1
             return []
         publications: list[Publication] = []
         time_ns, number = sample.time_ns, sample.sequence
@@ -189,7 +191,11 @@ class Monitor:
             accepted, rejected = run.update(HeldSample(time_ns, number, value, unit), self.config.reorder_rows)
             is_accepted = bool(accepted)
             for item in rejected:
-                self._reject(signal, item, run)
+                self.rejects.add(
+                    "out_of_place",
+                    f"{signal} number {item.number} at {item.time_ns} ns does not follow number {run.newest} at "
+                    f"{run.newest_ns} ns; do two plants publish as {self.config.plant}?",
+                )
             for item in accepted:
                 self._accept(signal, *item, publications)
         if is_accepted and now_ns >= self.stats.heard_ns + HEARD_AGAIN_NS:
@@ -215,15 +221,8 @@ class Monitor:
             memory.heard_from_ns.setdefault(signal, time_ns)
             memory.units[signal] = unit
             self._output_units = [memory.units[output] for output in self.config.outputs]
-        for row in self._aligner.update(signal, time_ns, number, value):
+        for row in self.aligner.update(signal, time_ns, number, value):
             self._on_row(row, publications)
-
-    def _reject(self, signal: str, sample: HeldSample, run: SequenceCheck) -> None:
-        self.rejects.add(
-            "out_of_place",
-            f"{signal} number {sample.number} at {sample.time_ns} ns does not follow number {run.newest} at "
-            f"{run.newest_ns} ns; do two plants publish as {self.config.plant}?",
-        )
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """Execute an operator's command at the time of the newest row, or refuse it."""
@@ -271,11 +270,6 @@ class Monitor:
         overdue_ns = self.silence.of_plant.due_ns()
         return self.stats.health_due_ns if overdue_ns is None else min(self.stats.health_due_ns, overdue_ns)
 
-    @property
-    def finished(self) -> bool:
-        """Always False: a monitor runs until it is stopped."""
-        return False
-
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish health for the last time."""
         return [self._health(now_ns, "stopped")]
@@ -284,7 +278,15 @@ class Monitor:
 
     def to_bytes(self) -> bytes:
         """Serialise the full state. A monitor restored from it produces bit-identical output."""
-        return seal_state(self.state, self._learning_settings)
+        state = MonitorState(
+            **msgspec.structs.asdict(self.memory),
+            settings={},
+            alignment=self.aligner.memory,
+            board=self.alarms.memory,
+            watch=self.pipeline.memory,
+            unconfirmed=[encode(item)[:3] for item in self.unconfirmed],
+        )
+        return seal_state(state, self._learning_settings)
 
     def from_bytes(self, data: bytes) -> None:
         """Resume from what `to_bytes` of a monitor with the same settings returned.
@@ -298,33 +300,17 @@ class Monitor:
                 which are newer than those of a state that fits afterwards.
         """
         try:
-            self.restore(open_state(data, self._learning_settings))
+            state = open_state(data, self._learning_settings)
         except OtherSettingsError as error:
             if self._alarms_with_other_settings is None:
                 self._alarms_with_other_settings = error.alarms
                 self._restore_alarms(error.alarms)
             raise
+        self._restore(state)
         if self._alarms_with_other_settings is not None:
             self._restore_alarms(self._alarms_with_other_settings)
 
-    @property
-    def state(self) -> MonitorState:
-        """The state that `to_bytes` stores, without the settings. Parts of it are not copied."""
-        return MonitorState(
-            **msgspec.structs.asdict(self.memory),
-            settings={},
-            alignment=self._aligner.memory,
-            board=self.alarms.memory,
-            watch=self.pipeline.memory,
-            unconfirmed=[encode(item)[:3] for item in self.unconfirmed],
-        )
-
-    def restore(self, state: MonitorState) -> None:
-        """Resume from a state of a monitor with the same settings, see `from_bytes`.
-
-        Raises:
-            InputError: the state is damaged; nothing has changed.
-        """
+    def _restore(self, state: MonitorState) -> None:
         board = Annunciator(self.config)
         try:
             pipeline = self._new_pipeline(board)
@@ -339,7 +325,7 @@ class Monitor:
         self._republishes_baseline = True  # it may not have been published before the stop
         self.memory = memory = msgspec.convert(state, MonitorMemory, from_attributes=True)
         self.rejects.by_reason, self.failures.by_stage = memory.refused, memory.failures
-        self._aligner.memory, self._replay_filter = state.alignment, ReplayFilter(state.alignment)
+        self.aligner.memory, self._replay_filter = state.alignment, ReplayFilter(state.alignment)
         self.silence.unusable = memory.unusable
         self._output_units = [memory.units[output] for output in self.config.outputs]
         self.unconfirmed = unconfirmed
@@ -372,22 +358,6 @@ class Monitor:
         executed = 0 if self.baseline is None else self.baseline.id
         return self.alarms.changes + 2 * executed + len(self.pipeline.baselines.update.commands)
 
-    # --- diagnosis of the training ---------------------------------------------------------------------------
-
-    @property
-    def awaits_diagnosis(self) -> bool:
-        """True while there is a `diagnosis_job`."""
-        return self.pipeline.baselines.update.is_pending
-
-    @property
-    def diagnosis_job(self) -> DiagnosisJob | None:
-        """The diagnosis of the training, from its end until `on_finding`; None: there is none to make."""
-        return self.pipeline.baselines.diagnosis_job
-
-    def on_finding(self, finding: Finding) -> None:
-        """Process the result of `diagnosis_job`; what it found holds from the next row on."""
-        self.pipeline.baselines.on_finding(finding)
-
     def schedule(self, baseline: Baseline) -> None:
         """Schedule a recorded change of the baseline for the row that it names."""
         self._changes.append(ScheduledChange(baseline.time_ns, baseline))
@@ -407,32 +377,9 @@ class Monitor:
         return "watching" if self.pipeline.watching or not self.pipeline.is_judged else "training"
 
     @property
-    def is_ordinary(self) -> bool:
-        """True if rows are evaluated and nothing happens: no command or change of a unit, no history, no event."""
-        pipeline, history = self.pipeline, self._replay_filter
-        has_commands = bool(pipeline.baselines.update.commands)
-        is_quiet = not (has_commands or self._sample_units.converted or self.memory.unusable.reasons)
-        return is_quiet and pipeline.watching and pipeline.is_ordinary and (history is None or history.is_done)
-
-    @property
-    def model(self) -> ProcessModel | None:
-        """Process model of the plant; None if there is none."""
-        return self.pipeline.model
-
-    @property
-    def equations(self) -> ProcessModel | None:
-        """Process model in force: `model`, or as the change of the baseline has it."""
-        return self.pipeline.baselines.equations
-
-    @property
     def rows(self) -> int:
         """Number of rows so far, including incomplete rows."""
-        return self._aligner.memory.counts.rows
-
-    @property
-    def restarts(self) -> int:
-        """Number of restarts of the plant, or of its clock, so far."""
-        return self._aligner.memory.counts.restarts
+        return self.aligner.memory.counts.rows
 
     @property
     def silence(self) -> SilenceCheck:
@@ -463,21 +410,13 @@ class Monitor:
 
     # --- rows ------------------------------------------------------------------------------------------------
 
-    def on_rows(self, rows: Iterable[Row]) -> list[Publication]:
-        """Evaluate rows that were aligned elsewhere."""
-        publications: list[Publication] = []
-        for row in rows:
-            self._on_row(row, publications)
-        self.memory.published += len(publications)
-        return publications
-
     def finish(self) -> list[Publication]:
         """Evaluate pending rows, as at the end of a record."""
         publications: list[Publication] = []
         for signal, run in zip(self._signals, self.memory.runs, strict=True):
             for sample in run.release():
                 self._accept(signal, *sample, publications)
-        for row in self._aligner.flush():
+        for row in self.aligner.flush():
             self._on_row(row, publications)
         return publications
 
@@ -544,16 +483,28 @@ class Monitor:
         self.pipeline.resume_from_alarms()
 
     def _health(self, now_ns: int, phase: str) -> Publication:
-        health = health_message(
-            now_ns,
-            self.stats,
-            self._aligner.memory.counts,
-            self.rejects.by_reason,
+        memory, stats, counts = self.memory, self.stats, self.aligner.memory.counts
+        health = Health(
+            time_ns=now_ns,
+            node=NODE,
+            version=version(),
             phase=phase,
-            received=self.memory.received,
-            published=self.memory.published,
+            uptime_s=(now_ns - stats.start_ns) / 1e9,
+            received=memory.received,
+            published=memory.published,
+            refused=self.rejects.total,
+            refused_by_reason=self.rejects.by_reason,
             failures=self.failures.by_stage,
-            heard_from_ns=self.memory.heard_from_ns,
+            heard_from_ns=memory.heard_from_ns,
+            lag_ms=stats.lag_ns / 1e6,
+            not_stored=stats.not_stored,
+            stalls=stats.stalls,
+            lost=counts.lost,
+            late=counts.late,
+            duplicated=counts.duplicated,
+            out_of_order=counts.out_of_order,
+            rows=counts.rows,
+            incomplete_rows=counts.incomplete_rows,
             reference=self.pipeline.reference,
             training=self.pipeline.trained_share,
         )

@@ -53,14 +53,12 @@ class DiagnosisWorker:
         self._jobs: SimpleQueue[tuple[str, DiagnosisJob] | None] = SimpleQueue()
         self._findings: SimpleQueue[PlantFinding] = SimpleQueue()
         self._thread: threading.Thread | None = None
-        self._submitted: dict[str, int] = {}
+        self._outstanding = 0
         self._is_closed = False
 
     def submit(self, plant: str, job: DiagnosisJob) -> None:
-        """Queue the diagnosis of a plant's training, unless it is queued already."""
-        if self._submitted.get(plant) == job.first_ns:
-            return
-        self._submitted[plant] = job.first_ns
+        """Queue the diagnosis of a plant's training."""
+        self._outstanding += 1
         self._jobs.put((plant, job))
         if self._thread is None:
             self._thread = threading.Thread(target=self._work, name="diagnosis of trainings", daemon=True)
@@ -69,14 +67,12 @@ class DiagnosisWorker:
     @property
     def is_busy(self) -> bool:
         """True while findings are to be expected."""
-        return bool(self._submitted)
+        return self._outstanding > 0
 
     def pop_findings(self) -> list[PlantFinding]:
         """Findings since the last call."""
         found = list(_drain(self._findings))
-        for plant, finding in found:
-            if self._submitted.get(plant) == finding.first_ns:
-                del self._submitted[plant]
+        self._outstanding -= len(found)
         return found
 
     def close(self) -> None:
@@ -91,8 +87,7 @@ class DiagnosisWorker:
     def _work(self) -> None:
         while not self._is_closed:
             first = self._jobs.get()
-            batch = [item for item in (first, *_drain(self._jobs)) if item is not None]
-            self._run(batch)
+            self._run([item for item in (first, *_drain(self._jobs)) if item is not None])
 
     def _run(self, batch: Sequence[tuple[str, DiagnosisJob]]) -> None:
         pending = dict(enumerate(batch))

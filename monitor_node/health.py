@@ -1,18 +1,15 @@
-"""Health of a monitor: its message, contained errors of this software, and other monitors of its plants."""
+"""Health of a monitor: statistics by receive time, contained errors of this software, other monitors of its plants."""
 
 import fnmatch
 import traceback
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import structlog
 
-from monitor_node.ingest.alignment import Counts
 from reactorwatch.contract import keys
-from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError
-from reactorwatch.version import version
 
 log = structlog.get_logger()
 
@@ -55,38 +52,6 @@ class ReceiveStats:
     ticked: bool = False
     stalls: int = 0
     not_stored: int = 0
-
-
-def health_message(
-    now_ns: int, stats: ReceiveStats, samples: Counts, refused: Mapping[str, int], **fields: Any
-) -> Health:
-    """Health message of a plant's monitor.
-
-    Args:
-        now_ns: present time.
-        stats: statistics by receive time.
-        samples: counts of samples and rows since the monitor was made, or since its state was.
-        refused: number of rejected messages by reason.
-        **fields: further fields of the message.
-    """
-    return Health(
-        time_ns=now_ns,
-        node=NODE,
-        version=version(),
-        uptime_s=(now_ns - stats.start_ns) / 1e9,
-        refused=sum(refused.values()),
-        refused_by_reason=refused,
-        lag_ms=stats.lag_ns / 1e6,
-        not_stored=stats.not_stored,
-        stalls=stats.stalls,
-        lost=samples.lost,
-        late=samples.late,
-        duplicated=samples.duplicated,
-        out_of_order=samples.out_of_order,
-        rows=samples.rows,
-        incomplete_rows=samples.incomplete_rows,
-        **fields,
-    )
 
 
 @dataclass

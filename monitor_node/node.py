@@ -7,7 +7,7 @@ from pathlib import Path
 
 import structlog
 
-from monitor_node.alarms.kpis import is_empty
+from monitor_node.alarms.incidents import is_empty
 from monitor_node.causes import stage
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor

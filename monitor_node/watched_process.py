@@ -69,8 +69,13 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
     for signal in (name for names in (*named.values(), *stated.values()) for name in names):
         if signal not in (*process.inputs, *process.outputs):
             raise InputError(describe_unknown("signal", signal, (*process.inputs, *process.outputs)))
-    described |= {key: described[key] | values for key, values in stated.items()}
-    changed: dict[str, object] = {"units": process.units} | _restrict(described, described | named)
+    changed = {"units": process.units} | described | named
+    names = (*changed["inputs"], *changed["outputs"])
+    unwatched = (name for key in DEFAULT_SIGNALS for name in described[key] if name not in names)
+    changed["labels"] = (*described["labels"], *unwatched)
+    for key, watched in (("bounds", names), ("resolution", changed["outputs"])):
+        values = described[key] | stated[key]
+        changed[key] = {name: value for name, value in values.items() if name in watched}
     if process.model is None:
         changed["process"] = WITHOUT_EQUATIONS
     if process.name != DEFAULT.name:
@@ -130,22 +135,6 @@ def order_inputs(config: MonitorConfig, model: ProcessModel | None) -> MonitorCo
     if model is None or set(config.inputs) != set(model.input_names):
         return config
     return msgspec.structs.replace(config, inputs=model.input_names)
-
-
-def _restrict(described: dict[str, Any], chosen: dict[str, Any]) -> dict[str, Any]:
-    """Settings of the signals of a process, for the inputs and outputs that are watched."""
-    inputs, outputs = chosen["inputs"], chosen["outputs"]
-    names = {*inputs, *outputs}
-    others = [name for key in ("inputs", "outputs") for name in described[key] if name not in names]
-    return {
-        "inputs": inputs,
-        "outputs": outputs,
-        "setpoints": described["setpoints"],
-        "modes": described["modes"],
-        "labels": (*described["labels"], *others),
-        "bounds": {name: bounds for name, bounds in described["bounds"].items() if name in (*inputs, *outputs)},
-        "resolution": {name: step for name, step in described["resolution"].items() if name in outputs},
-    }
 
 
 def limit_training(config: MonitorConfig, rows: int | None, *, is_stated: bool | None = None) -> MonitorConfig:

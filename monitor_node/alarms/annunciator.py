@@ -12,30 +12,24 @@ without an operator's action follow from the samples alone.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from math import isfinite
+from typing import Literal, TypeAlias
 
 import msgspec
-from google.protobuf.message import DecodeError as ProtobufDecodeError
 
 from monitor_node.alarms.alarms import (
     LAST_NS,
     AlarmChange,
     AlarmMemory,
     ChartAlarm,
-    Condition,
-    Incident,
-    OnOffDelay,
     SuspectedCause,
     TimeNs,
-    suspect_messages,
 )
-from monitor_node.alarms.kpis import KpiCounter
+from monitor_node.alarms.incidents import Incident, KpiCounter
 from monitor_node.config import MonitorConfig, PriorityName
 from reactorwatch.contract import keys
-from reactorwatch.contract.alarm_states import CODES, UNACKNOWLEDGED_STATES, Event, State, is_consistent
+from reactorwatch.contract.alarm_states import CODES, UNACKNOWLEDGED_STATES, Event, State, is_consistent, next_state
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis
-from reactorwatch.contract.messages_pb2 import Incident as IncidentMessage
+from reactorwatch.contract.messages_pb2 import Alarm, Contribution
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory
@@ -46,11 +40,14 @@ KPIS = "monitor"
 STOPPED = "the search for its cause stopped at its budget of filter steps, so none is named"
 """Text of an incident after such a search."""
 
-URGENCY = (
-    *(State.UNACKNOWLEDGED, State.ACKNOWLEDGED, State.RETURNED_UNACKNOWLEDGED, State.SHELVED),
-    *(State.SUPPRESSED_BY_DESIGN, State.OUT_OF_SERVICE, State.NORMAL),
+Action: TypeAlias = Event | Literal["comment"]
+"""Action of an operator; a comment changes no state."""
+
+SHARED = (
+    *("raised_ns", "cleared_ns", "value", "limit", "unit", "text", "incident", "first_in", "shelved_until_ns"),
+    *("by", "comment"),
 )
-"""States of alarms, the most urgent first; an incident has that of its most urgent alarm."""
+"""Fields that the memory of an alarm and its message have in common."""
 
 
 class AnnunciatorMemory(Memory):
@@ -65,7 +62,6 @@ class AnnunciatorMemory(Memory):
         kpi_minute: minute in which KPIs were last published; None if unknown.
         kpis_due: True if KPIs are due with the next row, after a change of an alarm.
         incidents_due: True if an incident may have changed since incidents were last published.
-        published_kpis: the newest published `AlarmKpis`, serialized; empty before the first.
     """
 
     time_ns: TimeNs | None = None
@@ -75,7 +71,6 @@ class AnnunciatorMemory(Memory):
     kpi_minute: int | None = None
     kpis_due: bool = False
     incidents_due: bool = False
-    published_kpis: bytes = b""
 
 
 class Annunciator:
@@ -94,10 +89,11 @@ class Annunciator:
         self._config = config
         self._window_ns = int(config.incident_min * MINUTE_NS)
         self._alarms: dict[str, ChartAlarm] = {}
-        self._keys: dict[str, str] = {}  # key of each alarm's messages, by its name
-        self._kpi_key = keys.key(config.plant, keys.ALARM_KPIS, KPIS)
+        self._alarm_key, self._incident_key, self._kpi_key = (
+            keys.key(config.plant, kind, name)
+            for kind, name in ((keys.ALARM, ""), (keys.INCIDENT, ""), (keys.ALARM_KPIS, KPIS))
+        )
         self._shelved: list[ChartAlarm] = []
-        self._newest_kpis: AlarmKpis | None = None
         self.memory = AnnunciatorMemory()
         self.changes = 0
         self.has_unexplained = False
@@ -135,17 +131,16 @@ class Annunciator:
         """
         config = self._config
         count, window = (1, 1) if without_on_delay else (config.raise_count, config.window)
-        rule = OnOffDelay(count, window, 1 if without_off_delay else config.clear_count)
+        delays = count, window, 1 if without_off_delay else config.clear_count
         urgency = priority or config.priorities.get(signal, "medium")
         band = config.dead_band if dead_band is None else dead_band
-        alarm = ChartAlarm(chart, signal, urgency, rule, band, names_cause=names_cause, is_transient=is_transient)
-        alarm.memory = self.memory.alarms.setdefault(alarm.name, alarm.memory)
-        alarm.memory.rule = Condition(standing=alarm.memory.is_active)
+        alarm = ChartAlarm(chart, signal, urgency, delays, band, names_cause=names_cause, is_transient=is_transient)
+        alarm.memory = memory = self.memory.alarms.setdefault(alarm.name, alarm.memory)
+        memory.recent, memory.in_a_row, memory.standing = 0, 0, memory.is_active
         self._alarms[alarm.name] = alarm
-        self._keys[alarm.name] = keys.key(config.plant, keys.ALARM, alarm.name)
         return alarm
 
-    # --- samples ---------------------------------------------------------------------------------------------
+    # --- rows ------------------------------------------------------------------------------------------------
 
     def apply(self, time_ns: int, changes: Sequence[AlarmChange]) -> list[Publication]:
         """Apply the changes of alarms that the stages of a row have found, in their order; returns their messages.
@@ -154,24 +149,29 @@ class Annunciator:
             time_ns: time of the row.
             changes: changes of alarms declared here.
         """
-        if not changes:
-            return []
         publications, activated = list[Publication](), list[tuple[int, ChartAlarm]]()
-        operation = self.describe_operation(time_ns)
+        operation = self.describe_operation(time_ns) if changes else ""
         for change in changes:
-            alarm, explanation = change.alarm, change.explanation
+            alarm, memory, judgement = change.alarm, change.alarm.memory, change.judgement
             at_ns = time_ns if change.time_ns is None else change.time_ns
-            before = alarm.memory.state
             self._take_suspects(alarm)
-            if explanation is not None:
-                text = "; ".join(filter(None, (explanation.text, operation, self.warning)))
-                change = change._replace(explanation=explanation._replace(text=text))
-            event = alarm.record(at_ns, change)
-            if self._on_change(alarm, event, before, at_ns):
+            memory.value, memory.unit, memory.is_active = judgement.statistic, change.unit, change.is_raised
+            if change.is_raised:
+                memory.above = judgement.statistic > judgement.centre
+                memory.limit = judgement.upper_limit if memory.above else judgement.lower_limit
+                memory.raised_ns, memory.cleared_ns, memory.incident, memory.first_in = at_ns, 0, 0, False
+                if memory.state is State.NORMAL:
+                    memory.by = memory.comment = ""
+                memory.text = "; ".join(filter(None, (change.text, operation, self.warning)))
+                memory.contributions, memory.suspects = change.contributions, list(change.suspects)
+            else:
+                memory.cleared_ns, memory.text = at_ns, f"{alarm.name} is back within its limits"
+            event = Event.RAISED if change.is_raised else Event.CLEARED
+            if self._set_state(alarm, event, at_ns):
                 activated.append((at_ns, alarm))
             publications.append(self._publication(alarm, event, at_ns))
-            if explanation is not None and explanation.entries:
-                self.set_suspects(explanation.entries)
+            if change.entries:
+                self.set_suspects(change.entries)
         if activated:
             self.memory.kpis.count(activated)
         return publications
@@ -188,7 +188,7 @@ class Annunciator:
         for alarm in self._shelved:
             # A clock that was set back ends shelving as well; otherwise it would last as much longer.
             if not alarm.memory.shelved_ns <= time_ns < alarm.memory.shelved_until_ns:
-                self._apply(alarm, Event.SHELF_TIME_OVER, time_ns)
+                self._change(alarm, Event.SHELF_TIME_OVER, time_ns)
                 publications.append(self._publication(alarm, Event.SHELF_TIME_OVER, time_ns))
         if memory.incidents_due:
             publications += self._publish_incidents(time_ns)
@@ -211,41 +211,56 @@ class Annunciator:
 
     def is_at_rest(self, counting: Iterable[ChartAlarm]) -> bool:
         """True if no alarm is active or shelved, and no alarms but the given ones remember points."""
-        if self._shelved or any(alarm.memory.rule.standing for alarm in self._alarms.values()):
+        if self._shelved or any(alarm.memory.standing for alarm in self._alarms.values()):
             return False
         known = {alarm.name for alarm in counting}
-        return all(name in known or not alarm.memory.rule.recent for name, alarm in self._alarms.items())
+        return all(name in known or not alarm.memory.recent for name, alarm in self._alarms.items())
 
     @property
     def incident(self) -> int:
         """Number of the latest incident; 0 before the first."""
         return self.memory.incidents[-1].number if self.memory.incidents else 0
 
-    # --- operator actions ------------------------------------------------------------------------------------
+    # --- operators -------------------------------------------------------------------------------------------
 
-    def act(self, name: str, event: Event, by: str, comment: str) -> list[Publication]:
-        """Apply an operator's action, other than shelving.
+    def act(self, name: str, action: Action, by: str, comment: str, minutes: float = 0.0) -> list[Publication]:
+        """Apply an operator's action.
 
         Args:
             name: name of the alarm.
-            event: the action.
+            action: the action; shelving a shelved alarm changes the time for which it is shelved.
             by: name of the operator.
             comment: reason; empty: the last comment stays.
+            minutes: duration of shelving in plant time.
 
         Raises:
-            InputError: there is no such alarm, no sample has come yet, or the table of states refuses it.
+            InputError: there is no such alarm, no sample has come yet, the table of states refuses the action, the
+                comment is empty where it is the action, or minutes are not positive or too many.
         """
-        alarm, time_ns = self._find(name), self._now_ns()
-        self._change_by(alarm, event, time_ns, by, comment)
-        return [self._publication(alarm, event, time_ns), *self._publish_summary(time_ns)]
+        alarm = self._find(name)
+        memory, time_ns, longest = alarm.memory, self.memory.time_ns, self._config.longest_shelf_min
+        if time_ns is None:
+            raise InputError("no sample has come yet, and alarms change at the time of a sample; wait for the plant")
+        if not isinstance(action, Event):
+            if not comment:
+                raise InputError("comment must say something, got ''")
+            self.changes += 1
+            memory.by, memory.comment = by, comment
+            return [self._publication(alarm, action, time_ns)]
+        if action is Event.SHELVE and not 0 < minutes <= longest:
+            raise InputError(f"minutes must be in (0, {longest:g}], which longest_shelf_min sets, got {minutes:g}")
+        try:
+            self._change(alarm, action, time_ns)
+        except InputError as error:
+            raise InputError(f"alarm {name} {error}") from error
+        memory.by, memory.comment = by, comment or memory.comment
+        if action is Event.SHELVE:
+            memory.shelved_ns, memory.shelved_until_ns = time_ns, min(time_ns + round(minutes * MINUTE_NS), LAST_NS)
+        changed = self._publication(alarm, action, time_ns)
+        return [changed, *self._publish_incidents(time_ns), self._publish_kpis(time_ns)]
 
     def acknowledge_incident(self, number: int, by: str, comment: str) -> list[Publication]:
-        """Acknowledge all alarms of an incident, one after the other.
-
-        Args:
-            number: number of the incident.
-            by: name of the operator.
-            comment: reason; empty: the last comment stays.
+        """Acknowledge all alarms of an incident, one after the other; arguments as for `act`.
 
         Raises:
             InputError: no sample has come yet, or the incident has no alarm that is unacknowledged.
@@ -259,55 +274,17 @@ class Annunciator:
             raise InputError(f"incident {number} has no alarm to acknowledge (the latest incident is {self.incident})")
         return [item for name in due for item in self.act(name, Event.ACKNOWLEDGE, by, comment)]
 
-    def shelve(self, name: str, minutes: float, by: str, comment: str) -> list[Publication]:
-        """Shelve an alarm, or change the time for which it is shelved.
-
-        Args:
-            name: name of the alarm.
-            minutes: duration in plant time.
-            by: name of the operator.
-            comment: reason; empty: the last comment stays.
-
-        Raises:
-            InputError: as `act`, or the time is not positive or too long.
-        """
-        alarm, time_ns = self._find(name), self._now_ns()
-        longest = self._config.longest_shelf_min
-        if not (isfinite(minutes) and 0 < minutes <= longest):
-            raise InputError(f"minutes must be in (0, {longest:g}], which longest_shelf_min sets, got {minutes:g}")
-        self._change_by(alarm, Event.SHELVE, time_ns, by, comment)
-        alarm.memory.shelved_ns = time_ns
-        alarm.memory.shelved_until_ns = min(time_ns + round(minutes * MINUTE_NS), LAST_NS)
-        return [self._publication(alarm, Event.SHELVE, time_ns), *self._publish_summary(time_ns)]
-
-    def comment(self, name: str, by: str, comment: str) -> list[Publication]:
-        """Set an operator's comment on an alarm.
-
-        Raises:
-            InputError: there is no such alarm, no sample has come yet, or the comment is empty.
-        """
-        alarm, time_ns = self._find(name), self._now_ns()
-        if not comment:
-            raise InputError("comment must say something, got ''")
-        self.changes += 1
-        alarm.memory.by, alarm.memory.comment = by, comment
-        return [self._publication(alarm, "comment", time_ns)]
-
     def alarm(self, name: str) -> Alarm:
         """The present message of an alarm.
 
         Raises:
             InputError: there is no such alarm.
         """
-        alarm = self._find(name)
-        self._take_suspects(alarm)
-        return alarm.message(self.memory.time_ns or 0, "")
+        return self._message(self._find(name), "", self.memory.time_ns or 0)
 
     def all_alarms(self) -> list[Alarm]:
         """The present messages of all alarms."""
         return [self.alarm(name) for name in self._alarms]
-
-    # --- state -----------------------------------------------------------------------------------------------
 
     def restore(self, memory: AnnunciatorMemory) -> None:
         """Resume from the memory of another annunciator of the plant.
@@ -316,16 +293,12 @@ class Annunciator:
             InputError: the memory contradicts itself; nothing has changed.
         """
         for name, alarm in memory.alarms.items():
-            if not is_consistent(alarm.state, active=alarm.rule.standing):
-                active = "is active" if alarm.rule.standing else "is not active"
+            if not is_consistent(alarm.state, active=alarm.standing):
+                active = "is active" if alarm.standing else "is not active"
                 raise InputError(f"is no state of alarms: {name} is {alarm.state}, but its condition {active}")
-        try:
-            kpis = AlarmKpis.FromString(memory.published_kpis) if memory.published_kpis else None
-        except ProtobufDecodeError as error:
-            raise InputError(f"is no state of alarms: {error}") from error
         for name, declared in self._alarms.items():
             declared.memory = memory.alarms.setdefault(name, declared.memory)
-        self.memory, self._newest_kpis = memory, kpis
+        self.memory = memory
         self._refresh()
 
     # --- within ----------------------------------------------------------------------------------------------
@@ -336,27 +309,21 @@ class Annunciator:
             raise InputError(f"there is no alarm {name!r} (there are: {', '.join(self._alarms)})")
         return alarm
 
-    def _now_ns(self) -> int:
-        if self.memory.time_ns is None:
-            raise InputError("no sample has come yet, and alarms change at the time of a sample; wait for the plant")
-        return self.memory.time_ns
-
-    def _change_by(self, alarm: ChartAlarm, event: Event, time_ns: int, by: str, comment: str) -> None:
-        try:
-            self._apply(alarm, event, time_ns)
-        except InputError as error:
-            raise InputError(f"alarm {alarm.name} {error}") from error
-        alarm.memory.by, alarm.memory.comment = by, comment or alarm.memory.comment
-
-    def _apply(self, alarm: ChartAlarm, event: Event, time_ns: int) -> None:
-        before = alarm.memory.state
-        alarm.apply(event)
-        if self._on_change(alarm, event, before, time_ns):
+    def _change(self, alarm: ChartAlarm, event: Event, time_ns: int) -> None:
+        """Apply an event that is not of a row's points."""
+        if self._set_state(alarm, event, time_ns):
             self.memory.kpis.count([(time_ns, alarm)])
 
-    def _on_change(self, alarm: ChartAlarm, event: Event, before: State, time_ns: int) -> bool:
-        """Assign an alarm that changed to its incident; returns True if it was activated."""
-        memory = alarm.memory
+    def _set_state(self, alarm: ChartAlarm, event: Event, time_ns: int) -> bool:
+        """Apply an event to the state of an alarm, and to its incident; returns True if the alarm was activated.
+
+        Raises:
+            InputError: the table of states refuses the event; nothing has changed.
+        """
+        memory, before = alarm.memory, alarm.memory.state
+        memory.state = next_state(before, event, active=memory.standing)
+        if memory.state is not State.SHELVED:
+            memory.shelved_ns = memory.shelved_until_ns = 0
         if event is Event.CLEARED and (memory.first_in or not alarm.is_transient):
             for incident in self.memory.incidents:
                 if incident.number == memory.incident:
@@ -369,6 +336,38 @@ class Annunciator:
         self.memory.kpis_due = self.memory.incidents_due = True
         return is_activated
 
+    def _refresh(self) -> None:
+        """Refresh what every row reads and few rows change."""
+        alarms = self._alarms.values()
+        self._shelved = [alarm for alarm in alarms if alarm.memory.state is State.SHELVED]
+        self.has_unexplained = any(alarm.memory.is_active and not alarm.names_cause for alarm in alarms)
+
+    def _publication(self, alarm: ChartAlarm, event: str, time_ns: int) -> Publication:
+        return Publication(self._alarm_key + alarm.name, self._message(alarm, event, time_ns))
+
+    def _message(self, alarm: ChartAlarm, event: str, time_ns: int) -> Alarm:
+        """An alarm as a message, with the event that changed it and the time of that."""
+        self._take_suspects(alarm)
+        memory = alarm.memory
+        return Alarm(
+            time_ns=time_ns,
+            alarm=alarm.name,
+            state=CODES[memory.state],
+            priority=alarm.priority,
+            contributions=[Contribution(signal=name, share=share) for name, share in memory.contributions.items()],
+            suspects=[item.message for item in memory.suspects],
+            event=event,
+            names_cause=alarm.names_cause,
+            **{field: getattr(memory, field) for field in SHARED},
+        )
+
+    def _publish_kpis(self, time_ns: int) -> Publication:
+        memory = self.memory
+        memory.kpi_minute, memory.kpis_due = time_ns // MINUTE_NS, False
+        return Publication(self._kpi_key, memory.kpis.compute(time_ns, self._alarms.values(), self.incident))
+
+    # --- incidents -------------------------------------------------------------------------------------------
+
     def _assign(self, alarm: ChartAlarm, time_ns: int) -> None:
         """Assign an activated alarm to the latest incident, or to a new one.
 
@@ -378,7 +377,8 @@ class Annunciator:
         incidents = self.memory.incidents
         joins = bool(incidents) and alarm.is_transient and self.has_unexplained
         if not (joins or (incidents and 0 <= time_ns - incidents[-1].changed_ns <= self._window_ns)):
-            self._keep_suspects()
+            for other in self._alarms.values():
+                self._take_suspects(other)
             incidents.append(Incident(1 + self.incident, since_ns=time_ns))
         latest = incidents[-1]
         if alarm.name not in latest.alarms:
@@ -387,78 +387,24 @@ class Annunciator:
             latest.changed_ns = time_ns
         alarm.memory.incident, alarm.memory.first_in = latest.number, latest.alarms[0] == alarm.name
 
-    def _refresh(self) -> None:
-        """Refresh what every row reads and few rows change."""
-        alarms = self._alarms.values()
-        self._shelved = [alarm for alarm in alarms if alarm.memory.state is State.SHELVED]
-        self.has_unexplained = any(alarm.memory.is_active and not alarm.names_cause for alarm in alarms)
-
-    def _publication(self, alarm: ChartAlarm, event: str, time_ns: int) -> Publication:
-        self._take_suspects(alarm)
-        return Publication(self._keys[alarm.name], alarm.message(time_ns, event))
-
     def _take_suspects(self, alarm: ChartAlarm) -> None:
         """Give an alarm the suspects of its incident, if that is the latest and the alarm does not name its cause."""
         memory, incidents = alarm.memory, self.memory.incidents
         if incidents and memory.incident == incidents[-1].number and memory.is_active and not alarm.names_cause:
             memory.suspects = list(incidents[-1].suspects)
 
-    def _keep_suspects(self) -> None:
-        """Give the suspects of the latest incident to its alarms, before a later one comes."""
-        for alarm in self._alarms.values():
-            self._take_suspects(alarm)
-
-    def _publish_summary(self, time_ns: int) -> list[Publication]:
-        """Publish the incidents that have changed, and the KPIs."""
-        return [*self._publish_incidents(time_ns), self._publish_kpis(time_ns)]
-
     def _publish_incidents(self, time_ns: int) -> list[Publication]:
         """Messages of the incidents that have changed; those that are over are forgotten, but for the latest."""
-        memory, publications = self.memory, list[Publication]()
+        memory, publications, kept = self.memory, list[Publication](), list[Incident]()
         for incident in memory.incidents:
-            message = self._incident_message(incident)
+            found = (self._alarms.get(name) for name in incident.alarms)
+            members = [item.memory for item in found if item is not None and item.memory.incident == incident.number]
+            message = incident.message(members)
             content = message.SerializeToString(deterministic=True)
             if content != incident.published:
                 incident.published, message.time_ns = content, time_ns
-                path = keys.key(self._config.plant, keys.INCIDENT, str(incident.number))
-                publications.append(Publication(path, message))
-        latest = memory.incidents[-1:]
-        memory.incidents = [item for item in memory.incidents[:-1] if not self._is_over(item)] + latest
-        memory.incidents_due = False
+                publications.append(Publication(f"{self._incident_key}{incident.number}", message))
+            if incident is memory.incidents[-1] or any(item.state is not State.NORMAL for item in members):
+                kept.append(incident)
+        memory.incidents, memory.incidents_due = kept, False
         return publications
-
-    def _members(self, incident: Incident) -> list[ChartAlarm]:
-        """Alarms whose last activation belongs to an incident."""
-        found = (self._alarms.get(name) for name in incident.alarms)
-        return [alarm for alarm in found if alarm is not None and alarm.memory.incident == incident.number]
-
-    def _is_over(self, incident: Incident) -> bool:
-        """True if no alarm of an incident is active or waits for an operator."""
-        return all(alarm.memory.state is State.NORMAL for alarm in self._members(incident))
-
-    def _incident_message(self, incident: Incident) -> IncidentMessage:
-        """An incident as a message, without the time."""
-        members = self._members(incident)
-        is_active = any(alarm.memory.is_active for alarm in members)
-        states = {alarm.memory.state for alarm in members}
-        return IncidentMessage(
-            number=incident.number,
-            since_ns=incident.since_ns,
-            until_ns=0 if is_active else incident.changed_ns,
-            state=CODES[next((state for state in URGENCY if state in states), State.NORMAL)],
-            alarms=incident.alarms,
-            suspects=suspect_messages(incident.suspects),
-            text=incident.text,
-        )
-
-    def _publish_kpis(self, time_ns: int) -> Publication:
-        memory, before = self.memory, self._newest_kpis
-        if memory.kpis_due or before is None or before.standing or before.alarms_10min:
-            kpis = memory.kpis.compute(time_ns, self._alarms.values(), self.incident)
-        else:  # nothing that time alone would change
-            kpis = AlarmKpis()
-            kpis.CopyFrom(before)
-            kpis.time_ns = time_ns
-        memory.kpi_minute, memory.kpis_due, self._newest_kpis = time_ns // MINUTE_NS, False, kpis
-        memory.published_kpis = kpis.SerializeToString()
-        return Publication(self._kpi_key, kpis)

@@ -25,10 +25,10 @@ record.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from math import exp, isfinite, log, nan
+from math import exp, isfinite, log
 
+from monitor_node.alarms.alarms import SuspectedCause
 from monitor_node.causes.fit import Fitter, log_evidence_of_residual
 from monitor_node.causes.scan import Candidate, GlrScan
 from monitor_node.causes.window import Row, newest_rows, window_of
@@ -39,6 +39,7 @@ from reactorwatch.kalman.step_budget import BudgetExceededError, StepBudget
 from reactorwatch.process import own_effects
 from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import MINUTE_NS
 
 UNKNOWN, SENSOR, PROCESS = "unknown", "sensor", "process"
 
@@ -50,32 +51,7 @@ def causes_of(model: ProcessModel) -> tuple[Effect, ...]:
     return tuple(effect for effect in traced if effect.extend(model).state_names == model.state_names)
 
 
-@dataclass(frozen=True)
-class Suspect:
-    """A cause with its probability, and its size and onset if it is the cause.
-
-    Attributes:
-        cause: its name in the catalogue, or `UNKNOWN`.
-        profile: `step` or `ramp`; empty if unknown.
-        probability: posterior probability; those of all suspects sum to 1.
-        size: size in the effect's unit; for a ramp, in the last row.
-        size_sd: standard deviation of the size.
-        onset_min: onset in minutes.
-        onset_sd_min: standard deviation of the onset.
-        kind: `sensor` or `process`; `UNKNOWN` if unknown.
-    """
-
-    cause: str
-    profile: str
-    probability: float
-    size: float
-    size_sd: float
-    onset_min: float
-    onset_sd_min: float
-    kind: str
-
-
-def rank_suspects(candidates: Sequence[Candidate], none: float) -> list[Suspect]:
+def rank_suspects(candidates: Sequence[Candidate], none: float) -> list[SuspectedCause]:
     """Compute the probability of each cause, most likely first; its size and onset are those of its likeliest profile.
 
     Args:
@@ -88,14 +64,25 @@ def rank_suspects(candidates: Sequence[Candidate], none: float) -> list[Suspect]
     weights = [exp(item - top) for item in evidence]
     unknown = exp(none - top) + exp(-top)
     total = sum(weights) + unknown
-    suspects = [unknown_suspect(unknown / total)]
+    suspects = [SuspectedCause(UNKNOWN, unknown / total)]
     for effect in dict.fromkeys(item.effect for item in candidates):
         indices = [index for index, item in enumerate(candidates) if item.effect is effect]
         item = candidates[max(indices, key=weights.__getitem__)]
         size, onset_min = item.parameters[:2].tolist()
-        probability, profile = sum(weights[index] for index in indices) / total, Step if item.profile is Step else Ramp
-        kind, sds = SENSOR if isinstance(effect, SensorEffect) else PROCESS, (item.size_sd, item.onset_sd_min)
-        suspects.append(Suspect(effect.name, profile.name, probability, size, sds[0], onset_min, sds[1], kind))
+        suspects.append(
+            SuspectedCause(
+                cause=effect.name,
+                probability=sum(weights[index] for index in indices) / total,
+                profile=(Step if item.profile is Step else Ramp).name,
+                size=size,
+                size_sd=item.size_sd,
+                unit=effect.unit,
+                onset_ns=round(onset_min * MINUTE_NS),
+                onset_sd_min=item.onset_sd_min,
+                kind=SENSOR if isinstance(effect, SensorEffect) else PROCESS,
+                text=effect.describe(size),
+            )
+        )
     return sorted(suspects, key=lambda item: -item.probability)
 
 
@@ -103,11 +90,6 @@ def log_evidence_of(item: Candidate) -> float:
     """Logarithm of a candidate's likelihood ratio to no fault, integrated over sizes and onsets."""
     share = 1.0 - SHARE_OF_RAMPS if item.profile is Step else SHARE_OF_RAMPS
     return item.gain + item.log_volume + item.end_log_volume + log(share)
-
-
-def unknown_suspect(probability: float) -> Suspect:
-    """Make the suspect `UNKNOWN`."""
-    return Suspect(UNKNOWN, "", probability, nan, nan, nan, nan, UNKNOWN)
 
 
 SHARE_OF_RAMPS = 0.3
@@ -152,7 +134,7 @@ class Isolation:
         """
         return [self._nominal.prepare, self._scan.prepare, *self.fitter.preparations]
 
-    def suspects(self, rows: Sequence[Row], since_rows: int = 0) -> list[Suspect]:
+    def suspects(self, rows: Sequence[Row], since_rows: int = 0) -> list[SuspectedCause]:
         """Compute the plausible causes, most likely first, `UNKNOWN` among them.
 
         A look stops at a budget of filter steps. `UNKNOWN` is then the only suspect, and `stopped` is set.
@@ -167,16 +149,16 @@ class Isolation:
             return self._compare(newest_rows(rows, LEAST_ROWS + 2 * since_rows))
         except BudgetExceededError:  # fitted hypotheses cannot be compared with others that are not
             self.stopped = True
-            return [unknown_suspect(1.0)]
+            return [SuspectedCause(UNKNOWN, 1.0)]
 
-    def _compare(self, rows: Sequence[Row]) -> list[Suspect]:
+    def _compare(self, rows: Sequence[Row]) -> list[SuspectedCause]:
         self._nominal.budget = self.budget
         window = window_of(rows, self._nominal)
         if window is None:
-            return [unknown_suspect(1.0)]
+            return [SuspectedCause(UNKNOWN, 1.0)]
         scans = self._scan.scan(window)
         candidates = [item for item in self.fitter.fit(window, *scans, self.budget) if isfinite(item.gain)]
         if not candidates:  # no measurement would show a cause, or every filter diverged
-            return [unknown_suspect(1.0)]
+            return [SuspectedCause(UNKNOWN, 1.0)]
         none = log_evidence_of(candidates[0]) + log_evidence_of_residual(*candidates[0].residual(window))
         return rank_suspects(candidates, none)

@@ -19,7 +19,7 @@ from math import isfinite, nan, sqrt
 
 from monitor_node.alarms.alarms import STUCK_SENSOR, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.causes.isolation import UNKNOWN, Isolation, Suspect, causes_of
+from monitor_node.causes.isolation import Isolation, causes_of
 from monitor_node.causes.scan import Progress
 from monitor_node.causes.window import MOST_PIECES, RecentRows, Row, is_break, newest_rows, rows_since_break
 from monitor_node.config import MonitorConfig
@@ -283,8 +283,8 @@ class Suspicion:
         isolation.fitter.progress = self.memory.progress
         suspects = isolation.suspects(self._rows_of_look(since), min(since, FEW_ROWS))
         self.memory.progress = isolation.fitter.progress
-        causes = [self._suspected_cause(item) for item in suspects if item.probability >= LEAST]
-        self._board.set_suspects(causes, stopped=isolation.stopped)
+        shown = [item for item in suspects if item.probability >= LEAST]
+        self._board.set_suspects(shown, stopped=isolation.stopped)
         self._follow(suspects[0])
 
     def add(self, time_min: float, inputs: Sequence[float], values: Sequence[float]) -> Sequence[float]:
@@ -303,12 +303,12 @@ class Suspicion:
             measured[index] = value
         return measured
 
-    def _follow(self, suspect: Suspect) -> None:
+    def _follow(self, suspect: SuspectedCause) -> None:
         """Start or stop the reconstruction of a sensor."""
         effect = self._effects.get(suspect.cause)
         output = effect.output if isinstance(effect, SensorEffect) else ""
         if suspect.probability >= CONVINCED and output in self._config.outputs:
-            self._reconstruct(output, suspect.cause, suspect.onset_min, self.memory.rows.rows())
+            self._reconstruct(output, suspect.cause, suspect.onset_ns / MINUTE_NS, self.memory.rows.rows())
         elif self._reconstructed_cause != STUCK_SENSOR:
             self._stop_reconstruction()
 
@@ -340,20 +340,3 @@ class Suspicion:
             time_ns=time_ns, value=value, sd=sd, unit=units[index], measured=values[index], cause=cause
         )
         return [Publication(keys.key(self._config.plant, keys.RECONSTRUCTION, output), message)]
-
-    def _suspected_cause(self, suspect: Suspect) -> SuspectedCause:
-        if suspect.cause == UNKNOWN:
-            return SuspectedCause(UNKNOWN, suspect.probability)
-        effect = self._effects[suspect.cause]
-        return SuspectedCause(
-            suspect.cause,
-            suspect.probability,
-            suspect.profile,
-            suspect.size,
-            suspect.size_sd,
-            effect.unit,
-            round(suspect.onset_min * MINUTE_NS),
-            suspect.onset_sd_min,
-            suspect.kind,
-            effect.describe(suspect.size),
-        )

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 import msgspec
 import numpy as np
 
-from monitor_node.alarms.alarms import AlarmChange, ChartAlarm, Explanation, SuspectedCause
+from monitor_node.alarms.alarms import AlarmChange, ChartAlarm, SuspectedCause, update_alarms
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.chart_design import ALL, ChartDesign, alarm_names
 from monitor_node.config import MonitorConfig, PriorityName
@@ -267,8 +267,8 @@ class ChartWatch:
         for name, memory in self.memory.charts.items():
             p[name] = memory.numbers
         for delay, alarm in zip(p["delays"], self._alarms.values(), strict=False):
-            rule = alarm.memory.rule
-            delay["recent"], delay["in_a_row"], delay["above"] = rule.recent, rule.in_a_row, alarm.memory.above
+            memory = alarm.memory
+            delay["recent"], delay["in_a_row"], delay["above"] = memory.recent, memory.in_a_row, memory.above
 
     def store(self, p: np.void) -> None:
         """Take over into the charts what compiled steps have written into the numbers of a plant."""
@@ -278,8 +278,7 @@ class ChartWatch:
     def store_delays(self, p: np.void) -> None:
         """Take over into the alarms what compiled steps have written into the numbers of a plant."""
         for (recent, in_a_row, _), alarm in zip(p["delays"].tolist(), self._alarms.values(), strict=False):
-            rule = alarm.memory.rule
-            rule.recent, rule.in_a_row = recent, in_a_row
+            alarm.memory.recent, alarm.memory.in_a_row = recent, in_a_row
         for watched in self._watched.values():
             watched.at_rest = all(alarm.is_idle for alarm in watched.alarms)
 
@@ -391,9 +390,9 @@ class ChartWatch:
             scales: one standard deviation of each, in the outputs' units.
             points: True to publish the charts' points.
         """
-        changes: list[AlarmChange] = []
         known = [size == size for size in e]  # NaN is not equal to itself
         seen = _ChartRow(e, known, withheld, row.inputs, row.values)
+        judged = list[tuple[_Watched, int, ChartAlarm, Judgement]]()
         for watched in self._watched.values():
             judgements = watched.charts.update(seen, always=points or not watched.at_rest)
             if judgements is None:
@@ -403,27 +402,27 @@ class ChartWatch:
                     continue
                 if points:
                     row.publications.append(Publication(watched.keys[index], chart_point(row.time_ns, judgement)))
-                rule = alarm.memory.rule
-                if not (judgement.out or rule.standing or rule.recent):
-                    continue
-                raised = alarm.update(judgement)
-                if raised is None:
-                    continue
-                explanation = self._explain(watched.charts, index, judgement, scales, row.units) if raised else None
-                if explanation is not None and watched.charts.locates:
-                    explanation = explanation._replace(entries=_entries(explanation.contributions))
-                changes.append(AlarmChange(alarm, judgement, SD, explanation))
-                if not raised:
-                    watched.charts.restart(index)
-            rules = [alarm.memory.rule for alarm in watched.alarms]
-            watched.at_rest = not any(rule.standing or rule.recent for rule in rules)
+                judged.append((watched, index, alarm, judgement))
+        if not judged:
+            return []
+        changes: list[AlarmChange] = []
+        found = update_alarms([(alarm, judgement) for _, _, alarm, judgement in judged], SD)
+        for (watched, index, _, judgement), change in zip(judged, found, strict=True):
+            if change is None:
+                continue
+            if change.is_raised:
+                columns = self._config.outputs, row.units, scales, self.memory.passed
+                signals = [Shown(*item) for item in zip(*columns, strict=True)]
+                change.text, change.contributions = watched.charts.explain(index, judgement, signals)
+                if watched.charts.locates:
+                    change.entries = _entries(change.contributions)
+            else:
+                watched.charts.restart(index)
+            changes.append(change)
+        for watched in self._watched.values():
+            memories = [alarm.memory for alarm in watched.alarms]
+            watched.at_rest = not any(memory.standing or memory.recent for memory in memories)
         return changes
-
-    def _explain(
-        self, charts: _Charts, index: int, judgement: Judgement, scales: list[float], units: list[str]
-    ) -> Explanation:
-        signals = [Shown(*item) for item in zip(self._config.outputs, units, scales, self.memory.passed, strict=True)]
-        return Explanation(*charts.explain(index, judgement, signals))
 
 
 def _entries(shares: Mapping[str, float]) -> list[SuspectedCause]:

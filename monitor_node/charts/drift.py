@@ -8,13 +8,12 @@ alarms.
 from collections.abc import Iterator
 from itertools import compress
 
-from monitor_node.alarms.alarms import AlarmChange, Explanation
+from monitor_node.alarms.alarms import AlarmChange
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.charts import chart_point
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import MeasuredRow
-from monitor_node.learn.arx import JUDGING_FORGETTING, ArxPredictor
-from monitor_node.learn.arx_fit import arx_structure
+from monitor_node.learn.arx import JUDGING_FORGETTING, ArxPredictor, arx_structure
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
@@ -130,13 +129,9 @@ class DriftWatch:
             if self._publish:
                 row.publications.append(Publication(key, chart_point(row.time_ns, judgement)))
             alarm = self._alarms.get(signal)
-            if alarm is not None and (raised := alarm.update(judgement)) is not None:
-                explanation = _explain(signal, parts) if raised else None
-                changes.append(AlarmChange(alarm, judgement, "", explanation))
+            if alarm is not None and (change := alarm.update(judgement)) is not None:
+                largest = " and ".join(sorted(parts, key=lambda name: -parts[name])[:NAMED])
+                change.text = f"the model of {signal} that adapts has drifted from its reference, most in {largest}"
+                change.contributions = {signal: 1.0}
+                changes.append(change)
         return changes
-
-
-def _explain(signal: str, parts: dict[str, float]) -> Explanation:
-    largest = sorted(parts, key=lambda name: -parts[name])[:NAMED]
-    text = f"the model of {signal} that adapts has drifted from its reference, most in {' and '.join(largest)}"
-    return Explanation(text, {signal: 1.0})

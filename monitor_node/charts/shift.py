@@ -13,7 +13,7 @@ from math import isfinite, nan
 
 import numpy as np
 
-from monitor_node.alarms.alarms import AlarmChange, Explanation
+from monitor_node.alarms.alarms import AlarmChange
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.charts import chart_point
 from monitor_node.config import MonitorConfig
@@ -28,6 +28,9 @@ from reactorwatch.stored_state import Records, place_records
 
 NAME = "shift"
 """Name of the chart."""
+
+STAYED = "stayed there, which the model follows from then on"
+"""End of an alarm's text."""
 
 
 class ShiftWatch:
@@ -109,14 +112,10 @@ class ShiftWatch:
             judgement = Judgement(point.statistic, 0.0, -point.limit, point.limit, abs(point.statistic) > point.limit)
             if points:
                 row.publications.append(Publication(self._keys[i], chart_point(row.time_ns, judgement)))
-            if (raised := alarm.update(judgement)) is None:
+            if (change := alarm.update(judgement, "sd")) is None:
                 continue
-            explanation = self._explain(i, point.size, point.rows, row.units[i]) if raised else None
-            changes.append(AlarmChange(alarm, judgement, "sd", explanation))
+            name, step = self._outputs[i], format_quantity(point.size, row.units[i], "+.3g")
+            change.text = f"{name} moved by {step} {point.rows} rows before and {STAYED}"
+            change.contributions = {name: 1.0}
+            changes.append(change)
         return changes
-
-    def _explain(self, output: int, size: float, rows: int, unit: str) -> Explanation:
-        name = self._outputs[output]
-        step = format_quantity(size, unit, "+.3g")
-        text = f"{name} moved by {step} {rows} rows before and stayed there, which the model follows from then on"
-        return Explanation(text, {name: 1.0})

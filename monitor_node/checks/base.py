@@ -72,13 +72,18 @@ class SignalCheck:
         cause: suspected cause of its alarms.
         options: options of its alarms, see `Annunciator.declare`.
         can_be_false: whether chance can raise its alarms, one an output, which then share the promised false alarms.
+        is_invalid_while_active: whether a value is no measurement while its alarm is active.
         memory: all that it remembers but the alarms, as it is stored; None: nothing.
+        invalid: True for each signal of the newest row whose value is no measurement; empty if all are.
     """
 
     name: ClassVar[str]
     cause: ClassVar[str]
     options: ClassVar[Mapping[str, Any]] = {}
     can_be_false: ClassVar[bool] = False
+    is_invalid_while_active: ClassVar[bool] = False
+    memory: Any = None
+    invalid: Flags = ()
 
     def __init__(
         self,
@@ -91,23 +96,11 @@ class SignalCheck:
         self.signals = config.outputs if signals is None else signals
         options = {"without_on_delay": True, "names_cause": True} | dict(self.options)
         self.alarms = [board.declare(self.name, signal, **options) for signal in self.signals]
-        self.memory: Any = None
-
-    @property
-    def invalid(self) -> Flags:
-        """True for each signal of the newest row whose value is no measurement; empty if all are."""
-        return ()
 
     @property
     def is_ordinary(self) -> bool:
         """True if only the numbers of a compiled check change with the next row, unless that row is an event."""
         return True
-
-    @property
-    def is_counting(self) -> bool:
-        """True if judgements within their limits may change an alarm."""
-        rules = [alarm.memory.rule for alarm in self.alarms]
-        return any(rule.standing or rule.recent for rule in rules)
 
     def use_numbers(self, numbers: np.void) -> None:
         """Keep numbers of the memory in those of the plant (`row_frame`) from now on.

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
-from msgspec import field
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.checks.base import PLANT, Finding, SignalCheck
@@ -12,8 +11,8 @@ from monitor_node.config import MonitorConfig
 from monitor_node.ingest.samples import UnusableSamples
 from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.spc.charts.base import Judgement
-from reactorwatch.spc.silence import NO_CHANGE, Change, DataTimeout, Spacing, no_timeouts
-from reactorwatch.stored_state import Memory, Records, place_records
+from reactorwatch.spc.silence import Change, DataTimeout, TimeoutMemory
+from reactorwatch.stored_state import place_records
 
 UNUSABLE = 32
 """Samples in a row that cannot be used before a plant without usual spacing has a timeout: as many as it is learned
@@ -22,55 +21,39 @@ from."""
 SILENT, RECEIVED = Judgement(1.0, 0.0, 0.0, 0.0, True), Judgement(0.0, 0.0, 0.0, 0.0, False)
 
 
-class Silences(Memory):
-    """Memory of the check.
-
-    Attributes:
-        numbers: timeouts of the plant, of each input and of each output, in sample time.
-        receipts: usual spacing of the plant's samples in receive time.
-    """
-
-    numbers: Records
-    receipts: Spacing = field(default_factory=Spacing)
-
-
 class SilenceCheck(SignalCheck):
     """Raises an alarm when the plant, or one of its signals, is silent, or sends nothing that can be used.
 
     Attributes:
+        of_plant: timeouts of the plant and of its signals.
         unusable: samples of the plant that were refused since the newest usable one; the monitor counts them.
     """
 
     name = cause = "silence"
     options: ClassVar = {"without_off_delay": True, "priority": "high"}
-    memory: Silences
 
     def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
         super().__init__(config, board, ranges, (PLANT, *config.signals))
         self.unusable = UnusableSamples()
-        self.memory = Silences(no_timeouts(len(self.signals)))
-        self._timeouts = [DataTimeout(config.silence_periods) for _ in self.signals]
-        self._share()
+        self.of_plant = DataTimeout(len(config.signals), config.silence_periods)
 
-    def _share(self) -> None:
-        for i, timeout in enumerate(self._timeouts):
-            timeout.numbers = self.memory.numbers[i : i + 1]
-        self.of_plant.receipts = self.memory.receipts
+    @property
+    def memory(self) -> TimeoutMemory:
+        """See `SignalCheck`."""
+        return self.of_plant.memory
+
+    @memory.setter
+    def memory(self, memory: TimeoutMemory) -> None:
+        self.of_plant.memory = memory
 
     def use_numbers(self, numbers: np.void) -> None:
         """See `SignalCheck`."""
         self.memory.numbers = place_records(self.memory.numbers, numbers["timeouts"])
-        self._share()
-
-    @property
-    def of_plant(self) -> DataTimeout:
-        """The timeout of all signals together."""
-        return self._timeouts[0]
 
     @property
     def silent(self) -> list[bool]:
         """Flags of the signals without data, the inputs first."""
-        return [timeout.is_active for timeout in self._timeouts[1:]]
+        return [is_active == 1 for is_active in self.memory.numbers["is_active"][1:].tolist()]
 
     @property
     def is_ordinary(self) -> bool:
@@ -80,24 +63,12 @@ class SilenceCheck(SignalCheck):
 
     def follow_alarms(self) -> None:
         """Take as silent what the alarms say is silent: the next sample ends it."""
-        for timeout, alarm in zip(self._timeouts, self.alarms, strict=True):
-            timeout.is_active = alarm.memory.rule.standing
+        self.memory.numbers["is_active"] = [alarm.memory.standing for alarm in self.alarms]
 
     def on_row(self, time_ns: int, values: tuple[float, ...]) -> list[Finding]:
         """See `SignalCheck`."""
-        plant, *timeouts = self._timeouts
-        change = plant.update(time_ns, present=True)
-        findings = self._findings(0, change)
-        if change is not NO_CHANGE:
-            for timeout in timeouts:
-                timeout.suppress_until(time_ns)
-        is_complete = all(value == value for value in values)  # NaN is not equal to itself
-        unknown_ns = None if is_complete else plant.fallback_allowed_ns()
-        for index, (timeout, value) in enumerate(zip(timeouts, values, strict=True), start=1):
-            change = timeout.update(time_ns, present=value == value, fallback_allowed_ns=unknown_ns)
-            if change is not NO_CHANGE:
-                findings += self._findings(index, change)
-        return findings
+        changes = self.of_plant.update(time_ns, values)
+        return [finding for i, change in changes for finding in self._findings(i, change)]
 
     def postpone(self, now_ns: int) -> None:
         """Restart an expired timer of the plant: a monitor with messages to process cannot say what has not come."""
@@ -119,7 +90,7 @@ class SilenceCheck(SignalCheck):
 
     def declare_unusable(self, time_ns: int) -> list[Finding]:
         """Declare a timeout of a plant without a usable sample, at a receive time."""
-        self.of_plant.is_active = True
+        self.memory.numbers["is_active"][0] = True
         return self._findings(0, Change(time_ns, None))
 
     def declare_timeout(self) -> list[Finding]:

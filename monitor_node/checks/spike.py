@@ -5,29 +5,17 @@ from math import isfinite
 from typing import ClassVar
 
 import numpy as np
-from msgspec import field
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.checks.base import CheckTraining, Finding, Flags, SignalCheck
+from monitor_node.checks.base import CheckTraining, Finding, SignalCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Judgement, format_quantity
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.spike import FEWEST_ROWS, Spike, spike_limit
+from reactorwatch.spc.spike import FEWEST_ROWS, Spike, Spikes, spike_limit
 from reactorwatch.spc.spike_rate import SpikeRate
 from reactorwatch.spc.training_errors import TrainingErrors, two_sided_tail
-from reactorwatch.stored_state import Memory
-
-
-class Spikes(Memory):
-    """Memory of the check.
-
-    Attributes:
-        of_outputs: check of each output; None for an output without one; empty before the training ends.
-    """
-
-    of_outputs: list[Spike | None] = field(default_factory=list)
 
 
 class SpikeCheck(SignalCheck):
@@ -42,7 +30,6 @@ class SpikeCheck(SignalCheck):
         super().__init__(config, board, ranges)
         self.memory = Spikes()
         self._limits: Array = np.full(len(self.outputs), np.inf)
-        self._invalid: list[bool] = []
 
     def use_numbers(self, numbers: np.void) -> None:
         """See `SignalCheck`: the limit of each output, within which a residual is no spike."""
@@ -74,40 +61,28 @@ class SpikeCheck(SignalCheck):
     @property
     def is_ordinary(self) -> bool:
         """See `SignalCheck`."""
-        return all(spike is None or spike.is_ordinary for spike in self.memory.of_outputs)
-
-    @property
-    def invalid(self) -> Flags:
-        """See `SignalCheck`."""
-        return self._invalid
+        return self.memory.is_ordinary
 
     def on_residuals(self, time_ns: int, e: list[float], scales: list[float], units: list[str]) -> list[Finding]:
         """See `SignalCheck`."""
         findings: list[Finding] = []
-        self._invalid = [False] * len(e)
-        is_moved = self.board.has_unexplained
-        is_steady = not (is_moved or self.is_counting) and self.is_ordinary
-        if is_steady and not any(abs(size) > limit for size, limit in zip(e, self._limits.tolist(), strict=True)):
-            return findings
-        for i, spike in enumerate(self.memory.of_outputs):
-            if spike is None or not isfinite(e[i]):
+        verdicts = self.memory.update(e, is_moved=self.board.has_unexplained)
+        self.invalid = [verdict.quarantine for verdict in verdicts]
+        for i, (verdict, alarm) in enumerate(zip(verdicts, self.alarms, strict=False)):
+            spike = self.memory.of_outputs[i]
+            if spike is None or not isfinite(e[i]) or not (verdict.spike or alarm.memory.standing):
                 continue
-            verdict, rate = spike.update(e[i], is_moved=is_moved), spike.usual
-            self._invalid[i] = verdict.quarantine
-            count = 1 if rate is None or not verdict.spike else rate.add(time_ns)
-            is_out = verdict.spike and count > 0
-            size, text = 0.0, ""
+            count = 1 if spike.usual is None or not verdict.spike else spike.usual.add(time_ns)
+            is_out, size, text = verdict.spike and count > 0, 0.0, ""
             if is_out:
                 size = verdict.size
                 spiked = format_quantity(size * scales[i], units[i], "+.3g")
                 text = f"{self.outputs[i]} had a spike of {spiked} one row before; it was left out"
-                if rate is not None:
-                    text += f"; {count} spikes in {rate.window_min:.3g} min, where {rate.usual:.2g} are usual"
+                if (usual := spike.usual) is not None:
+                    text += f"; {count} spikes in {usual.window_min:.3g} min, where {usual.usual:.2g} are usual"
             findings.append(Finding(i, Judgement(size, 0.0, -spike.limit, spike.limit, is_out), "sd", text))
         return findings
 
     def on_gap(self) -> None:
         """See `SignalCheck`."""
-        for spike in self.memory.of_outputs:
-            if spike is not None:
-                spike.restart()
+        self.memory.restart()

@@ -1,4 +1,4 @@
-"""The checks of the signals of a plant together, as `catalogue` lists them.
+"""The checks of the signals of a plant, `CHECKS`, together.
 
 None of them needs a model of what a fault looks like in the process, and each raises its alarm at once: a stuck sensor
 after as many equal readings as its noise makes impossible, a spike with the value after it, a silence when the next
@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from monitor_node.alarms.alarms import AlarmChange, Explanation, SuspectedCause
+from monitor_node.alarms.alarms import AlarmChange, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.checks.base import PLANT, CheckTraining, Finding, Flags, SignalCheck
-from monitor_node.checks.catalogue import CHECKS
+from monitor_node.checks.range import RangeCheck
 from monitor_node.checks.silence import SilenceCheck
+from monitor_node.checks.spike import SpikeCheck
+from monitor_node.checks.stuck import StuckCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.arrays import Array
@@ -23,6 +25,9 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.training_errors import TrainingErrors
 from reactorwatch.stored_state import Records, read_memory
+
+CHECKS: tuple[type[SignalCheck], ...] = (SilenceCheck, StuckCheck, SpikeCheck, RangeCheck)
+"""The signal checks. A new one: a file beside this one, and a name here."""
 
 SENSOR = "sensor"
 """Kind of the causes that checks suspect."""
@@ -136,9 +141,9 @@ class SignalChecks:
             changes: list to which changes of alarms are added.
         """
         for check in self._row_checks:
-            changes += self._changes(check, check.on_row(time_ns, values))
-            if True in (flags := check.invalid):
-                values = tuple(nan if invalid else value for value, invalid in zip(values, flags, strict=True))
+            invalid = self._find(check, check.on_row(time_ns, values), changes)
+            if True in invalid:
+                values = tuple(nan if is_invalid else value for value, is_invalid in zip(values, invalid, strict=True))
         return values
 
     def check_silence(self, now_ns: int) -> list[Publication]:
@@ -149,40 +154,36 @@ class SignalChecks:
         self, time_ns: int, values: list[float], units: list[str], changes: list[AlarmChange]
     ) -> list[bool]:
         """Check the outputs of a row; returns flags of those whose readings are no measurements."""
-        for check in self._value_checks:
-            changes += self._changes(check, check.on_values(time_ns, values, units))
-        return self._any_invalid(self._value_checks, len(values))
+        checks = self._value_checks
+        flags = [self._find(check, check.on_values(time_ns, values, units), changes) for check in checks]
+        return _join(flags, len(values))
 
     def check_residuals(
         self, time_ns: int, e: list[float], scales: list[float], units: list[str], changes: list[AlarmChange]
     ) -> list[bool]:
         """Check the residuals of a row; returns flags of the outputs whose value must not enter a memory yet."""
-        for check in self._residual_checks:
-            changes += self._changes(check, check.on_residuals(time_ns, e, scales, units))
-        return self._any_invalid(self._residual_checks, len(e))
+        checks = self._residual_checks
+        flags = [self._find(check, check.on_residuals(time_ns, e, scales, units), changes) for check in checks]
+        return _join(flags, len(e))
 
     def publish(self, check: SignalCheck, time_ns: int, findings: Sequence[Finding]) -> list[Publication]:
         """Alarms of a check that its findings raise or clear, outside of a row."""
-        return self._board.apply(time_ns, self._changes(check, findings))
-
-    @staticmethod
-    def _changes(check: SignalCheck, findings: Sequence[Finding]) -> list[AlarmChange]:
         changes: list[AlarmChange] = []
-        for i, judgement, unit, text, own_time_ns in findings:
-            alarm, signal = check.alarms[i], check.signals[i]
-            rule = alarm.memory.rule
-            raised = alarm.update(judgement) if judgement.out or rule.standing or rule.recent else None
-            if raised is None:
-                continue
-            shares = {} if signal == PLANT else {signal: 1.0}
-            explanation = Explanation(text, shares, [SuspectedCause(check.cause, 1.0, kind=SENSOR)]) if raised else None
-            changes.append(AlarmChange(alarm, judgement, unit, explanation, own_time_ns))
-        return changes
+        self._find(check, findings, changes)
+        return self._board.apply(time_ns, changes)
 
     @staticmethod
-    def _any_invalid(checks: Sequence[SignalCheck], count: int) -> list[bool]:
-        flags: list[Flags] = [found for check in checks if (found := check.invalid)]
-        return [any(item) for item in zip(*flags, strict=True)] if flags else [False] * count
+    def _find(check: SignalCheck, findings: Sequence[Finding], changes: list[AlarmChange]) -> Flags:
+        """Add the changes of a check's alarms; returns flags of the signals whose value is no measurement."""
+        for i, judgement, unit, text, own_time_ns in findings:
+            change = check.alarms[i].update(judgement, unit, own_time_ns)
+            if change is None:
+                continue
+            if check.signals[i] != PLANT:
+                change.contributions = {check.signals[i]: 1.0}
+            change.text, change.suspects = text, [SuspectedCause(check.cause, 1.0, kind=SENSOR)]
+            changes.append(change)
+        return [alarm.memory.standing for alarm in check.alarms] if check.is_invalid_while_active else check.invalid
 
     def on_gap(self) -> None:
         """Forget what is quarantined, as after a gap."""
@@ -193,3 +194,9 @@ class SignalChecks:
         """Drop earlier rows: the publisher was restarted."""
         for check in self._checks:
             check.on_restart()
+
+
+def _join(flags: Sequence[Flags], count: int) -> list[bool]:
+    """Signals with a flag by any check."""
+    given = [item for item in flags if item]
+    return [any(item) for item in zip(*given, strict=True)] if given else [False] * count

@@ -7,7 +7,7 @@ import numpy as np
 
 from monitor_node.alarms.alarms import STUCK_SENSOR
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.checks.base import CheckTraining, Finding, Flags, SignalCheck
+from monitor_node.checks.base import CheckTraining, Finding, SignalCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.spc.charts.base import format_quantity
@@ -21,7 +21,7 @@ class StuckCheck(SignalCheck):
     """Raises an alarm when the sensor of an output is stuck; its readings are no measurements then."""
 
     name, cause = "stuck", STUCK_SENSOR
-    can_be_false = True
+    can_be_false = is_invalid_while_active = True
     memory: StuckSensors
 
     def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
@@ -49,7 +49,8 @@ class StuckCheck(SignalCheck):
     def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Finding]:
         """See `SignalCheck`."""
         findings: list[Finding] = []
-        if not self.memory.update(np.array(values), self._resolutions) and not self.is_counting:
+        is_active = any(alarm.memory.standing for alarm in self.alarms)
+        if not (self.memory.update(np.array(values), self._resolutions) or is_active):
             return findings
         for i, (name, value) in enumerate(zip(self.outputs, values, strict=True)):
             if isfinite(value):
@@ -58,11 +59,6 @@ class StuckCheck(SignalCheck):
                 text = f"{name} is stuck: it has read {reading} {judgement.statistic:.0f} times in a row"
                 findings.append(Finding(i, judgement, READINGS, text))
         return findings
-
-    @property
-    def invalid(self) -> Flags:
-        """See `SignalCheck`."""
-        return [alarm.memory.rule.standing for alarm in self.alarms]
 
     def on_restart(self) -> None:
         """See `SignalCheck`. After a gap equal readings are counted on: it makes them no likelier."""

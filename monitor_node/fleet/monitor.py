@@ -32,79 +32,13 @@ from reactorwatch.records.record import NEVER_NS
 MOST_PLANTS = 100_000
 
 MOST_UNVERIFIED = 1000
+"""Plants that are not verified, of which each costs a monitor; at this limit further ones wait until there is room."""
 
 PROVEN_ROWS = 32
 """Aligned rows that verify a plant."""
 
 EVICT_NS = 600_000_000_000
 """An unverified plant without a message in this time is evicted."""
-
-
-class PlantRegister:
-    """All plants of a fleet's monitor, and admission of unverified ones: anyone may publish under invented names.
-
-    A plant is verified by a liveliness token of one of its nodes, by a stored state, or by aligned rows. The number of
-    unverified plants, of which each costs a monitor, is limited. At the limit, further plants wait until one is
-    verified, or evicted because it has sent nothing for long. So invented names use up neither memory nor the capacity
-    for plants with a token.
-
-    Attributes:
-        evicted: number of evicted plants.
-    """
-
-    def __init__(self) -> None:
-        self._plants: set[str] = set()
-        self._active_ns: dict[str, int] = {}  # last activity of the unverified plants, the least recent first
-        self.evicted = 0
-
-    def __len__(self) -> int:
-        return len(self._plants)
-
-    def register(self, plant: str, now_ns: int, *, verified: bool) -> bool:
-        """Register a plant; returns True if it is new, has a valid name, and is below the limits.
-
-        Args:
-            plant: name of the plant.
-            now_ns: present time.
-            verified: True if the plant certainly exists; a registered plant is verified then.
-        """
-        if plant in self._plants:
-            if verified:
-                self._active_ns.pop(plant, None)
-            return False
-        if len(self._plants) >= MOST_PLANTS or not (verified or len(self._active_ns) < MOST_UNVERIFIED):
-            return False
-        try:
-            keys.check_plant(plant)
-        except ValueError:
-            return False
-        self._plants.add(plant)
-        if not verified:
-            self._active_ns[plant] = now_ns
-        return True
-
-    def is_unverified(self, plant: str) -> bool:
-        """True for a plant that is not verified."""
-        return plant in self._active_ns
-
-    def on_activity(self, plant: str, rows: int, now_ns: int) -> None:
-        """Note that messages of a plant have arrived; its aligned rows so far may verify it."""
-        if self._active_ns.pop(plant, None) is not None and rows < PROVEN_ROWS:
-            self._active_ns[plant] = now_ns
-
-    def evict(self, now_ns: int) -> list[str]:
-        """Evict unverified plants without recent messages; returns them."""
-        plants: list[str] = []
-        for plant, active_ns in self._active_ns.items():
-            if now_ns - active_ns < EVICT_NS:
-                break
-            plants.append(plant)
-        for plant in plants:
-            del self._active_ns[plant]
-            self._plants.remove(plant)
-        self.evicted += len(plants)
-        return plants
-
 
 ANY = "*"
 """Pattern of all plants."""
@@ -157,13 +91,17 @@ def prepare(kinds: Sequence[PlantKind], *, points: bool) -> None:
     """
     RecursiveLeastSquares(1).update([1.0], 1.0)
     for kind in kinds:
-        model = Monitor(kind.config, 0, points=points, model=kind.model).model
+        model = Monitor(kind.config, 0, points=points, model=kind.model).pipeline.model
         for _ in chain(drift.preparation(kind.config, wanted=points), stage.preparation(kind.config, model)):
             pass
 
 
 class FleetMonitor:
     """Monitors of many plants.
+
+    A plant is verified by a liveliness token of one of its nodes, by a stored state, or by aligned rows. Anyone may
+    publish under invented names, so the number of unverified plants is limited, and those that fall silent are evicted:
+    invented names use up neither memory nor the capacity for plants with a token.
 
     Args:
         kinds: kinds of plants, see `load_kinds`. A plant is of the first kind that names it, else of the first whose
@@ -179,6 +117,7 @@ class FleetMonitor:
         InputError: the settings are inconsistent.
 
     Attributes:
+        evictions: number of unverified plants that were evicted.
         is_behind: see `Monitor`.
     """
 
@@ -198,8 +137,9 @@ class FleetMonitor:
         self._kinds, self._named = kinds, {kind.pattern: kind for kind in reversed(kinds)}
         self._shard, self._points, self._passes = shard, points, passes
         self._on_watch, self._diagnose = on_watch, diagnose
-        self._register = PlantRegister()
         self._monitors: dict[str, Monitor] = {}
+        self._active_ns: dict[str, int] = {}  # last activity of the unverified plants, the least recent first
+        self.evictions = 0
         self._by_key: dict[str, Monitor] = {}  # by key of a sample
         self._foreign: set[str] = set()  # keys of samples of other shards
         self._heap: list[tuple[int, str]] = []  # deadlines; one that was postponed is noticed when it comes up
@@ -231,12 +171,7 @@ class FleetMonitor:
     def is_worth_storing(self, plant: str) -> bool:
         """True if a plant is watched, is verified and has rows."""
         own = self._monitors.get(plant)
-        return own is not None and own.rows > 0 and not self._register.is_unverified(plant)
-
-    @property
-    def evictions(self) -> int:
-        """Number of unverified plants that were evicted."""
-        return self._register.evicted
+        return own is not None and own.rows > 0 and plant not in self._active_ns
 
     def register(
         self, plant: str, now_ns: int, *, verified: bool, restore: Callable[[Monitor], None] | None = None
@@ -246,11 +181,18 @@ class FleetMonitor:
         Args:
             plant: name of the plant.
             now_ns: present time.
-            verified: True if the plant certainly exists; if not, see `PlantRegister`.
+            verified: True if the plant certainly exists; a watched plant is verified then.
             restore: called with the plant's new monitor, before it is used.
         """
-        if not self._shard.has(plant) or not self._register.register(plant, now_ns, verified=verified):
+        if plant in self._monitors:
+            if verified:
+                self._active_ns.pop(plant, None)
             return
+        has_room = len(self._monitors) < MOST_PLANTS and (verified or len(self._active_ns) < MOST_UNVERIFIED)
+        if not (has_room and self._shard.has(plant) and is_plant(plant)):
+            return
+        if not verified:
+            self._active_ns[plant] = now_ns
         kind = self._named.get(plant) or next(item for item in self._kinds if fnmatchcase(plant, item.pattern))
         config = msgspec.structs.replace(kind.config, plant=plant)
         monitor = self._monitors[plant] = Monitor(config, now_ns, points=self._points, model=kind.model)
@@ -264,7 +206,12 @@ class FleetMonitor:
 
     def _evict(self, now_ns: int) -> None:
         """Remove the unverified plants without recent messages."""
-        for plant in self._register.evict(now_ns):
+        while self._active_ns:
+            plant, active_ns = next(iter(self._active_ns.items()))
+            if now_ns - active_ns < EVICT_NS:
+                return
+            del self._active_ns[plant]
+            self.evictions += 1
             config = self._monitors.pop(plant).config
             for signal in (*config.signals, *config.carried_signals):
                 self._by_key.pop(keys.key(plant, keys.SAMPLE, signal), None)
@@ -276,13 +223,15 @@ class FleetMonitor:
         """Process the diagnosis of a plant's training; the plant may have been removed."""
         self._submitted.discard(plant)
         if plant in self._monitors:
-            self._monitors[plant].on_finding(finding)
+            self._monitors[plant].pipeline.baselines.on_finding(finding)
 
     def _schedule(self, plant: str, monitor: Monitor) -> None:
         """Submit a training for diagnosis, once, and schedule the deadline if it is earlier than the present one."""
-        if monitor.awaits_diagnosis and plant not in self._submitted and (job := monitor.diagnosis_job) is not None:
-            self._submitted.add(plant)
-            self._diagnose(plant, job)
+        if monitor.pipeline.baselines.update.is_pending and plant not in self._submitted:
+            job = monitor.pipeline.baselines.diagnosis_job
+            if job is not None:
+                self._submitted.add(plant)
+                self._diagnose(plant, job)
         due_ns = monitor.next_tick_ns()
         if due_ns < self._due_ns.get(plant, due_ns + 1):
             self._due_ns[plant] = due_ns
@@ -312,7 +261,8 @@ class FleetMonitor:
                 touched[monitor] = None
         for monitor in touched:
             plant = monitor.config.plant
-            self._register.on_activity(plant, monitor.rows, now_ns)
+            if self._active_ns.pop(plant, None) is not None and monitor.rows < PROVEN_ROWS:
+                self._active_ns[plant] = now_ns
             self._schedule(plant, monitor)
         return publications
 
@@ -364,3 +314,12 @@ class FleetMonitor:
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish the health of all plants' monitors for the last time."""
         return [item for monitor in self._monitors.values() for item in monitor.on_stop(now_ns)]
+
+
+def is_plant(name: str) -> bool:
+    """True if a plant may have this name."""
+    try:
+        keys.check_plant(name)
+    except ValueError:
+        return False
+    return True

@@ -1,7 +1,8 @@
-"""One-step-ahead predictions of an output by a recursive ARX model, and the same model as the training left it.
+"""Recursive ARX model of an output: its update with a row, and the same model as the training left it.
 
 The adaptive model is updated with every row by recursive least squares; the prediction is that before the update. The
-reference is fitted to the whole training at its end and then frozen: the adaptive model's distance from it is charted.
+reference is fitted to the whole training at its end (`arx_reference`) and then frozen: the adaptive model's distance
+from it is charted.
 
 Where the adaptive model judges, it starts from the reference, and learns while nothing is wrong: not from a row whose
 residual is beyond `GATE` standard deviations, and not while an alarm is active. It forgets a row after `MEMORY` others,
@@ -9,32 +10,27 @@ and the training counts as so many: a model that learned faster would learn a fa
 learned shortly before an alarm is taken back: its state becomes that of a copy that is `COPY_ROWS` to twice as many
 rows old.
 
-If the training has too few rows for the parameters, the models get a simpler structure (`arx_fit`), and the adaptive
-model is updated with the rows of the training again.
+If the training has too few rows for the parameters, the models get a simpler structure (`simpler_structures`), and the
+adaptive model is updated with the rows of the training again.
 
 Signals are scaled by mean and spread of the first rows, so that the estimator works with numbers of the order of one.
 Snapshots are in the signals' own units.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from math import isfinite, nan, sqrt
-from typing import NamedTuple, Self
+from typing import Self
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
+from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals
-from monitor_node.learn.arx_fit import (
-    arx_snapshot,
-    check_training,
-    fit_arx,
-    fit_snapshot,
-    fitting_structure,
-    input_columns,
-)
 from reactorwatch.arrays import Array
-from reactorwatch.contract.messages_pb2 import ModelSnapshot
+from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
+from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.regressor import RegressorBuffer, Rows
 from reactorwatch.identification.rls import RecursiveLeastSquares, RlsMemory
 from reactorwatch.identification.structure import Scaling, Structure
@@ -43,6 +39,9 @@ from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.parameter_drift import learn
 from reactorwatch.stored_state import Memory, copy_of
+
+ROWS_A_PARAMETER = 10
+"""Least number of rows per parameter of the reference."""
 
 SCALING_ROWS = 50
 """Rows from which the scaling is made; there is no prediction before."""
@@ -60,20 +59,36 @@ COPY_ROWS = 250
 """Rows between two copies of an adaptive model that judges."""
 
 
-class FittedModel(NamedTuple):
-    """Reference of a predictor in the signals' units, and the newest rows.
+def arx_structure(config: MonitorConfig) -> Structure:
+    """Structure of the identified models that the settings ask for."""
+    return Structure.of_order(config.order, config.delay, inputs=len(config.inputs))
 
-    Attributes:
-        structure: structure of the model.
-        coefficients: coefficients of the output's lags, of the inputs' lags, and the offset.
-        inputs: inputs of the newest complete rows, the newest first.
-        outputs: output in the same rows.
+
+def simpler_structures(structure: Structure) -> Iterator[Structure]:
+    """Structures with fewer parameters, the largest first.
+
+    They have fewer lags of the inputs, then no inputs, then fewer lags of the output.
+
+    >>> [(item.output_lags, item.inputs and item.input_lags) for item in simpler_structures(Structure.of_order(2))]
+    [(2, 1), (2, 0), (1, 0)]
     """
+    if structure.inputs:
+        for lags in range(structure.input_lags - 1, 0, -1):
+            yield replace(structure, input_lags=lags)
+        yield (structure := replace(structure, inputs=0))
+    for lags in range(structure.output_lags - 1, 0, -1):
+        yield replace(structure, output_lags=lags)
 
-    structure: Structure
-    coefficients: list[float]
-    inputs: list[list[float]]
-    outputs: list[float]
+
+def fewest_rows(structure: Structure) -> int:
+    """Least number of consecutive rows for a reference of a structure."""
+    return structure.history + ROWS_A_PARAMETER * structure.parameters
+
+
+def input_columns(structure: Structure) -> slice:
+    """Columns of the inputs in a regressor."""
+    first = structure.output_lags
+    return slice(first, first + structure.input_lags * structure.inputs)
 
 
 class ArxPredictor(Memory, dict=True):
@@ -82,18 +97,17 @@ class ArxPredictor(Memory, dict=True):
     Attributes:
         wanted: structure of the models that the settings ask for.
         forgetting: forgetting factor of the adaptive model.
-        with_snapshots: True if a snapshot of the reference will be read.
         structure: structure of the models.
         rls: the adaptive model.
         regressors: rows of the next regressor.
         first_rows: rows from which the scaling will be made, the inputs and the output of each.
         scaling: scaling of the signals; None before it is known.
         reference: parameters of the reference; None before the fit.
-        reference_model: snapshot of the reference, a serialized `ModelSnapshot`; empty without snapshots.
+        reference_model: snapshot of the reference, a serialized `ModelSnapshot`; empty where none is published.
         drift_chart: chart of the models' difference; None without one.
         newest_drift: newest point of that chart.
-        ranges: smallest, then largest value of each input of the reference's regressor in the training, scaled; None
-            before the fit and without inputs.
+        ranges: smallest, then largest value of each input of the reference's regressor in the training, scaled, shape
+            (2, inputs); None before the fit and without inputs.
         copies: the older and the newer copy of an adaptive model that judges; empty where it does not.
         copied_rows: rows since the newer one.
         learning: False while an adaptive model that judges does not learn.
@@ -102,7 +116,6 @@ class ArxPredictor(Memory, dict=True):
 
     wanted: Structure
     forgetting: float
-    with_snapshots: bool
     structure: Structure
     rls: RecursiveLeastSquares
     regressors: RegressorBuffer
@@ -130,22 +143,10 @@ class ArxPredictor(Memory, dict=True):
             self._scale(self.scaling)
 
     @classmethod
-    def of(cls, structure: Structure, forgetting: float, *, with_snapshots: bool = True) -> Self:
+    def of(cls, structure: Structure, forgetting: float) -> Self:
         """Predictor that knows nothing; arguments as the attributes."""
         rls, regressors = RecursiveLeastSquares(structure.parameters, forgetting), RegressorBuffer(structure)
-        return cls(structure, forgetting, with_snapshots, structure, rls, regressors)
-
-    def _start(self, structure: Structure) -> None:
-        """Start the adaptive model, and the scaling, with the next row."""
-        self.structure, self._inputs = structure, input_columns(structure)
-        self.rls = RecursiveLeastSquares(structure.parameters, self.forgetting)
-        self.regressors = RegressorBuffer(structure)
-        self.first_rows, self.scaling = [], None
-
-    @property
-    def uses_inputs(self) -> bool:
-        """True if the models have inputs."""
-        return self.structure.inputs > 0
+        return cls(structure, forgetting, structure, rls, regressors)
 
     @property
     def simplification(self) -> str:
@@ -223,38 +224,22 @@ class ArxPredictor(Memory, dict=True):
                 self.copies, self.copied_rows = [self.copies[1], copy_of(self.rls.memory)], 0
         return prediction
 
-    def fit_reference(self, time_min: Array, inputs: Array, outputs: Array) -> Array:
-        """Fit the reference to a training by least squares.
+    def set_reference(self, parameters: Array, rows: Rows) -> None:
+        """Set the reference.
 
         Args:
-            time_min: times in minutes, shape (rows,).
-            inputs: input values, shape (rows, inputs); NaN if missing.
-            outputs: output values, shape (rows,); NaN if missing or left out.
-
-        Returns:
-            Residuals, shape (rows,), scaled to the size of out-of-sample residuals; NaN if missing. With too few rows
-            for any structure there is no reference, and all are NaN.
+            parameters: parameters of the model of scaled signals, shape (parameters,).
+            rows: scaled rows of the training that they were fitted to.
         """
-        structure = fitting_structure(self.structure, time_min, inputs, outputs)
-        if structure != self.structure:
-            self.structure = structure
-            self.learn_again(time_min, inputs, outputs)
-        fit = None if self.scaling is None else fit_arx(structure, self.scaling, time_min, inputs, outputs)
-        if fit is None or self.scaling is None:
-            return np.full(time_min.size, nan)
-        self.reference, self._fitted = fit.parameters, fit.rows
-        self.ranges = None if fit.ranges is None else fit.ranges.ravel()
-        if self.with_snapshots:
-            snapshot, given = fit_snapshot(structure, self.scaling, fit), inputs[:, : structure.inputs]
-            snapshot.checks.extend(check_training(structure, time_min, given, outputs, fit.residual))
-            self.reference_model = snapshot.SerializeToString()
-        return fit.residual
+        self.reference, self._fitted = parameters, rows
+        given = rows.regressors[:, self._inputs]
+        self.ranges = np.array([given.min(axis=0), given.max(axis=0)]) if given.shape[1] else None
 
     def _extrapolation_sd(self, regressor: Array) -> float:
         if self.ranges is None or self.reference is None:
             return 1.0
         given = regressor[self._inputs]
-        beyond = given - np.clip(given, *self.ranges.reshape(2, -1))
+        beyond = given - np.clip(given, *self.ranges)
         if not beyond.any():
             return 1.0
         added = float(self.reference[self._inputs] @ beyond)
@@ -275,9 +260,18 @@ class ArxPredictor(Memory, dict=True):
             response[lag:] -= coefficient
         return response
 
-    def learn_again(self, time_min: Array, inputs: Array, outputs: Array) -> None:
-        """Update a new adaptive model with the rows of a training; arguments as for `fit_reference`."""
-        self._start(self.structure)
+    def learn_again(self, structure: Structure, time_min: Array, inputs: Array, outputs: Array) -> None:
+        """Update a new adaptive model, of a structure, with the rows of a training.
+
+        Args:
+            structure: structure of the models from now on.
+            time_min: times in minutes, shape (n,).
+            inputs: input values, shape (n, inputs); NaN if missing.
+            outputs: output values, shape (n,); NaN if missing.
+        """
+        self.structure, self._inputs = structure, input_columns(structure)
+        self.rls = RecursiveLeastSquares(structure.parameters, self.forgetting)
+        self.regressors, self.first_rows, self.scaling = RegressorBuffer(structure), [], None
         follows = [False, *regular_intervals(time_min).tolist()]
         times_ns = [round(minutes * MINUTE_NS) for minutes in time_min.tolist()]
         for row in zip(times_ns, inputs.tolist(), outputs.tolist(), follows, strict=True):
@@ -311,34 +305,48 @@ class ArxPredictor(Memory, dict=True):
         parts = self.drift_chart.contributions(self.rls.parameters - self.reference)
         return self.newest_drift, dict(zip(self.drift_chart.names, parts.tolist(), strict=True))
 
-    @property
-    def linear_reference(self) -> FittedModel | None:
-        """The reference and the rows before the next one; None before the fit."""
-        if self.reference is None or self.scaling is None:
-            return None
-        matrix, shift = self.scaling.unscaling(self.structure)
-        rows, (centre, spread), count = self.regressors, self._output_scale, self.structure.inputs
-        inputs = [
-            [middle + size * u for u, (middle, size) in zip(rows.inputs[i * count :], self._input_scales, strict=False)]
-            for i in range(len(rows.outputs))
-        ]
-        outputs = [centre + spread * value for value in rows.outputs]
-        return FittedModel(self.structure, (matrix @ self.reference + shift).tolist(), inputs, outputs)
-
     def adaptive_snapshot(self) -> ModelSnapshot | None:
         """Snapshot of the adaptive model, without a time; None before its first update."""
         rls = self.rls
         if not rls.rows:
             return None
         covariance = self.weight * rls.parameter_covariance
-        assert self.scaling is not None
-        return arx_snapshot(
-            self.structure, self.scaling, rls.parameters, covariance, rls.condition, rls.rows, rls.forgetting
-        )
+        return self.snapshot(rls.parameters, covariance, rls.condition, rls.rows, rls.forgetting)
 
     def reference_snapshot(self) -> ModelSnapshot | None:
         """Snapshot of the reference, without a time; None before the fit."""
         return ModelSnapshot.FromString(self.reference_model) if self.reference_model else None
+
+    def snapshot(
+        self, parameters: Array, covariance: Array, condition: float, rows: int, forgetting: float
+    ) -> ModelSnapshot:
+        """Snapshot of a model in the signals' units, without a time.
+
+        Args:
+            parameters: parameters of the model of scaled signals, shape (parameters,).
+            covariance: covariance of `parameters`, shape (parameters, parameters).
+            condition: condition number of the regressors.
+            rows: number of rows that the model has learned from.
+            forgetting: forgetting factor.
+        """
+        assert self.scaling is not None
+        structure, (matrix, shift) = self.structure, self.scaling.unscaling(self.structure)
+        deviations = standard_deviations(covariance, matrix)
+        return ModelSnapshot(
+            structure="arx",
+            order=structure.output_lags,
+            delay=structure.delay,
+            parameters=[
+                Parameter(name=name, value=value, sd=sd)
+                for name, value, sd in zip(
+                    structure.parameter_names(), matrix @ parameters + shift, deviations, strict=True
+                )
+            ],
+            rows=rows,
+            forgetting=forgetting,
+            excitation=1.0 / condition,
+            condition=condition,
+        )
 
     def _learn_scaling(self, inputs: Sequence[float], value: float) -> None:
         row = (*inputs[: self.structure.inputs], value)

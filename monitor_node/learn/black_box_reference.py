@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from monitor_node.ingest.sampling import TOLERANCE, regular_intervals
-from monitor_node.learn.references import GATE, FilterReference, RowFilter, RowPrediction
+from monitor_node.learn.references import GATE, FilterReference, Reference, RowFilter, RowPrediction
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
@@ -62,7 +62,9 @@ class BlackBoxMemory(Memory, tag="black-box"):
     unfamiliar_rows: int = 0
     copies: list[Array] = msgspec.field(default_factory=list)
 
-    def reference(self, equations: ProcessModel | None, outputs: tuple[str, ...]) -> "BlackBoxReference":
+    def reference(
+        self, equations: ProcessModel | None, outputs: tuple[str, ...], models: Reference
+    ) -> "BlackBoxReference":
         """Reference that resumes from this memory, bit for bit.
 
         Raises:

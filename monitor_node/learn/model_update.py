@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from monitor_node.config import MonitorConfig
-from monitor_node.learn.arx import ArxPredictor
+from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.training import Training, TrainingResult
 from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding, read_equations
 from monitor_node.learn.training_rows import TrainingRows
@@ -18,7 +18,6 @@ from reactorwatch.contract.commands import check_signature
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.errors import InputError
-from reactorwatch.stored_state import copy_of
 
 
 class ScheduledChange(NamedTuple):
@@ -112,19 +111,19 @@ class ModelUpdate:
         change.time_ns, change.id = time_ns, 1 + (self.baseline.id if self.baseline is not None else 0)
         return change
 
-    def relearn(self, change: Baseline, predictors: list[ArxPredictor]) -> TrainingResult | None:
+    def relearn(self, change: Baseline, models: ArxReference) -> TrainingResult | None:
         """Learn the baseline again from the rows of the training, which are dropped, with the model of a change.
 
         Args:
             change: the change, which is in force afterwards.
-            predictors: the identified models, which stay as they are.
+            models: the identified models, which stay as they are.
 
         Returns:
             The result; None if the new equations do not judge the plant any better than the identified models.
         """
         assert self.rows is not None
         rows, self.rows = self.rows, None
-        training = Training(self._config, read_equations(change.model), [copy_of(item) for item in predictors])
+        training = Training(self._config, read_equations(change.model), models.copy())
         trained = training.learn(rows, last_chance=True)
         if trained.refused or not trained.reference.follows_equations:
             return None

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from monitor_node.ingest.sampling import missing_in_intervals
-from monitor_node.learn.references import GATE, FilterReference, PlantEquations, RowFilter, RowPrediction
+from monitor_node.learn.references import GATE, FilterReference, PlantEquations, Reference, RowFilter, RowPrediction
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
@@ -55,7 +55,9 @@ class ProcessMemory(Memory, tag="process"):
     reach: list[float] = msgspec.field(default_factory=list)
     typical_sd: list[float] = msgspec.field(default_factory=list)
 
-    def reference(self, equations: ProcessModel | None, outputs: tuple[str, ...]) -> "ProcessReference":
+    def reference(
+        self, equations: ProcessModel | None, outputs: tuple[str, ...], models: Reference
+    ) -> "ProcessReference":
         """Reference that resumes from this memory, bit for bit.
 
         Raises:

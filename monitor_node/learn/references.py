@@ -1,14 +1,13 @@
 """References: models that predict the rows of a plant; residuals are taken against the predictions.
 
 There are three: the extended Kalman filter of a process model (`process_reference`), a black box of few signals
-(`black_box_reference`), and the recursive ARX models (`arx_reference`).
+(`black_box_reference`), and the identified models, recursive ARX models (`arx_reference`).
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, NamedTuple
 
-from monitor_node.learn.identified_models import IdentifiedModels
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.contract.messages_pb2 import ModelSnapshot
@@ -76,7 +75,7 @@ class Reference(ABC):
     @property
     @abstractmethod
     def memory(self) -> Any:
-        """The memory, without the equations; its `reference` makes a reference that resumes from a copy of it."""
+        """The memory, without equations and models; its `reference` makes one that resumes from a copy of it."""
 
     @property
     @abstractmethod
@@ -123,9 +122,6 @@ class Reference(ABC):
 
     def set_learning(self, learning: bool) -> None:  # noqa: B027 # without memory of the plant there is nothing to do
         """Learn from the rows to come, or not: while nothing is wrong, or a fault would be learned as ordinary."""
-
-    def use_models(self, models: IdentifiedModels) -> None:  # noqa: B027 # only identified models judge by them
-        """Take the identified models of the plant, if they judge."""
 
     def obstacles(self, inputs: Sequence[str]) -> Iterator[tuple[str, str]]:
         """Reasons why rows are not judged now, each with what it is about.

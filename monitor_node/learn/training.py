@@ -19,14 +19,20 @@ from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import regular_intervals
-from monitor_node.learn.arx import ArxPredictor
-from monitor_node.learn.arx_fit import ROWS_A_PARAMETER, arx_structure, fewest_rows
+from monitor_node.learn.arx import ROWS_A_PARAMETER, arx_structure, fewest_rows
 from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.black_box_reference import BlackBoxReference
 from monitor_node.learn.process_reference import ProcessReference
 from monitor_node.learn.references import Reference
 from monitor_node.learn.signal_range import possible_ranges
-from monitor_node.learn.training_rows import AfterMoves, Screening, TrainingRows, compare_after_moves, screen_baseline
+from monitor_node.learn.training_rows import (
+    AfterMoves,
+    Mask,
+    Screening,
+    TrainingRows,
+    compare_after_moves,
+    screen_baseline,
+)
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.errors import InputError
@@ -135,11 +141,11 @@ class Training:
     Args:
         config: settings of the monitor.
         model: process model; None: only the identified models are used.
-        predictors: identified models, one an output.
+        models: identified models, which judge after the training if they are chosen.
     """
 
-    def __init__(self, config: MonitorConfig, model: ProcessModel | None, predictors: list[ArxPredictor]) -> None:
-        self._config, self._model, self._predictors = config, model, predictors
+    def __init__(self, config: MonitorConfig, model: ProcessModel | None, models: ArxReference) -> None:
+        self._config, self._model, self._models = config, model, models
         self._without_black_box = self._weakness = ""
         of_one_input = replace(structure := arx_structure(config), inputs=min(structure.inputs, 1))
         of_identified = max(fewest_rows(of_one_input), FEWEST_ROWS)
@@ -203,6 +209,7 @@ class Training:
         if self._without_black_box and self._config.reference == "black-box":
             checks.append(Check(name=BlackBoxReference.kind, result=f"the ARX models judge: {self._without_black_box}"))
         if reference.is_identified:
+            self._models.start_judging(time_min, np.where(_have_values(inputs), inputs, 0.0), measured)
             checks += [Check(name="model", result=text) for text in self._simplifications(evaluated)]
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
         inputs = np.where([name not in left_out for name in self._config.inputs], inputs, np.nan)
@@ -228,7 +235,7 @@ class Training:
     def _simplifications(self, evaluated: list[bool]) -> list[str]:
         """Terms that the identified models lack, each with the outputs."""
         outputs: dict[str, list[str]] = {}
-        for name, predictor in compress(zip(self._config.outputs, self._predictors, strict=True), evaluated):
+        for name, predictor in compress(zip(self._config.outputs, self._models.predictors, strict=True), evaluated):
             outputs.setdefault(predictor.simplification, []).append(name)
         return [
             f"{', '.join(names)}: predicted with {text}, as there are fewer than {ROWS_A_PARAMETER} rows a parameter"
@@ -252,16 +259,13 @@ class Training:
         self._weakness = self._without_black_box = ""
         config = self._config
         minor = [max(MINOR * sd, step) for sd, step in zip(smallest, steps, strict=True)]
-        has_values = np.count_nonzero(np.isfinite(inputs), axis=0) >= FEWEST_ROWS
+        has_values = _have_values(inputs)
         given_inputs = np.where(has_values, inputs, 0.0)
         if not has_values.all():
-            for predictor, column in zip(self._predictors, measured.T, strict=True):
-                predictor.learn_again(time_min, given_inputs, column)
+            self._models.learn_again(time_min, given_inputs, measured)
 
         def fit_models(rows: Array) -> _Fit:
-            pairs = zip(self._predictors, rows.T, strict=True)
-            columns = [predictor.fit_reference(time_min, given_inputs, column) for predictor, column in pairs]
-            return ArxReference.of_training(given_inputs, self._predictors), np.column_stack(columns), minor
+            return self._models, self._models.fit(time_min, given_inputs, rows), minor
 
         identified = _refit_without_outliers(fit_models, measured)
         possible = None
@@ -364,6 +368,11 @@ def _predicts_as_well(candidate: _Candidate, identified: _Candidate) -> bool:
             if sds[0] > AS_WELL * sds[1]:
                 return False
     return True
+
+
+def _have_values(columns: Array) -> Mask:
+    """Flags of the columns with values enough."""
+    return np.asarray(np.count_nonzero(np.isfinite(columns), axis=0) >= FEWEST_ROWS)
 
 
 def _too_few_values(names: tuple[str, ...], columns: Array) -> dict[str, str]:

@@ -9,7 +9,7 @@ import numpy as np
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
-from monitor_node.learn.arx_fit import arx_structure, fewest_rows
+from monitor_node.learn.arx import arx_structure, fewest_rows
 from monitor_node.learn.training import FEWEST_ROWS
 from monitor_node.watch.pipeline_memory import PipelineMemory
 from monitor_node.watched_process import load_process
@@ -251,7 +251,7 @@ def run(
         first_ns=(monitor.memory.first_ns or 0) if first_ns is None else first_ns,
         last_ns=monitor.memory.last_ns or 0,
         span_ns=monitor.span_ns,
-        runs=1 + monitor.restarts,
+        runs=1 + monitor.aligner.memory.counts.restarts,
         watching_since_ns=monitor.memory.watching_since_ns,
         expected_false_alarms=monitor.pipeline.expected_false_alarms,
         alarm_messages=alarms,

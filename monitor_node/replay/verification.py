@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any
 
+from monitor_node.alarms.annunciator import Action
 from monitor_node.checks.silence import SilenceCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -301,12 +302,9 @@ class _Replay:
                 return []
             return signals.publish(silence, alarm.time_ns, silence.declare_timeout())
         try:
-            if alarm.event == "comment":
-                return board.comment(alarm.alarm, alarm.by, alarm.comment)
-            if alarm.event == Event.SHELVE:
-                minutes = (alarm.shelved_until_ns - alarm.time_ns) / MINUTE_NS
-                return board.shelve(alarm.alarm, minutes, alarm.by, alarm.comment)
-            return board.act(alarm.alarm, Event(alarm.event), alarm.by, alarm.comment)
+            action: Action = "comment" if alarm.event == "comment" else Event(alarm.event)
+            minutes = (alarm.shelved_until_ns - alarm.time_ns) / MINUTE_NS
+            return board.act(alarm.alarm, action, alarm.by, alarm.comment, minutes)
         except InputError:
             return []  # the replay then lacks it
 

@@ -10,15 +10,15 @@ import contextlib
 import re
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 from monitor_node.core import Monitor
 from monitor_node.monitor_state import ForeignFileError, OtherSettingsError
 from monitor_node.storage.claims import Claim
 from reactorwatch.errors import InputError, is_passing
-from reactorwatch.records import input_file
 from reactorwatch.records.atomic import atomic_write, write_durably
+from reactorwatch.records.input_file import read_regular
 
 DAMAGED, OTHER_SETTINGS = ".damaged", ".other-settings"
 
@@ -57,39 +57,6 @@ def find_kept_aside(folder: Path) -> dict[str, list[Path]]:
     return {name: [path for _, path in sorted(dated, reverse=True)] for name, dated in found.items()}
 
 
-def put_back(path: Path, asides: Iterable[Path], use: Callable[[bytes], None]) -> Path | None:
-    """Use the first usable one of the kept files, and rename it back; returns the name it was kept under, or None.
-
-    Args:
-        path: original name, which no file has now.
-        asides: kept files.
-        use: called with the bytes of a file; raises InputError if they are unusable.
-
-    Raises:
-        OSError: a file cannot be read or renamed.
-    """
-    for aside in asides:
-        try:
-            use(aside.read_bytes())
-        except InputError:
-            continue
-        aside.replace(path)
-        return aside
-    return None
-
-
-def read_regular(path: Path) -> bytes | None:
-    """Bytes of a regular file; None: there is none.
-
-    Raises:
-        InputError: the path is a device, a pipe or a folder, which can hold no state.
-        OSError: the file cannot be read.
-    """
-    if not path.exists():
-        return None
-    return input_file.read_regular(path, bounded=False)
-
-
 ENDING, CLAIM = ".state", ".owner"
 
 MOST_PENDING = 100
@@ -114,21 +81,38 @@ def restore(path: Path, monitor: Monitor, asides: Iterable[Path]) -> str:
         InputError: the file can hold no state.
         OSError: a file cannot be read or renamed.
     """
-    status, data = "there is none yet", read_regular(path)
-    if data is not None:
+    status, joint = "there is none yet", ";"
+    if path.exists():
+        data = read_regular(path, bounded=False)
         try:
             monitor.from_bytes(data)
         except ForeignFileError:
             raise
         except InputError as error:
             ending = OTHER_SETTINGS if isinstance(error, OtherSettingsError) else DAMAGED
-            status = f"{error}; it is kept as {keep_aside(path, ending).name}"
+            status, joint = f"{error}; it is kept as {keep_aside(path, ending).name}", ", and"
         else:
             return RESUMED
-    fitting = put_back(path, asides, monitor.from_bytes)
-    if fitting is not None:
-        return f"{status}; {fitting.name} fits and is in use again"
-    return f"{status}{';' if data is None else ', and'} the monitor learns again"
+    for aside in asides:
+        try:
+            monitor.from_bytes(aside.read_bytes())
+        except InputError:
+            continue
+        aside.replace(path)
+        return f"{status}; {aside.name} fits and is in use again"
+    return f"{status}{joint} the monitor learns again"
+
+
+def write_state(path: Path, state: bytes, claim: Claim, kind: str) -> None:
+    """Write a state to the disk; `kind` names its file in messages.
+
+    Raises:
+        InputError: the file cannot be written, or another monitor has claimed it; it is unchanged.
+    """
+    try:
+        write_durably(path, state, claim.check)  # just before the file is replaced: a slow disk comes before
+    except OSError as error:
+        raise InputError(f"{kind} {path}: cannot be written: {error.strerror}") from error
 
 
 class StateFile:
@@ -206,13 +190,10 @@ class StateFile:
 
     def _write(self) -> None:
         try:
-            write_durably(self._path, self.monitor.to_bytes(), self.claim.check)
+            write_state(self._path, self.monitor.to_bytes(), self.claim, "state_file")
         except InputError:
             self.monitor.stats.not_stored += 1
             raise
-        except OSError as error:
-            self.monitor.stats.not_stored += 1
-            raise InputError(f"state_file {self._path}: cannot be written: {error.strerror}") from error
 
 
 class StateFolder:
@@ -329,9 +310,7 @@ class StateFolder:
                 return f"state {path}: cannot be used and is not overwritten; move it away"
             self._protected.discard(plant)
         try:
-            write_durably(path, state, self.claim.check)  # just before the file is replaced: a slow disk comes before
+            write_state(path, state, self.claim, "state")
         except InputError as error:
             return str(error)
-        except OSError as error:
-            return f"state {path}: cannot be written: {error.strerror}"
         return None

@@ -82,8 +82,7 @@ class Baselines:
     def _judge_by(self, kept: EvaluationMemory) -> None:
         """Judge by a baseline that was replaced; its filters and charts start with the next row."""
         memory = copy_of(kept)
-        memory.suspicion = memory.bank = None
-        self._models.restart()
+        memory.suspicion = None
         self._evaluation.resume(memory, self._equations(memory.change), follows=False)
         self._evaluation.restart_charts()
 
@@ -163,7 +162,7 @@ class Baselines:
             return None
         evaluation.leave_ordinary()
         try:
-            trained = update.relearn(change, self._models.predictors)
+            trained = update.relearn(change, self._models)
         except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
             self._failures.add("baseline", error, "the plant is judged by the equations as given")
             return None

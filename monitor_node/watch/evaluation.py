@@ -15,7 +15,7 @@ from monitor_node.checks.base import CheckTraining
 from monitor_node.checks.stage import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import SamplingPeriod
-from monitor_node.learn.identified_models import IdentifiedModels, RowHistory
+from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.references import Reference
 from monitor_node.learn.signal_range import possible_ranges, stated_ranges
 from monitor_node.learn.training import TrainingResult
@@ -66,7 +66,7 @@ class Evaluation:
         self,
         config: MonitorConfig,
         board: Annunciator,
-        models: IdentifiedModels,
+        models: ArxReference,
         *,
         model: ProcessModel | None,
         is_process: bool,
@@ -82,7 +82,6 @@ class Evaluation:
         self.signals = SignalChecks(config, board, self._ranges, self.ordinary.numbers)
         self._use_ranges()
         self.drift = DriftWatch(config, board, publish=models.points)
-        models.adapts = self.drift.wanted
         self.shift = ShiftWatch(config, board)
         self._budget = AlarmBudget(config, self.charts.design, self.signals, self.shift, self.drift)
         self.suspicion: Suspicion | None = None
@@ -131,7 +130,7 @@ class Evaluation:
         if memory.reference is None:
             return
         learned = [whitener.autoregression for whitener in self.whiteners]
-        self._set_reference(memory.reference.reference(equations, outputs), learned, memory.suspicion, memory.bank)
+        self._set_reference(memory.reference.reference(equations, outputs, self.models), learned, memory.suspicion)
         self.charts.resume(memory.charts, self.evaluated)
         self.shift.resume(memory.shift)
         memory.shift = self.shift.memory
@@ -185,7 +184,6 @@ class Evaluation:
         return Watch(
             self._config,
             trained.reference,
-            self.models.predictors,
             trained.learned,
             self.charts.design.detectors(trained.learned, trained.e, self.memory.arl0),
             self.shift.sensitivities,
@@ -195,20 +193,13 @@ class Evaluation:
         )
 
     def _set_reference(
-        self,
-        reference: Reference,
-        learned: list[Prewhitening],
-        suspicion: SuspicionMemory | None = None,
-        bank: RowHistory | None = None,
+        self, reference: Reference, learned: list[Prewhitening], suspicion: SuspicionMemory | None = None
     ) -> None:
-        """Set the reference for the rows to come; the search for causes and the bank go on from their memories."""
+        """Set the reference for the rows to come; the search for causes goes on from its memory."""
         self.reference = reference
         self._use_ranges()
         self.whitened_sds = [item.sd for item in learned]
         self.start_search(reference, suspicion)
-        self.models.use_bank(identified=reference.is_identified, memory=bank)
-        self.memory.bank = None if self.models.bank is None else self.models.bank.memory
-        reference.use_models(self.models)
         self.ordinary.start(reference)
 
     def start_search(self, reference: Reference, memory: SuspicionMemory | None = None) -> None:
@@ -230,7 +221,7 @@ class Evaluation:
 
     def stop(self) -> None:
         """Evaluate no rows."""
-        self.reference = self.suspicion = self.models.bank = None
+        self.reference = self.suspicion = None
         self.ordinary.stop()
         self._use_ranges()
         self.memory, self.promises.promise = self._new_memory(), None

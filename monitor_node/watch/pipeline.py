@@ -21,7 +21,6 @@ from monitor_node.health import NODE, Failures
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.learn.arx_reference import ArxReference
-from monitor_node.learn.identified_models import IdentifiedModels
 from monitor_node.learn.model_update import ScheduledChange, is_command
 from monitor_node.learn.signal_range import input_bounds
 from monitor_node.learn.training import NO_VALUE, TrainingResult
@@ -95,7 +94,7 @@ class PlantPipeline:
         self._promise_checked = False
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
         self._paths, self._paths_beside = estimate_keys(config), estimate_keys(config, ArxReference.kind)
-        self.models = IdentifiedModels(config, points=points)
+        self.models = ArxReference(config, points=points)
         self.evaluation = Evaluation(
             config,
             board,
@@ -341,7 +340,9 @@ class PlantPipeline:
         reference, publications = evaluation.reference, row.publications
         assert reference is not None
         if evaluation.drift.wanted:
-            if not reference.is_identified and (predictions := self.models.update(row)):
+            is_beside = reference is not self.models
+            predictions = self.models.adapt(row) if is_beside or self.models.stays_as_fitted else []
+            if is_beside and predictions:
                 publications.extend(estimates(row, self._paths_beside, predictions))
             changes += evaluation.drift.update(row, self.models.predictors)
         if changes:

@@ -8,9 +8,8 @@ from monitor_node.causes.stage import SuspicionMemory
 from monitor_node.charts.charts import ChartsMemory
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.learn.arx import ArxPredictor
-from monitor_node.learn.arx_reference import ArxRanges
+from monitor_node.learn.arx_reference import ArxMemory
 from monitor_node.learn.black_box_reference import BlackBoxMemory
-from monitor_node.learn.identified_models import RowHistory
 from monitor_node.learn.process_reference import ProcessMemory
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.operation import CarriedState
@@ -34,7 +33,6 @@ class EvaluationMemory(Memory, kw_only=True):
         shift: tests for lasting steps, one an output, see `STEP_TEST`; None without them.
         suspicion: memory of the search for causes; None if there is none.
         promise: the promise of false alarms.
-        bank: memory of the fitted models' bank; None if there is none.
         arl0: in-control run length of each alarm, in rows; 0 before the end of the training.
         rows_watched: number of evaluated rows.
         until_drift: number of rows until the next drift point.
@@ -47,14 +45,13 @@ class EvaluationMemory(Memory, kw_only=True):
     signals: dict[str, Any]
     whiteners: Records
     quarantined: tuple[bool, ...]
-    reference: ProcessMemory | BlackBoxMemory | ArxRanges | None = None
+    reference: ProcessMemory | BlackBoxMemory | ArxMemory | None = None
     checks: list[Check] = msgspec.field(default_factory=list)
     left_out: dict[str, str] = msgspec.field(default_factory=dict)
     charts: ChartsMemory = msgspec.field(default_factory=ChartsMemory)
     shift: Records | None = None
     suspicion: SuspicionMemory | None = None
     promise: PlantPromise | None = None
-    bank: RowHistory | None = None
     arl0: float = 0.0
     rows_watched: int = 0
     until_drift: int = 0

@@ -22,7 +22,6 @@ from monitor_node.causes.scan import GlrScan
 from monitor_node.causes.stage import has_causes
 from monitor_node.causes.window import window_of
 from monitor_node.config import MonitorConfig
-from monitor_node.learn.arx import ArxPredictor
 from monitor_node.learn.process_reference import output_indices
 from monitor_node.learn.references import Reference
 from monitor_node.learn.training_rows import TrainingRows
@@ -71,7 +70,6 @@ class Watch(NamedTuple):
     Attributes:
         config: settings of the monitor.
         reference: the reference.
-        predictors: identified models, one an output.
         learned: prewhitening of each output.
         detectors: the charts.
         steps: statistic of each output's test of lasting steps after a step of one unit, and its limit; empty without
@@ -83,7 +81,6 @@ class Watch(NamedTuple):
 
     config: MonitorConfig
     reference: Reference
-    predictors: Sequence[ArxPredictor]
     learned: Sequence[Prewhitening]
     detectors: Sequence[Detector]
     steps: Sequence[tuple[float, float]]

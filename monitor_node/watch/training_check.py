@@ -91,7 +91,7 @@ def check_training(
             """A pipeline that starts with what was learned; its settings may differ in the false alarms."""
             pipeline = PlantPipeline(config, Annunciator(config), points=False, model=model)
             pipeline.resume(copy_of(memory), 0)
-            reference = learned.reference(pipeline.baselines.equations, config.outputs)
+            reference = learned.reference(pipeline.baselines.equations, config.outputs, pipeline.models)
             pipeline.start(trained._replace(reference=reference, checks=list(trained.checks)))
             return pipeline
 

@@ -6,7 +6,7 @@ from operator import not_
 
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import MeasuredRow
-from monitor_node.learn.identified_models import IdentifiedModels
+from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.training import MOST_REFUSALS, Training, TrainingResult
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.pipeline_memory import TrainingMemory
@@ -33,7 +33,7 @@ class TrainingStage:
         is_open: True to train until the caller ends it.
     """
 
-    def __init__(self, config: MonitorConfig, model: ProcessModel | None, models: IdentifiedModels) -> None:
+    def __init__(self, config: MonitorConfig, model: ProcessModel | None, models: ArxReference) -> None:
         self._config, self._model, self._models = config, model, models
         self.memory = TrainingMemory(self._no_rows)
         self.trained_rows = 0
@@ -46,14 +46,14 @@ class TrainingStage:
 
     def restart(self, time_ns: int | None) -> None:
         """Start again without a row."""
-        self._models.restart()
-        self._training = Training(self._config, self._model, self._models.predictors)
+        self._models.forget()
+        self._training = Training(self._config, self._model, self._models)
         self.memory.rows, self.memory.began_ns = self._no_rows, time_ns
 
     def take_over(self, rows: TrainingRows) -> None:
         """Train on with the rows of an incident, by which the identified models are updated."""
         self.memory.rows, self.memory.began_ns = rows, rows.times_ns[0]
-        self._models.learn_again(rows)
+        self._models.learn_again(rows.time_min, rows.inputs, rows.outputs)
 
     def open(self) -> None:
         """Train until the caller ends it, on all rows until then."""
@@ -91,7 +91,7 @@ class TrainingStage:
     def add(self, row: MeasuredRow) -> list[float]:
         """Add a row, and update the identified models with it; returns their predictions if they are published."""
         self.memory.rows.add(row.time_ns, row.inputs, row.values)
-        return self._models.update(row)
+        return self._models.adapt(row)
 
     def finish(self, *, last_chance: bool | None = None) -> tuple[TrainingRows, TrainingResult]:
         """Learn from the rows; returns them and the result.

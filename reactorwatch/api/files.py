@@ -66,9 +66,9 @@ def described_process(path: Path, plant: str | None = None, choice: ProcessChoic
     """
     if not choice.is_default or file_kind(path) == "table":
         return choice.load()
-    from recorder.files.recording import recorded_process
+    from recorder.files.recording import Recording
 
-    return recorded_process(path, plant) or choice.load()
+    return Recording(path).process(plant) or choice.load()
 
 
 def record_of_process(
@@ -158,12 +158,12 @@ def open_messages(
         zero_ns, has_clock_time = measured.stored_zero_ns, bool(measured.zero_ns)
         return MessageSource(encoded, zero_ns, has_clock_time, measured.read_as, choice.load(), measured)
     from recorder.files.metadata import ZERO_NS
-    from recorder.files.recording import has_clock, read_messages, read_metadata, recorded_process, zero_from
+    from recorder.files.recording import Recording, has_clock, zero_from
 
-    read = (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
-    metadata = read_metadata(path)
+    recording = Recording(path)
+    read, metadata = (Encoded(*entry[:4]) for entry in recording.messages(plant=plant)), recording.metadata
     given_ns = zero_from(metadata, 0) if ZERO_NS in metadata else None
-    process = recorded_process(path, plant) if choice.is_default else choice.load()
+    process = recording.process(plant) if choice.is_default else choice.load()
     return MessageSource(read, given_ns, has_clock(metadata), process=process)
 
 
@@ -177,7 +177,7 @@ def expand_folder(folder: Path) -> list[Path]:
         InputError: the folder holds neither.
     """
     from recorder.files.metadata import FILE_INDEX
-    from recorder.files.recording import live_file, read_metadata
+    from recorder.files.recording import Recording, live_file
 
     one_recording = {FILE_INDEX, "cut", "merged"}
     records, recordings = (list_files(folder, suffix) for suffix in (".csv", ".mcap"))
@@ -188,7 +188,7 @@ def expand_folder(folder: Path) -> list[Path]:
     origins = []
     for file in recordings:
         with suppress(InputError):  # a damaged one is reported when it is read
-            origins.append(read_metadata(file))
+            origins.append(Recording(file).metadata)
     if origins and all(one_recording & origin.keys() for origin in origins):
         return [folder, *records]
     return sorted([*records, *recordings])
@@ -198,13 +198,13 @@ def resolve_plant(path: Path, plant: str | None) -> str:
     """Name of the plant in a file: the given one, or the only one.
 
     Raises:
-        InputError: as `one_plant_in`; or the name is invalid.
+        InputError: as `Recording.one_plant`; or the name is invalid.
     """
     if file_kind(path) == "table":
         return plant or DEFAULT_PLANT
-    from recorder.files.recording import one_plant_in
+    from recorder.files.recording import Recording
 
-    name = one_plant_in(path, plant)
+    name = Recording(path).one_plant(plant)
     try:
         return check_plant(name)
     except ValueError as error:

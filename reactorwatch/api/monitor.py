@@ -7,7 +7,6 @@ from typing import Any
 import msgspec
 from google.protobuf.message import Message
 
-from monitor_node.alarms.alarms import suspect_messages
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor as MonitorCore
 from monitor_node.diagnosis_worker import find_deviations
@@ -15,7 +14,7 @@ from monitor_node.watched_process import load_process, watch_process
 from reactorwatch.api.records import ProcessLike
 from reactorwatch.api.rows import iterate_rows
 from reactorwatch.contract import keys
-from reactorwatch.contract.alarm_text import priority_word
+from reactorwatch.contract.alarm_text import NewSuspects, priority_word
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Quality, Sample
 from reactorwatch.contract.messages_pb2 import Suspect as SuspectMessage
@@ -86,7 +85,7 @@ class Monitor:
         self._config, model = load_process(config) if described is None else watch_process(config, described)
         self._core = MonitorCore(self._config, 0, points=False, model=model, diagnose=find_deviations)
         self._rows = 0
-        self._suspects = self._newest_suspects()
+        self._suspects = self._known_suspects()
 
     @property
     def phase(self) -> str:
@@ -151,19 +150,18 @@ class Monitor:
             raise InputError(f"the state of a monitor cannot be read: {error}") from error
         self._core.from_bytes(core)
         self._rows = rows
-        self._suspects = self._newest_suspects()
+        self._suspects = self._known_suspects()
 
-    def _newest_suspects(self) -> dict[int, list[SuspectMessage]]:
-        """Suspects of the incidents that may change, by number."""
-        return {item.number: suspect_messages(item.suspects) for item in self._core.alarms.memory.incidents}
+    def _known_suspects(self) -> NewSuspects:
+        incidents = self._core.alarms.memory.incidents
+        return NewSuspects({item.number: [cause.message for cause in item.suspects] for item in incidents})
 
     def _change(self, message: Message) -> AlarmChange | None:
         """Change of an alarm, or new suspects of an incident at its first-out alarm; None for another message."""
         if isinstance(message, Alarm):
             return _alarm_change(message, message.event, message.suspects)
-        if not isinstance(message, Incident) or message.suspects == self._suspects.get(message.number, []):
+        if not isinstance(message, Incident) or not self._suspects.update(message.number, message.suspects):
             return None
-        self._suspects = self._newest_suspects()
         return _alarm_change(self._core.alarms.alarm(message.alarms[0]), "suspected", message.suspects)
 
 

@@ -208,7 +208,8 @@ def replay(
     from reactorwatch.records.record import MINUTE_NS
     from reactorwatch.records.source_text import is_table
     from reactorwatch.runtime.config import section
-    from recorder.tools.replay import ReplayConfig, run_replay
+    from recorder.config import ReplayConfig
+    from recorder.tools.replay import run_replay
 
     if column and not is_table(file):
         raise InputError(f"--column is for the columns of a .csv file or another table, got {file}")

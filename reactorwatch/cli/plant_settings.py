@@ -15,7 +15,7 @@ from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import section
 from recorder.config import ReplayConfig
-from recorder.files.recording import one_plant_in, recorded_process
+from recorder.files.recording import Recording
 from recorder.tools.convert import plant_name
 
 Tables = dict[str, dict[str, Any]]
@@ -170,8 +170,9 @@ def _played_process(path: Path, process: str | None, plant: str | None) -> tuple
         InputError: there is no such process, or a recording holds several plants.
     """
     if not is_table(path):
-        recorded = one_plant_in(path)
-        plant, described = plant or recorded, recorded_process(path, recorded)
+        recording = Recording(path)
+        recorded = recording.one_plant()
+        plant, described = plant or recorded, recording.process(recorded)
         if process is None and described is not None:
             process = described.name
             find_in_catalogue(process, f"--record {path}")

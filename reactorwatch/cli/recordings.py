@@ -88,7 +88,7 @@ def cut(
     from recorder.files.copies import cut as copy
     from recorder.files.copies import sample_window
     from recorder.files.metadata import ZERO_NS
-    from recorder.files.recording import read_metadata, recordings_in
+    from recorder.files.recording import Recording
     from recorder.tools.inspect import zero_ns_of
 
     from_ns = parse_span_ns(begin, "--from") if begin is not None else -(2**63)
@@ -97,10 +97,10 @@ def cut(
         raise InputError(f"--from must be before --to, got {begin} and {end or 'the end'}")
     out = check_output(out, ".mcap", (file,), force=force)
     with task(f"cutting {file.name}"):
-        sources = recordings_in(check_recording(file))
-        zero_ns = zero_ns_of(file)
+        recording = Recording(check_recording(file))
+        sources, zero_ns = recording.files, zero_ns_of(recording)
         window = sample_window(sources, zero_ns + from_ns, zero_ns + to_ns)
-        about = {**read_metadata(file), "cut": f"from {begin or 'the start'} to {end or 'the end'} of {file.name}"}
+        about = {**recording.metadata, "cut": f"from {begin or 'the start'} to {end or 'the end'} of {file.name}"}
         count = copy(sources, out, window, {**about, ZERO_NS: str(zero_ns)})
     print_lines(f"wrote {out}: {count} messages")
 

@@ -20,15 +20,8 @@ from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import parse_tables, read_settings, section
 from reactorwatch.terminal import printable_lines
 from reactorwatch.version import UNKNOWN, describe_build, this_build
-from recorder.files.recording import (
-    has_clock,
-    one_plant_in,
-    read_messages,
-    read_metadata,
-    recorded_process,
-    recordings_in,
-)
-from recorder.tools.inspect import gaps_in, zero_ns_of
+from recorder.files.recording import Recording, has_clock
+from recorder.tools.inspect import zero_ns_of
 
 SETTINGS = "settings"
 """Name of the nodes' settings in the metadata of a recording."""
@@ -54,17 +47,18 @@ def run(file: Path, config: Path | None, plant: str | None, process: str | None 
     """
     if is_table(file):
         raise InputError(f"{file}: holds no alarms to verify; a recording (.mcap) was expected")
-    metadata = read_metadata(file)
-    other_builds = _describe_other_builds(file)
+    recording = Recording(file)
+    metadata = recording.metadata
+    other_builds = _describe_other_builds(recording)
     for line in other_builds:  # before the work, whose result or refusal it may explain
         print_lines(line, err=as_json)
-    monitor = _settings(file, metadata, config, one_plant_in(file, plant))
+    monitor = _settings(file, metadata, config, recording.one_plant(plant))
     judged = find_process(process, on_bus=True) if process else None
     if judged is None and config is None:
-        judged = _recorded_process(file, monitor)
+        judged = _recorded_process(recording, monitor)
 
     def read() -> Iterator[Encoded]:
-        return (Encoded(*entry[:4]) for entry in read_messages(file, plant=monitor.plant) if not entry.latched)
+        return (Encoded(*entry[:4]) for entry in recording.messages(plant=monitor.plant) if not entry.latched)
 
     with task(f"verifying {file.name}"):
         try:
@@ -74,10 +68,10 @@ def run(file: Path, config: Path | None, plant: str | None, process: str | None 
     verification.notes += [
         f"{gap.messages} messages of {gap.stream} never reached this recording; what the monitor published about "
         "them, and what it learned from them, is then not reproduced"
-        for gap in gaps_in(file)
+        for gap in recording.gaps
         if gap.stream in {keys.all_keys(monitor.plant, kind).removesuffix("/**") for kind in (keys.SAMPLE, *COMPARED)}
     ]
-    zero_ns = zero_ns_of(file)
+    zero_ns = zero_ns_of(recording)
     report = _object(verification, file, monitor.plant, zero_ns) | {
         "zero": format_utc(zero_ns) if has_clock(metadata) else None
     }
@@ -87,9 +81,9 @@ def run(file: Path, config: Path | None, plant: str | None, process: str | None 
     return 0 if verification.exact else 1
 
 
-def _describe_other_builds(file: Path) -> list[str]:
+def _describe_other_builds(recording: Recording) -> list[str]:
     """Remark that other builds of this software made the recording, or files of it; empty if it was this one."""
-    recorded = [{"version": UNKNOWN, "commit": UNKNOWN} | read_metadata(part) for part in recordings_in(file)]
+    recorded = [{"version": UNKNOWN, "commit": UNKNOWN} | origin for origin in recording.metadata_by_file]
     builds = dict.fromkeys(describe_build(build["version"], build["commit"]) for build in recorded)
     others = [build for build in builds if build != this_build()]
     if not others:
@@ -97,7 +91,7 @@ def _describe_other_builds(file: Path) -> list[str]:
     return [f"it was recorded by another build, {' and '.join(others)}, and this is {this_build()}: they may differ"]
 
 
-def _recorded_process(file: Path, monitor: MonitorConfig) -> Process | None:
+def _recorded_process(recording: Recording, monitor: MonitorConfig) -> Process | None:
     """Process that the settings in a recording name: of the catalogue, or as the recording itself describes it.
 
     A file that they name is not opened. None: they name none.
@@ -106,10 +100,10 @@ def _recorded_process(file: Path, monitor: MonitorConfig) -> Process | None:
         InputError: the recording does not hold the equations that judged.
     """
     path = ProcessChoice(monitor.process).file
-    described = None if path is None else recorded_process(file, monitor.plant)
+    described = None if path is None else recording.process(monitor.plant)
     if path is not None and described is not None and (described.model is not None or path.suffix.lower() == ".toml"):
         return described
-    return find_in_catalogue(monitor.process, str(file)) if monitor.process else None
+    return find_in_catalogue(monitor.process, str(recording.path)) if monitor.process else None
 
 
 def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: str) -> MonitorConfig:

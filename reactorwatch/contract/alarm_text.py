@@ -1,12 +1,16 @@
 """Texts of alarms for people; a number that this version has no word for is shown as it is."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
+from types import MappingProxyType
 
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Priority, Suspect
 
 MIN_PROBABILITY = 0.05
 """Probability below which a suspect is not shown."""
+
+MAX_INCIDENTS = 1000
+"""Incidents whose suspects are remembered; few change after others have begun."""
 
 _MINUTE_NS = 60_000_000_000
 
@@ -15,6 +19,26 @@ def set_suspects(alarm: Alarm, suspects: Iterable[Suspect]) -> None:
     """Replace the suspects of an alarm, as by those that its incident has now."""
     del alarm.suspects[:]
     alarm.suspects.extend(suspects)
+
+
+class NewSuspects:
+    """Tells incidents with new suspects from those that repeat theirs, as after a restart of a monitor.
+
+    Args:
+        suspects: suspects of incidents that were published before, by number of the incident.
+    """
+
+    def __init__(self, suspects: Mapping[int, Sequence[Suspect]] = MappingProxyType({})) -> None:
+        self._suspects = {number: list(items) for number, items in suspects.items()}
+
+    def update(self, number: int, suspects: Sequence[Suspect]) -> bool:
+        """True if an incident has suspects, and other ones than before."""
+        if not suspects or list(suspects) == self._suspects.get(number):
+            return False
+        self._suspects[number] = list(suspects)
+        if len(self._suspects) > MAX_INCIDENTS:
+            del self._suspects[next(iter(self._suspects))]
+        return True
 
 
 def describe_suspects(suspects: Iterable[Suspect]) -> str:

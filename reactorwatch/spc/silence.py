@@ -17,33 +17,31 @@ are known there is no timeout.
 If the transport delayed samples and the plant never stopped, the next row clears the live alarm at the time at which it
 was raised, and a replay, rightly, does not have it.
 
-One `DataTimeout` is for the plant: every row and every received sample restarts it. One more for each signal counts its
-values in the rows, which continue with NaN after a sensor has failed. A gap in all rows is no fault of a single sensor;
-these timeouts are suppressed then, and only one alarm is raised.
+The timeout of the plant is restarted by every row and every received sample. That of a signal counts its values in the
+rows, which continue with NaN after a sensor has failed. A gap in all rows is no fault of a single sensor; the signals'
+timeouts are suppressed then, and only one alarm is raised.
 
 A signal with fewer than `LEARN_FROM` known spacings, or without any value, is measured by the plant's rows: its timeout
 is `UNKNOWN_ROWS` of their usual spacings.
 
->>> from math import isnan, nan
->>> plant, sensor = DataTimeout(), DataTimeout()
->>> def on_row(time_ns: int, T: float) -> list[tuple[str, Change]]:
-...     changes = [("plant", plant.update(time_ns, present=True))]
-...     if changes[0][1] != NO_CHANGE:
-...         sensor.suppress_until(time_ns)
-...     changes.append(("T", sensor.update(time_ns, present=not isnan(T))))
-...     return [(name, change) for name, change in changes if change != NO_CHANGE]
->>> [on_row(time_ns, 440.0) for time_ns in range(0, 4000, 100)] == [[]] * 40
+>>> from math import nan
+>>> timeout = DataTimeout(signals=1)
+>>> [timeout.update(time_ns, [440.0]) for time_ns in range(0, 4000, 100)] == [[]] * 40
 True
->>> on_row(7000, 440.0)  # nothing for 3100 ns, where 500 are allowed
-[('plant', Change(raised_ns=4400, cleared_ns=7000))]
->>> sum((on_row(time_ns, nan) for time_ns in range(7100, 8100, 100)), [])
-[('T', Change(raised_ns=7500, cleared_ns=None))]
+>>> timeout.update(7000, [440.0])  # nothing for 3100 ns, where 500 are allowed
+[(0, Change(raised_ns=4400, cleared_ns=7000))]
+>>> sum((timeout.update(time_ns, [nan]) for time_ns in range(7100, 8100, 100)), [])
+[(1, Change(raised_ns=7500, cleared_ns=None))]
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import field
+from numpy.typing import NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit, python_function
 from reactorwatch.errors import InputError, positive
 from reactorwatch.stored_state import Memory, Records
@@ -82,8 +80,6 @@ class Change(NamedTuple):
 
 
 NO_CHANGE = Change(None, None)
-"""Returned, the object itself, if nothing changes."""
-
 
 SPACING = np.dtype([("mean_ns", "f8"), ("deviation_ns", "f8"), ("count", "i8")], align=True)
 """Numbers of a spacing, see `Spacing`."""
@@ -140,7 +136,7 @@ def allowed_ns(s: Any, limit: float) -> int:
 
 @jit
 def update_timeout(p: Any, time_ns: int, present: bool, limit: float, fallback_ns: int) -> tuple[int, int, int]:
-    """Update with a row, see `DataTimeout.update`.
+    """Update with a row, see `_update`.
 
     Args:
         p: numbers of the timeout.
@@ -177,8 +173,29 @@ def update_timeout(p: Any, time_ns: int, present: bool, limit: float, fallback_n
 
 
 @jit
-def _update(numbers: Any, time_ns: int, present: bool, limit: float, fallback_ns: int) -> tuple[int, int, int]:
-    return update_timeout(numbers[0], time_ns, present, limit, fallback_ns)
+def _update(numbers: Any, time_ns: int, values: Array, limit: float, changes: NDArray[np.int64]) -> bool:
+    """Update the timeouts of a plant and of its signals; writes the results of `update_timeout`; True if one changed.
+
+    Args:
+        numbers: numbers of the timeouts, the plant's first.
+        time_ns: time of the row.
+        values: value of each signal; NaN where missing.
+        limit: allowed time, in usual spacings.
+        changes: results, shape (1 + signals, 3).
+    """
+    plant, fallback_ns = numbers[0], -1
+    changes[0, 0], changes[0, 1], changes[0, 2] = update_timeout(plant, time_ns, True, limit, -1)
+    found = bool(changes[0, 0])
+    if not np.isfinite(values).all():
+        fallback_ns = allowed_ns(plant.spacing, max(UNKNOWN_ROWS, limit))
+    for i in range(values.size):
+        p = numbers[i + 1]
+        if changes[0, 0] and not p.is_active:  # until now all signals had no data, not only this one
+            p.last_ns = time_ns
+        change, raised_ns, cleared_ns = update_timeout(p, time_ns, np.isfinite(values[i]), limit, fallback_ns)
+        changes[i + 1, 0], changes[i + 1, 1], changes[i + 1, 2] = change, raised_ns, cleared_ns
+        found = found or change > 0
+    return found
 
 
 @jit
@@ -189,16 +206,28 @@ def _limit_ns(numbers: Any, limit: float) -> int:
 _UPDATE, _ALLOWED, _ALLOWED_NS = Entry(_update), Entry(_limit_ns), python_function(allowed_ns)
 
 
-class DataTimeout:
-    """Timeout of a plant's or a signal's samples.
-
-    Args:
-        limit: allowed time without a sample, in usual spacings.
-        least_s: least allowed receive time without a sample, in seconds.
-        numbers: memory in sample time, shape (1,), as a view of that of a plant; None: a new one.
-        receipts: spacing in receive time; None: a new one.
+class TimeoutMemory(Memory):
+    """Memory of timeouts.
 
     Attributes:
+        numbers: numbers in sample time of the plant, then of each signal, see `TIMEOUT`.
+        receipts: usual spacing of the plant's samples in receive time.
+    """
+
+    numbers: Records
+    receipts: Spacing = field(default_factory=Spacing)
+
+
+class DataTimeout:
+    """Timeouts of a plant's samples, and of those of each signal.
+
+    Args:
+        signals: number of signals.
+        limit: allowed time without a sample, in usual spacings.
+        least_s: least allowed receive time without a sample, in seconds.
+
+    Attributes:
+        memory: what is stored; another one may be put in its place.
         received_ns: receive time of the last sample; None before the first. A monitor that was down received nothing.
         counted_ns: receive time of the sample from which the next spacing counts; None before the first.
 
@@ -206,62 +235,47 @@ class DataTimeout:
         InputError: limit is not a number above 1, or least_s not a positive one.
     """
 
-    def __init__(
-        self,
-        limit: float = 5.0,
-        least_s: float = 5.0,
-        numbers: Records | None = None,
-        receipts: Spacing | None = None,
-    ) -> None:
+    def __init__(self, signals: int = 0, limit: float = 5.0, least_s: float = 5.0) -> None:
         if not 1.0 < limit < float("inf"):
             raise InputError(f"limit must be a number of periods above 1, got {limit}")
         self._limit, self._least_ns = float(limit), int(positive("least_s", least_s) * 1e9)
-        self.numbers = no_timeouts(1) if numbers is None else numbers
-        self.receipts = Spacing() if receipts is None else receipts
+        numbers = np.zeros(1 + signals, TIMEOUT)
+        numbers["last_ns"] = NO_TIME_NS
+        self.memory = TimeoutMemory(numbers)
+        self._changes = np.zeros((1 + signals, 3), np.int64)
         self.received_ns: int | None = None
         self.counted_ns: int | None = None
 
     @property
     def is_active(self) -> bool:
-        """True if the timeout is active."""
-        return bool(self.numbers["is_active"][0])
-
-    @is_active.setter
-    def is_active(self, is_active: bool) -> None:
-        self.numbers["is_active"] = is_active
+        """True if the timeout of the plant is active."""
+        return bool(self.memory.numbers["is_active"][0])
 
     # --- sample time -----------------------------------------------------------------------------------------
 
-    def fallback_allowed_ns(self) -> int | None:
-        """Allowed time of a signal whose own spacing is unknown, by this plant's rows; None if that is unknown."""
-        allowed: int = _ALLOWED.call(self.numbers, max(UNKNOWN_ROWS, self._limit))
-        return None if allowed < 0 else allowed
-
-    def update(self, time_ns: int, *, present: bool, fallback_allowed_ns: int | None = None) -> Change:
-        """Update with a row.
+    def update(self, time_ns: int, values: Sequence[float]) -> list[tuple[int, Change]]:
+        """Update with a row; returns the changes with the index of each in the memory: 0 for the plant.
 
         A row that is not later than the last sample means that the plant's clock was set back: spacings count from this
         row on.
 
         Args:
             time_ns: time of the row.
-            present: True if the signal has a value in it.
-            fallback_allowed_ns: allowed time while the signal's own spacing is unknown; None: unlimited.
+            values: value of each signal; NaN where missing.
         """
-        fallback_ns = -1 if fallback_allowed_ns is None else fallback_allowed_ns
-        change, raised_ns, cleared_ns = _UPDATE.call(self.numbers, time_ns, present, self._limit, fallback_ns)
-        if not change:
-            return NO_CHANGE
-        return Change(raised_ns if change & 1 else None, cleared_ns if change & 2 else None)
-
-    def suppress_until(self, time_ns: int) -> None:
-        """Restart the timer: until now all signals had no data, not only this one."""
-        if not self.is_active:
-            self.numbers["last_ns"] = time_ns
+        row = np.array(values, dtype=np.float64)
+        if not _UPDATE.call(self.memory.numbers, time_ns, row, self._limit, self._changes):
+            return []
+        return [
+            (i, Change(raised_ns if change & 1 else None, cleared_ns if change & 2 else None))
+            for i, (change, raised_ns, cleared_ns) in enumerate(self._changes.tolist())
+            if change
+        ]
 
     def deadline_ns(self) -> int | None:
         """Deadline of the next row; None before the spacing is known."""
-        last_ns, allowed = int(self.numbers["last_ns"][0]), _ALLOWED.call(self.numbers, self._limit)
+        numbers = self.memory.numbers
+        last_ns, allowed = int(numbers["last_ns"][0]), _ALLOWED.call(numbers, self._limit)
         return None if last_ns == NO_TIME_NS or allowed < 0 else last_ns + allowed
 
     # --- receive time ----------------------------------------------------------------------------------------
@@ -275,11 +289,11 @@ class DataTimeout:
         before_ns, self.received_ns = self.counted_ns, now_ns
         if before_ns is None or now_ns < before_ns:
             self.counted_ns = now_ns
-        elif self.receipts.count < MEMORY or now_ns - before_ns >= BURST * self.receipts.mean_ns:
+        elif self.memory.receipts.count < MEMORY or now_ns - before_ns >= BURST * self.memory.receipts.mean_ns:
             self.counted_ns = now_ns
             allowed = self._timeout_ns()
             spacing_ns = now_ns - before_ns
-            self.receipts.learn(float(spacing_ns if allowed is None else min(spacing_ns, allowed)), MEMORY)
+            self.memory.receipts.learn(float(spacing_ns if allowed is None else min(spacing_ns, allowed)), MEMORY)
 
     def due_ns(self) -> int | None:
         """Time to `check`, unless a sample arrives before; None: no timeout is set."""
@@ -306,21 +320,14 @@ class DataTimeout:
         return self.declare_timeout()
 
     def declare_timeout(self) -> Change:
-        """Make the timeout active."""
+        """Make the timeout of the plant active."""
         deadline_ns = self.deadline_ns()
         if self.is_active or deadline_ns is None:
             return NO_CHANGE
-        self.is_active = True
+        self.memory.numbers["is_active"][0] = True
         return Change(deadline_ns, None)
 
     def _timeout_ns(self) -> int | None:
         """Allowed receive time without a sample; None before it is known."""
-        allowed = _ALLOWED_NS(self.receipts, self._limit)
+        allowed = _ALLOWED_NS(self.memory.receipts, self._limit)
         return None if allowed < 0 else max(allowed, self._least_ns)
-
-
-def no_timeouts(count: int) -> Records:
-    """Memory of timeouts before the first sample, shape (count,)."""
-    numbers = np.zeros(count, TIMEOUT)
-    numbers["last_ns"] = NO_TIME_NS
-    return numbers

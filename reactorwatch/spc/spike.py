@@ -29,6 +29,7 @@ are none. Of outliers that a training has, only a change of their rate is an ala
 than exponential there are more false spikes than promised; but isolated far values are then what the signal has.
 """
 
+from collections.abc import Sequence
 from math import ceil, log, sqrt
 from statistics import median
 from typing import Literal, NamedTuple, TypeAlias
@@ -180,6 +181,34 @@ class Spike(Memory):
         """Drop earlier values, as after a gap or a restart of the plant: a quarantined value stays undecided."""
         self.phase, self.quarantined = "ordinary", 0.0
         self.recent.clear()
+
+
+class Spikes(Memory):
+    """Spikes of the outputs of a plant; the object is its own state.
+
+    Attributes:
+        of_outputs: method for each output; None for an output without one; empty before the training ends.
+    """
+
+    of_outputs: list[Spike | None] = field(default_factory=list)
+
+    @property
+    def is_ordinary(self) -> bool:
+        """True if values within their limits would change nothing."""
+        return all(spike is None or spike.is_ordinary for spike in self.of_outputs)
+
+    def update(self, z: Sequence[float], *, is_moved: bool) -> list[Verdict]:
+        """Update with a row: a standardised residual of each output, NaN where missing; see `Spike.update`."""
+        return [
+            NO_SPIKE if spike is None or size != size else spike.update(size, is_moved=is_moved)
+            for spike, size in zip(self.of_outputs, z, strict=True)
+        ]
+
+    def restart(self) -> None:
+        """Drop earlier rows, see `Spike.restart`."""
+        for spike in self.of_outputs:
+            if spike is not None:
+                spike.restart()
 
 
 def spike_limit(z: ArrayLike, arl0: float) -> float:

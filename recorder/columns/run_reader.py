@@ -17,6 +17,7 @@ from google.protobuf.message import Message
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.alarm_text import NewSuspects
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
@@ -103,7 +104,7 @@ class RunReader:
         self._plant = ""
         self._keys: dict[str, _Key | None] = {}
         self._newest_changes: dict[str, tuple[object, ...]] = {}
-        self._newest_suspects: dict[int, list[messages.Suspect]] = {}  # by incident
+        self._suspects = NewSuspects()
         self._newest_ns: int | None = None
         self._clock = ContinuousTime()
         self._statistics: dict[str, SignalStatistics] = {}
@@ -149,9 +150,8 @@ class RunReader:
             topic = keys.Topic(self._plant, kind, str(message.number))
             into = self._keys[keys.key(*topic)] = self._keys.get(keys.key(*topic)) or _Key(topic, _KINDS[kind])
         if kind == keys.INCIDENT:
-            if not message.suspects or list(message.suspects) == self._newest_suspects.get(message.number):
+            if not self._suspects.update(message.number, message.suspects):
                 return
-            self._newest_suspects[message.number] = list(message.suspects)
         elif kind == keys.ALARM:
             change = (*(getattr(message, name) for name in _CHANGE), list(message.suspects))
             if self._newest_changes.get(message.alarm) == change:

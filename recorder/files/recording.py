@@ -11,19 +11,23 @@ the intact part of that is read.
 
 import heapq
 from collections.abc import Callable, Collection, Iterable, Iterator
+from functools import cached_property
+from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+from mcap.records import Metadata
 from mcap.summary import Summary
 
 from reactorwatch.contract import keys
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import list_files
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder import RecordedMessage
 from recorder.files.index import LATEST_NS, read_summary, span_ns
-from recorder.files.metadata import CLOCK, NO_CLOCK, ZERO_NS, own_metadata, processes_in
+from recorder.files.metadata import CLOCK, NO_CLOCK, ZERO_NS, gaps_of, own_metadata, processes_in
 from recorder.files.part_file import PART, is_locked
 from recorder.files.reader import Reader, StoredMessage, Wanted, metadata_records
 
@@ -110,38 +114,131 @@ def merge_messages(
         yield from heapq.merge(*map(read, group), key=attrgetter("log_time_ns"))
 
 
-def read_messages(
-    path: Path, kinds: Collection[str] | None = None, plant: str | None = None
-) -> Iterator[RecordedMessage]:
-    """Messages of a recording in the order of receipt; those of equal time in the order of the file.
+class Recording:
+    """A recording: one file, or all files of a folder.
 
     Args:
         path: file or folder of any size; one chunk of each file is in memory at a time.
-        kinds: kinds to read, such as `keys.SAMPLE`; None for all, other programs' keys included.
-        plant: plant to read; None for all.
+
+    Attributes:
+        path: the file or folder.
+        files: the files in the order of their times.
+        live: file whose intact part is read, because it is still being recorded; None: the recording is complete.
 
     Raises:
-        InputError: the file does not exist, is no MCAP file, or is damaged. Damage within a chunk is raised when the
-            iteration reaches it.
+        InputError: the file does not exist, is no MCAP file, or is damaged; or the folder holds none. Damage within a
+            chunk is raised when messages or metadata are read from it.
     """
 
-    def is_selected(key: str) -> bool:
-        topic = keys.parse(key)
-        if topic is None:
-            return kinds is None and plant is None
-        return (kinds is None or topic.kind in kinds) and (plant is None or topic.plant == plant)
+    def __init__(self, path: Path) -> None:
+        self.path, self.live = path, live_file(path)
+        if not path.is_dir():
+            self._sources = open_sources([path])
+        elif self.live is not None:
+            self._sources = open_sources([self.live], tolerant=True)
+        else:
+            files = list_files(path, ".mcap")
+            if not files:
+                part = next(iter(list_files(path, PART)), None)
+                cure = f"; {part.name} is left of a recorder that was killed: `reactorwatch recover` it" if part else ""
+                raise InputError(f"{path}: holds no recording (.mcap){cure}")
+            sources = open_sources(files)
+            held = [source for source in sources if source.span != (0, 0)] or sources[:1]
+            self._sources = [source._replace(first=not index) for index, source in enumerate(held)]
+        self.files = [source.path for source in self._sources]
 
-    sources = _sources_in(path)  # not within a generator: errors are raised at the call
-    return (stored.recorded_message for stored in merge_messages(sources, wanted=is_selected))
+    def messages(self, kinds: Collection[str] | None = None, plant: str | None = None) -> Iterator[RecordedMessage]:
+        """Messages in the order of receipt; those of equal time in the order of the file.
 
+        Args:
+            kinds: kinds to read, such as `keys.SAMPLE`; None for all, other programs' keys included.
+            plant: plant to read; None for all.
+        """
 
-def recordings_in(path: Path) -> list[Path]:
-    """Files of a recording in the order of their times: the path itself, or the files in the folder.
+        def is_selected(key: str) -> bool:
+            topic = keys.parse(key)
+            if topic is None:
+                return kinds is None and plant is None
+            return (kinds is None or topic.kind in kinds) and (plant is None or topic.plant == plant)
 
-    Raises:
-        InputError: a file is damaged, or the folder holds none.
-    """
-    return [source.path for source in _sources_in(path)]
+        return (stored.recorded_message for stored in merge_messages(self._sources, wanted=is_selected))
+
+    @cached_property
+    def metadata_by_file(self) -> list[dict[str, str]]:
+        """Metadata of each file, empty if another program wrote it."""
+        return [own_metadata(records) for records in self._metadata_records]
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """Metadata of the first file."""
+        return self.metadata_by_file[0]
+
+    @property
+    def gaps(self) -> tuple[Gap, ...]:
+        """Messages lost on the bus before the recorder."""
+        return gaps_of(chain.from_iterable(self._metadata_records))
+
+    @cached_property
+    def processes(self) -> dict[str, Process]:
+        """Processes by plant, as the recording describes them."""
+        return processes_in(chain.from_iterable(self._metadata_records))
+
+    def process(self, plant: str | None) -> Process | None:
+        """Process of a plant, or of the only plant, as the recording describes it; None: it does not."""
+        found = self.processes
+        if plant is None:
+            return next(iter(found.values())) if len(found) == 1 else None
+        return found.get(plant)
+
+    @cached_property
+    def sample_topics(self) -> set[keys.Topic]:
+        """Topics of the samples."""
+        found: set[keys.Topic] = set()
+        for source in self._sources:
+            topics = {topic for topic, _ in source.topics}
+            if not topics:  # nothing was recorded, or the file's index does not say what
+                topics = {stored.channel.key for stored in Reader(source.path, tolerant=source.summary is None)}
+            parsed = map(keys.parse, topics)
+            found.update(topic for topic in parsed if topic is not None and topic.kind == keys.SAMPLE)
+        return found
+
+    @property
+    def plants(self) -> tuple[str, ...]:
+        """Plants with samples, in alphabetical order."""
+        return tuple(sorted({topic.plant for topic in self.sample_topics}))
+
+    def one_plant(self, plant: str | None = None) -> str:
+        """The given plant, or the only one.
+
+        Raises:
+            InputError: there are no samples, or none of the given plant, or several plants and none was given.
+        """
+        plants = self.plants
+        if not plants:
+            raise self.no_samples_error()
+        if plant is None and len(plants) > 1:
+            raise InputError(f"{self.path}: holds samples of several plants; name one of {', '.join(plants)}")
+        if plant is not None and plant not in plants:
+            raise InputError(f"{self.path}: holds no samples of plant {plant!r} (there are: {', '.join(plants)})")
+        return plant or plants[0]
+
+    def no_samples_error(self) -> InputError:
+        """Error of a recording without samples, with what is there instead in one of another program."""
+        text = f"{self.path}: holds no samples"
+        if self.metadata:
+            return InputError(text)
+        topics = {item for source in self._sources for item in source.topics}
+        found = sorted(f"{topic!r} ({encoding or 'no encoding'})" for topic, encoding in topics)
+        more = f" and {len(found) - MAX_TOPICS} more" if len(found) > MAX_TOPICS else ""
+        there = f"topics {', '.join(found[:MAX_TOPICS])}{more}" if found else "no index of its topics"
+        return InputError(
+            f"{text}: another program wrote it, with {there}; samples are messages reactorwatch.v1.Sample (protobuf) "
+            f"on {keys.ROOT}/PLANT/{keys.SAMPLE}/SIGNAL; convert it to a table, and `import` that"
+        )
+
+    @cached_property
+    def _metadata_records(self) -> list[list[Metadata]]:
+        return [metadata_records(file) for file in self.files]
 
 
 def live_file(folder: Path) -> Path | None:
@@ -149,97 +246,6 @@ def live_file(folder: Path) -> Path | None:
     if not folder.is_dir() or list_files(folder, ".mcap"):
         return None
     return next((file for file in reversed(list_files(folder, PART)) if is_locked(file)), None)
-
-
-def _sources_in(path: Path) -> list[SourceFile]:
-    if not path.is_dir():
-        return open_sources([path])
-    files = list_files(path, ".mcap")
-    live = live_file(path)
-    if not files and live is None:
-        left = next(iter(list_files(path, PART)), None)
-        cure = "" if left is None else f"; {left.name} is left of a recorder that was killed: `reactorwatch recover` it"
-        raise InputError(f"{path}: holds no recording (.mcap){cure}")
-    sources = open_sources(files) if live is None else open_sources([live], tolerant=True)
-    held = [source for source in sources if source.span != (0, 0)] or sources[:1]
-    return [source._replace(first=not index) for index, source in enumerate(held)]
-
-
-def sample_topics_in(path: Path) -> set[keys.Topic]:
-    """Topics of the samples in the recording.
-
-    Raises:
-        InputError: as `read_messages`.
-    """
-    found: set[keys.Topic] = set()
-    for source in _sources_in(path):
-        topics = {topic for topic, _ in source.topics}
-        if not topics:  # nothing was recorded, or the file's index does not say what
-            topics = {stored.channel.key for stored in Reader(source.path, tolerant=source.summary is None)}
-        parsed = map(keys.parse, topics)
-        found.update(topic for topic in parsed if topic is not None and topic.kind == keys.SAMPLE)
-    return found
-
-
-def plants_in(path: Path) -> tuple[str, ...]:
-    """Plants with samples in the recording, in alphabetical order.
-
-    Raises:
-        InputError: as `read_messages`.
-    """
-    return tuple(sorted({topic.plant for topic in sample_topics_in(path)}))
-
-
-def one_plant_in(path: Path, plant: str | None = None) -> str:
-    """The given plant, or the only one of the recording.
-
-    Raises:
-        InputError: there are no samples, or none of the given plant, or several plants and none was given.
-    """
-    plants = plants_in(path)
-    if not plants:
-        raise no_samples_error(path)
-    if plant is None and len(plants) > 1:
-        raise InputError(f"{path}: holds samples of several plants; name one of {', '.join(plants)}")
-    if plant is not None and plant not in plants:
-        raise InputError(f"{path}: holds no samples of plant {plant!r} (there are: {', '.join(plants)})")
-    return plant or plants[0]
-
-
-def no_samples_error(path: Path) -> InputError:
-    """Error of a recording without samples, with what is there instead in one of another program."""
-    text = f"{path}: holds no samples"
-    if read_metadata(path):
-        return InputError(text)
-    topics = {item for source in _sources_in(path) for item in source.topics}
-    found = sorted(f"{topic!r} ({encoding or 'no encoding'})" for topic, encoding in topics)
-    more = f" and {len(found) - MAX_TOPICS} more" if len(found) > MAX_TOPICS else ""
-    there = f"topics {', '.join(found[:MAX_TOPICS])}{more}" if found else "no index of its topics"
-    return InputError(
-        f"{text}: another program wrote it, with {there}; samples are messages reactorwatch.v1.Sample (protobuf) on "
-        f"{keys.ROOT}/PLANT/{keys.SAMPLE}/SIGNAL; convert it to a table, and `import` that"
-    )
-
-
-def read_metadata(path: Path) -> dict[str, str]:
-    """Metadata of the recording, or of the first file of a folder; empty if another program wrote it.
-
-    Raises:
-        InputError: as `read_messages`.
-    """
-    return own_metadata(metadata_records(recordings_in(path)[0]))
-
-
-def recorded_process(path: Path, plant: str | None) -> Process | None:
-    """Process of a plant, or of the only plant, as the recording describes it; None: it does not.
-
-    Raises:
-        InputError: as `read_messages`.
-    """
-    found = processes_in(record for file in recordings_in(path) for record in metadata_records(file))
-    if plant is None:
-        return next(iter(found.values())) if len(found) == 1 else None
-    return found.get(plant)
 
 
 def zero_from(metadata: dict[str, str], first_ns: int) -> int:

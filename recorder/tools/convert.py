@@ -26,15 +26,7 @@ from recorder import RecordedMessage
 from recorder.columns.run import signal_roles
 from recorder.columns.samples import ContinuousTime, SampleSeries, decode_messages
 from recorder.files.metadata import CLOCK, NO_CLOCK, PROCESS, ZERO_NS, process_metadata
-from recorder.files.recording import (
-    has_clock,
-    live_file,
-    one_plant_in,
-    read_messages,
-    read_metadata,
-    recorded_process,
-    zero_from,
-)
+from recorder.files.recording import Recording, has_clock, zero_from
 from recorder.files.writer import RecordingWriter
 from recorder.tools.player import samples_of
 
@@ -147,29 +139,29 @@ def read_record(path: Path, plant: str | None = None, process: Process | None = 
         first sample of the first run.
 
     Raises:
-        InputError: as `read_messages` and `one_plant_in`; or there are no samples of the process.
+        InputError: as `Recording` and its `one_plant`; or there are no samples of the process.
     """
-    plant = one_plant_in(path, plant)
+    recording = Recording(path)
+    plant = recording.one_plant(plant)
     wanted = None if process is None else {signal.name for signal in process.signals}
     series = SampleSeries()
-    for topic, sample in decode_messages(read_messages(path, {keys.SAMPLE}, plant)):
+    for topic, sample in decode_messages(recording.messages({keys.SAMPLE}, plant)):
         if isinstance(sample, Sample) and (wanted is None or topic.name in wanted):
             series.add(topic.name, sample)
     runs, splitter, units = series.runs, series.splitter, series.units
     if not runs:
         sought = "that can be used" if process is None else f"of {', '.join(item.name for item in process.signals)}"
         raise InputError(f"{path}: holds no samples {sought} of plant {plant!r}")
-    metadata = read_metadata(path)
+    metadata, live = recording.metadata, recording.live
     zero_ns = zero_from(metadata, splitter.runs[0].first_ns)
     present = {name: units.get(name, "") for of_run in runs for name in of_run}
     needed = () if process is None else (*process.inputs, *process.outputs)
-    if process is None and (process := recorded_process(path, plant)) is not None:
+    if process is None and (process := recording.process(plant)) is not None:
         needed = tuple(signal.name for signal in process.signals)
     columns = signal_roles({**dict.fromkeys(needed, ""), **present}, process)
     full = [of_run for of_run in runs if any(times for times, _ in of_run.values())]
     rows = [_rows(of_run, columns, zero_ns, path.name) for of_run in full]
     clock_ns = zero_ns if has_clock(metadata) else 0
-    live = live_file(path)
     read_as = "" if live is None else f"the intact part of {live.name}, which is still being recorded"
     return replace(join_runs(rows), zero_ns=clock_ns, strays=splitter.strays, units=units, read_as=read_as)
 

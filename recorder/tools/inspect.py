@@ -13,14 +13,8 @@ from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder import RecordedMessage
 from recorder.columns.samples import Run, RunSplitter, content_of
 from recorder.files.metadata import gaps_of, own_metadata, processes_in
-from recorder.files.reader import Reader, metadata_records
-from recorder.files.recording import (
-    live_file,
-    read_messages,
-    read_metadata,
-    recordings_in,
-    zero_from,
-)
+from recorder.files.reader import Reader, read_start
+from recorder.files.recording import Recording, zero_from
 
 MAX_GAPS = 1000
 """Gaps that are listed; more are counted only."""
@@ -256,50 +250,46 @@ def inspect(path: Path) -> FileInfo:
     Raises:
         InputError: it is no recording, or a file of the folder is damaged.
     """
-    damages: list[str] = []
-    live = live_file(path)
-    reader = Reader(recordings_in(path)[0] if path.is_dir() else path, tolerant=True)
     if path.is_dir():
-        found, metadata = overview(read_messages(path)), read_metadata(path)
-        records = [record for file in recordings_in(path) for record in metadata_records(file)]
-        next(iter(reader), None)  # its header
-    else:
-        found = overview(stored.recorded_message for stored in reader)
-        records, metadata = reader.metadata, own_metadata(reader.metadata)
-        damages += map(str, reader.damages)
-        if reader.orphans:
-            damages.append(f"{reader.orphans} messages of channels that are described nowhere")
-    zero_ns = zero_from(metadata, found.starts_ns or 0)
+        recording = Recording(path)
+        found, start = overview(recording.messages()), read_start(recording.files[0])
+        return FileInfo(
+            overview=found,
+            metadata=recording.metadata,
+            zero_ns=zero_from(recording.metadata, found.starts_ns or 0),
+            damages=(),
+            gaps=recording.gaps,
+            processes=recording.processes,
+            profile=start.profile,
+            library=start.library,
+            attachments=tuple(attached.name for attached in start.attachments()),
+            live="" if recording.live is None else recording.live.name,
+        )
+    reader = Reader(path, tolerant=True)
+    found = overview(stored.recorded_message for stored in reader)
+    metadata, damages = own_metadata(reader.metadata), list(map(str, reader.damages))
+    if reader.orphans:
+        damages.append(f"{reader.orphans} messages of channels that are described nowhere")
     return FileInfo(
         overview=found,
         metadata=metadata,
-        zero_ns=zero_ns,
+        zero_ns=zero_from(metadata, found.starts_ns or 0),
         damages=tuple(damages),
-        gaps=gaps_of(records),
-        processes=processes_in(records),
+        gaps=gaps_of(reader.metadata),
+        processes=processes_in(reader.metadata),
         profile=reader.profile,
         library=reader.library,
         attachments=tuple(attached.name for attached in reader.attachments()),
-        live="" if live is None else live.name,
     )
 
 
-def gaps_in(path: Path) -> tuple[Gap, ...]:
-    """Messages lost on the bus before the recorder, from the metadata of a file or a folder.
-
-    Raises:
-        InputError: a file is damaged.
-    """
-    return gaps_of(record for file in recordings_in(path) for record in metadata_records(file))
-
-
-def zero_ns_of(path: Path) -> int:
+def zero_ns_of(recording: Recording) -> int:
     """Time that minutes of a recording count from: its metadata, else the first sample of its first run.
 
     Raises:
         InputError: it holds no sample, or it is damaged.
     """
-    starts_ns = overview(read_messages(path, {keys.SAMPLE})).starts_ns
+    starts_ns = overview(recording.messages({keys.SAMPLE})).starts_ns
     if starts_ns is None:
-        raise InputError(f"{path}: holds no sample")
-    return zero_from(read_metadata(path), starts_ns)
+        raise InputError(f"{recording.path}: holds no sample")
+    return zero_from(recording.metadata, starts_ns)

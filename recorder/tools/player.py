@@ -7,14 +7,14 @@ before is published at once. After the plant's clock stepped back, the next run 
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Container, Iterable, Iterator
-from typing import NamedTuple, cast
+from typing import cast
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply
-from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS, Record, to_time_ns
 from recorder import RecordedMessage
 from recorder.columns.samples import ContinuousTime, decode_messages
@@ -122,30 +122,19 @@ def filter_time(publications: Iterable[Publication], from_ns: int, to_ns: int) -
             yield publication
 
 
-class _Scheduled(NamedTuple):
-    """Publication with its continuous time."""
-
-    publication: Publication
-    time_ns: int
-
-
-def _schedule(tape: Iterable[Publication]) -> Iterator[_Scheduled]:
+def _schedule(tape: Iterable[Publication]) -> Iterator[tuple[Publication, int]]:
     """Add to each publication its time, continuous over the runs of its plant."""
-    clocks: dict[str, ContinuousTime] = {}
+    clocks = defaultdict[str, ContinuousTime](ContinuousTime)
     first: list[Publication] | None = []  # alarms before all else: they are due with what follows them
     for publication in tape:
         if first is not None and isinstance(publication.message, messages.Alarm):
             first.append(publication)
             continue
-        plant = publication.key.split("/", 2)[1]
-        clock = clocks.get(plant)
-        if clock is None:
-            clock = clocks[plant] = ContinuousTime()
-        time_ns = clock.continuous_ns(*publication)
-        yield from (_Scheduled(alarm, time_ns) for alarm in first or ())
+        time_ns = clocks[publication.key.split("/", 2)[1]].continuous_ns(*publication)
+        yield from ((alarm, time_ns) for alarm in first or ())
         first = None
-        yield _Scheduled(publication, time_ns)
-    yield from (_Scheduled(alarm, alarm.message.time_ns) for alarm in first or ())
+        yield publication, time_ns
+    yield from ((alarm, alarm.message.time_ns) for alarm in first or ())
 
 
 class Player:
@@ -171,25 +160,21 @@ class Player:
         loop: bool = False,
         on_wait: Callable[[float], None] = lambda _wait_s: None,
     ) -> None:
-        self._open_tape, self._on_wait = open_tape, on_wait
+        self._open_tape, self._on_wait, self._loop = open_tape, on_wait, loop
+        self.rate, self.paused, self.published = rate, False, 0
         self._tape = _schedule(open_tape())
-        self.rate = rate
-        self._loop = loop
-        self.paused = False
         self._next = next(self._tape, None)
-        self._first_ns = self._next.time_ns if self._next is not None else 0
+        self._first_ns = 0 if self._next is None else self._next[1]
         self._spacing_ns, self._is_jump = 0, False  # between the last two rows
         self._anchor: tuple[int, int] | None = None  # (clock time, plant time) of one moment
-        self.published = 0
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Publish due messages; the first call starts the replay."""
         if self._next is not None and self._anchor is None:
-            self._anchor = now_ns, self._next.time_ns
+            self._anchor = now_ns, self._next[1]
         due: list[Publication] = []
         while self._next is not None and len(due) < BATCH and self.next_tick_ns() <= now_ns:
-            due.append(self._take(self._next))
-        self.published += len(due)
+            due.append(self._take(*self._next))
         if due and self._next is not None and self._is_jump and not self.paused:
             wait_ns = self.next_tick_ns() - now_ns
             if wait_ns > LONG_WAIT_NS:
@@ -203,7 +188,7 @@ class Player:
         if self._anchor is None or self._next is None:
             return 0
         clock_ns, plant_ns = self._anchor
-        return clock_ns + round((self._next.time_ns - plant_ns) / self.rate)
+        return clock_ns + round((self._next[1] - plant_ns) / self.rate)
 
     @property
     def finished(self) -> bool:
@@ -222,38 +207,22 @@ class Player:
         """Publish nothing."""
         return []
 
-    def pause(self, now_ns: int) -> None:
-        """Publish nothing until it is resumed or stepped."""
-        self._hold_position(now_ns)
-        self.paused = True
+    def set_pace(self, now_ns: int, *, rate: float | None = None, paused: bool | None = None) -> None:
+        """Change the rate, pause, or resume after the rest of the time to the next message."""
+        plant_ns = self._plant_time_ns(now_ns)
+        if plant_ns is not None:
+            self._anchor = now_ns, plant_ns
+        self.rate = self.rate if rate is None else rate
+        self.paused = self.paused if paused is None else paused
 
-    def resume(self, now_ns: int) -> None:
-        """Go on, after the rest of the time to the next message."""
-        self._hold_position(now_ns)
-        self.paused = False
-
-    def set_rate(self, rate: float, now_ns: int) -> None:
-        """Change the rate.
-
-        Raises:
-            InputError: the rate is not positive.
-        """
-        if not rate > 0.0:
-            raise InputError(f"rate must be positive, got {rate:g}")
-        self._hold_position(now_ns)
-        self.rate = rate
-
-    def step(self, rows: int, now_ns: int) -> list[Publication]:
-        """Publish the next rows.
-
-        Raises:
-            InputError: the replay is not paused.
-        """
-        if not self.paused:
-            raise InputError("the replay is not paused; pause it before a step")
-        stepped = [publication for _ in range(rows) for publication in self._play_row(now_ns)]
-        self.published += len(stepped)
-        return stepped
+    def step(self, now_ns: int) -> list[Publication]:
+        """Publish the next row of a paused replay: all messages of the next time."""
+        row: list[Publication] = []
+        at_ns = self._next[1] if self._next is not None and self.paused else None
+        while self._next is not None and self._next[1] == at_ns:
+            self._anchor = now_ns, self._next[1]
+            row.append(self._take(*self._next))
+        return row
 
     @property
     def status(self) -> str:
@@ -261,41 +230,27 @@ class Player:
         state = "at the end" if self._next is None else "paused" if self.paused else "playing"
         return f"{state} at {self.rate:g} times the plant's pace"
 
-    def position_min(self, now_ns: int) -> float:
-        """Plant time since the first message (min); NaN before the start and at the end."""
+    def position_min(self, now_ns: int) -> float | None:
+        """Plant time since the first message (min); None before the start and at the end."""
         plant_ns = self._plant_time_ns(now_ns)
-        return math.nan if plant_ns is None else (plant_ns - self._first_ns) / MINUTE_NS
-
-    def _hold_position(self, now_ns: int) -> None:
-        """Let a new rate or pause count from the current plant time."""
-        plant_ns = self._plant_time_ns(now_ns)
-        if plant_ns is not None:
-            self._anchor = now_ns, plant_ns
+        return None if plant_ns is None else (plant_ns - self._first_ns) / MINUTE_NS
 
     def _plant_time_ns(self, now_ns: int) -> int | None:
         """Current plant time, at most that of the next message; None before the start."""
         if self._anchor is None or self._next is None:
             return None
         clock_ns, plant_ns = self._anchor
-        next_ns = self._next.time_ns
-        if self.paused or math.isinf(self.rate):
-            return plant_ns if self.paused else next_ns
-        return min(next_ns, plant_ns + round((now_ns - clock_ns) * self.rate))
+        if self.paused:
+            return plant_ns
+        next_ns = self._next[1]
+        return next_ns if math.isinf(self.rate) else min(next_ns, plant_ns + round((now_ns - clock_ns) * self.rate))
 
-    def _play_row(self, now_ns: int) -> list[Publication]:
-        """Publish all messages of the next time."""
-        row: list[Publication] = []
-        first_ns = self._next.time_ns if self._next is not None else 0
-        while self._next is not None and self._next.time_ns == first_ns:
-            self._anchor = now_ns, first_ns
-            row.append(self._take(self._next))
-        return row
-
-    def _take(self, due: _Scheduled) -> Publication:
+    def _take(self, publication: Publication, time_ns: int) -> Publication:
         """Advance to the next message, at the end of a loop to the first."""
+        self.published += 1
         self._next = next(self._tape, None)
         if self._next is not None:
-            spacing_ns = self._next.time_ns - due.time_ns
+            spacing_ns = self._next[1] - time_ns
             self._is_jump = spacing_ns > JUMP * self._spacing_ns
             self._spacing_ns = spacing_ns or self._spacing_ns
         elif self._loop:
@@ -303,5 +258,5 @@ class Player:
             self._next = next(self._tape, None)
             if self._next is not None and self._anchor is not None:
                 clock_ns, plant_ns = self._anchor
-                self._anchor = clock_ns, plant_ns - (due.time_ns + max(self._spacing_ns, 0) - self._next.time_ns)
-        return due.publication
+                self._anchor = clock_ns, plant_ns - (time_ns + max(self._spacing_ns, 0) - self._next[1])
+        return publication

@@ -30,18 +30,14 @@ from reactorwatch.runtime.liveliness import wait_alive
 from reactorwatch.runtime.node_main import main
 from reactorwatch.runtime.start import instance_name, join
 from recorder.config import ReplayConfig
-from recorder.files.recording import no_samples_error, read_messages, sample_topics_in
+from recorder.files.recording import Recording
 from recorder.tools.convert import plant_name
 from recorder.tools.inspect import zero_ns_of
-from recorder.tools.player import (
-    EVERYTHING,
-    SAMPLES,
-    Player,
-    filter_playable,
-    filter_time,
-    samples_of,
-)
+from recorder.tools.player import EVERYTHING, SAMPLES, Player, filter_playable, filter_time, samples_of
 
+log = structlog.get_logger()
+
+NODE = "replay"
 REFRESH_S = 0.25
 RATES = (1e-3, 1e6)
 """Slowest and fastest rate that keys set."""
@@ -108,21 +104,18 @@ def _read_keys(player: Player, loop: EventLoop, keyboard: int, end: int) -> None
 
 def _act(player: Player, key: bytes, now_ns: int) -> list[Publication]:
     if key == _SPACE:
-        (player.resume if player.paused else player.pause)(now_ns)
+        player.set_pace(now_ns, paused=not player.paused)
     elif key in (_UP, _DOWN):
         slowest, fastest = RATES
-        player.set_rate(min(max(player.rate * (2.0 if key == _UP else 0.5), slowest), fastest), now_ns)
+        player.set_pace(now_ns, rate=min(max(player.rate * (2.0 if key == _UP else 0.5), slowest), fastest))
     else:
-        try:
-            return player.step(1, now_ns)
-        except InputError:  # it is playing: there the next row comes by itself
-            return []
+        return player.step(now_ns)
     return []
 
 
 def _show_position(player: Player, now_ns: int) -> list[Publication]:
     minutes = player.position_min(now_ns)
-    if minutes == minutes:  # not before the start, nor at the end
+    if minutes is not None:
         _show(f"{minutes:.1f} min, {player.status} ({HELP})")
     return []
 
@@ -132,13 +125,6 @@ def _show(text: str) -> None:
     width = os.get_terminal_size(sys.stderr.fileno()).columns or 80
     sys.stderr.write(f"{_TO_LINE_START}{text[: width - 1]}{_CLEAR_REST}{_TO_LINE_START}")
     sys.stderr.flush()
-
-
-__all__ = ["Player", "ReplayConfig", "replay", "run_replay", "samples_of"]
-
-log = structlog.get_logger()
-
-NODE = "replay"
 
 
 def run_replay(config: ReplayConfig, bus_config: BusConfig) -> None:
@@ -191,10 +177,8 @@ def open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Itera
     """
     path, choice = Path(config.file), ProcessChoice(config.process, config.inputs, config.outputs)
     if is_table(path):
-        plant, record = (
-            plant_name(config.plant, choice.load()),
-            read_signals(path, choice, config.columns, config.table),
-        )
+        plant = plant_name(config.plant, choice.load())
+        record = read_signals(path, choice, config.columns, config.table)
         _check_signals(path, record.columns)
         if record.read_as:
             log.info("read as", file=config.file, form=record.read_as)
@@ -203,10 +187,11 @@ def open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Itera
         zero_ns = record.stored_zero_ns
         return (plant,), lambda: filter_time(samples_of(record, plant, zero_ns), *_span_ns(config, zero_ns))
     signals = None if choice.is_default else {signal.name for signal in choice.load().signals}
-    topics = [topic for topic in sample_topics_in(path) if signals is None or topic.name in signals]
+    recording = Recording(path)
+    topics = [topic for topic in recording.sample_topics if signals is None or topic.name in signals]
     plants = tuple(sorted({topic.plant for topic in topics}))
     if not plants:
-        raise no_samples_error(path)
+        raise recording.no_samples_error()
     if not config.plant:
         for plant in plants:
             try:
@@ -218,10 +203,10 @@ def open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Itera
         raise InputError(f"{path}: holds samples of {', '.join(plants)}; they cannot all be played as {config.plant!r}")
     kinds = EVERYTHING if config.everything else SAMPLES
     whole = (config.from_min, config.to_min) == (-inf, inf)
-    from_ns, to_ns = _span_ns(config, 0 if whole else zero_ns_of(path))
+    from_ns, to_ns = _span_ns(config, 0 if whole else zero_ns_of(recording))
 
     def tape() -> Iterator[Publication]:
-        played = filter_playable(read_messages(path, kinds), config.plant, kinds, signals)
+        played = filter_playable(recording.messages(kinds), config.plant, kinds, signals)
         return filter_time(played, from_ns, to_ns)
 
     return (config.plant,) if config.plant else plants, tape

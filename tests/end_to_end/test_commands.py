@@ -15,7 +15,7 @@ from reactorwatch.contract.messages_pb2 import CommandReply, InjectFault, SetInp
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 from tests.tables import read_csv
 
 from .conftest import PATIENCE_S, Command, Start, WaitAlive
@@ -188,7 +188,7 @@ def test_up_runs_until_ctrl_c_and_closes_its_files(endpoint: str, start: Start, 
     (recording,) = folder.glob("*.mcap")
     assert recording.name.startswith("R-101-")
     assert not list(folder.glob("*.part"))
-    kinds = {entry.key.split("/")[2] for entry in read_messages(recording)}
+    kinds = {entry.key.split("/")[2] for entry in Recording(recording).messages()}
     assert {"sample", "health"} <= kinds
 
 

@@ -17,7 +17,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Estimate, Fault, Health, ModelSnapshot, Sample
 from reactorwatch.records.record import to_time_ns
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 
 from .conftest import COMMAND_WITHIN_S, REACTORWATCH
 
@@ -39,7 +39,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 @pytest.fixture(scope="module")
 def recorded(demo: tuple[Path, str]) -> list[Encoded]:
     """Everything in its recording, in order of receipt."""
-    return [Encoded(*entry[:4]) for entry in read_messages(demo[0] / "demo.mcap")]
+    return [Encoded(*entry[:4]) for entry in Recording(demo[0] / "demo.mcap").messages()]
 
 
 def bodies(recorded: list[Encoded], kind: type[B]) -> list[B]:

@@ -17,7 +17,7 @@ from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_port
 from reactorwatch.runtime.security.provisioning import make_site
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 
 from .conftest import PATIENCE_S, Command, Start
 
@@ -49,7 +49,7 @@ def test_a_demonstration_runs_on_a_secured_router_and_each_node_has_its_own_cert
         assert joined.endpoint.startswith("tls/")
         assert joined.certificate == str(site / "demo" / node / "certificate.pem")
     assert bus_of(run / "settings.toml").certificate == str(site / "demo" / "viewer" / "certificate.pem")
-    bodies = [decode(entry.payload, entry.encoding) for entry in read_messages(run / "demo.mcap", plant="demo")]
+    bodies = [decode(entry.payload, entry.encoding) for entry in Recording(run / "demo.mcap").messages(plant="demo")]
     assert sum(isinstance(body, Sample) for body in bodies) == 3 * 1600
     assert {body.node for body in bodies if isinstance(body, Health)} == set(NODES)
 
@@ -87,7 +87,7 @@ def test_up_admits_clients_with_a_certificate_and_no_others(site: Path, tmp_path
     process.terminate()
     assert process.wait(PATIENCE_S) == 0
     (recording,) = (tmp_path / "runs").glob("*.mcap")
-    kinds = {entry.key.split("/")[2] for entry in read_messages(recording)}
+    kinds = {entry.key.split("/")[2] for entry in Recording(recording).messages()}
     assert {"sample", "health"} <= kinds
     (written,) = (tmp_path / "runs").glob("*.plant.toml")
     assert tomllib.loads(written.read_text())["recorder"]["key_expression"] == "reactor/cstr/**"

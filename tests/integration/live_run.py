@@ -22,7 +22,7 @@ from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 from recorder.config import RecorderConfig
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 from recorder.tools.player import samples_of
 
 WITHIN_S = 120.0
@@ -129,7 +129,7 @@ class LiveRun:
 
     def recorded_alarms(self) -> list[Change]:
         """Changes of alarms in the recording; messages repeated after a restart count once."""
-        recorded = [decode(item.payload, item.encoding) for item in read_messages(self.recording, {keys.ALARM})]
+        recorded = [decode(item.payload, item.encoding) for item in Recording(self.recording).messages({keys.ALARM})]
         return list(dict.fromkeys(_changes(item for item in recorded if isinstance(item, Alarm))))
 
     def expected_alarms(self) -> list[Change]:

@@ -18,7 +18,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, Estimate
 from reactorwatch.description.find import find_process
 from reactorwatch.runtime.loopback import free_endpoint
 from recorder.columns.run_reader import read_segments
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 from recorder.panels import signals
 from recorder.panels.base import TimePlot
 from recorder.tools.convert import export_csv
@@ -67,7 +67,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def alarms(recording: Path) -> list[Alarm]:
-    found = [decode(item.payload, item.encoding) for item in read_messages(recording, {keys.ALARM})]
+    found = [decode(item.payload, item.encoding) for item in Recording(recording).messages({keys.ALARM})]
     return [item for item in found if isinstance(item, Alarm)]
 
 
@@ -76,7 +76,7 @@ def test_a_described_plant_is_watched_by_its_equations(rig: Path) -> None:
     raised = [item for item in alarms(rig) if item.event == "raised"]
     assert raised
     assert min(item.time_ns for item in raised) - inspect(rig).zero_ns >= 30 * 60e9
-    found = [decode(item.payload, item.encoding) for item in read_messages(rig, {keys.ESTIMATE})]
+    found = [decode(item.payload, item.encoding) for item in Recording(rig).messages({keys.ESTIMATE})]
     judged = [item for item in found if isinstance(item, Estimate)]
     assert {item.unit for item in judged} == {"cm"}
 

@@ -10,7 +10,7 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.event_loop import StopSignal
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 
 from .compose import NODES, SECURE, Services, run_nodes, services_of
 from .site import Site, settings
@@ -45,7 +45,7 @@ def test_every_service_s_command_and_health_check_work(services: Services, tmp_p
         with closing(viewer):
             run_nodes(services, viewer, outside)
     (file,) = recordings.glob("cstr-*.mcap")
-    kinds = {entry.key.split("/")[2] for entry in read_messages(file)}
+    kinds = {entry.key.split("/")[2] for entry in Recording(file).messages()}
     assert {keys.SAMPLE, keys.ESTIMATE, keys.HEALTH} <= kinds
 
 

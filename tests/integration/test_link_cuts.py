@@ -31,7 +31,7 @@ from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
-from recorder.files.recording import recordings_in
+from recorder.files.recording import Recording
 from recorder.tools.inspect import inspect
 
 RATE_PER_S = 1000
@@ -187,7 +187,7 @@ def test_a_restarted_recorder_loses_nothing_and_repeats_nothing(tmp_path: Path, 
     finally:
         publisher.close()
         bus.close()
-    files = recordings_in(tmp_path)
+    files = Recording(tmp_path).files
     assert len(files) == 2
     found = read_content(files, publisher)
     assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)

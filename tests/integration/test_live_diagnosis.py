@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import structlog
 
-from diagnosis_node.__main__ import Command, DiagnosisRunner
+from diagnosis_node.__main__ import DiagnosisRunner
 from diagnosis_node.trigger import DiagnosisConfig, DiagnosisTrigger
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -16,19 +16,19 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.records.record import Record
-from recorder.tools.replay import samples_of
+from recorder.tools.player import samples_of
 from tests.memory_bus import Exchange, MemoryBus
 
 ZERO_NS = 1_780_000_000 * 10**9
 
 
-def watched(record: Record, out: Path, run: Command) -> DiagnosisRunner:
+def watched(record: Record, out: Path, kind: type[DiagnosisRunner] = DiagnosisRunner) -> DiagnosisRunner:
     """Plays a record onto a bus that a monitor and a diagnosis hear; each diagnosis ends before the next sample."""
     exchange = Exchange()
     bus = MemoryBus(exchange)
     monitor = Monitor(MonitorConfig(training_min=60.0), 0)
     config = DiagnosisConfig(out=str(out), window_min=100.0, after_min=25.0, tolerance={"T": 0.2, "C": 0.001})
-    diagnoses = DiagnosisRunner(config, out, run)
+    diagnoses = kind(config)
     node = DiagnosisTrigger(config, diagnoses.start, lambda: diagnoses.busy)
     samples, alarms = (keys.all_keys("cstr", kind) for kind in (keys.SAMPLE, keys.ALARM))
 
@@ -56,7 +56,7 @@ def leaking() -> Record:
 def test_after_an_alarm_there_is_a_report_that_names_the_leak(leaking: Record, tmp_path: Path) -> None:
     out = tmp_path / "reports"
     with structlog.testing.capture_logs() as logs:
-        watched(leaking, out, Command())
+        watched(leaking, out)
     (folder,) = out.iterdir()
     assert folder.name.startswith("cstr-2026")
     assert {path.name for path in folder.iterdir()} == {
@@ -76,12 +76,12 @@ def test_after_an_alarm_there_is_a_report_that_names_the_leak(leaking: Record, t
 
 
 def test_a_diagnosis_that_fails_is_reported_and_the_next_one_is_done(leaking: Record, tmp_path: Path) -> None:
-    class Failing(Command):
-        def __call__(self, arguments: list[str]) -> tuple[int, str, str]:
+    class Failing(DiagnosisRunner):
+        def execute(self, arguments: list[str]) -> tuple[int, str, str]:
             return 2, "", "warning: something\nreactorwatch: record.mcap: T must vary\n"
 
     with structlog.testing.capture_logs() as logs:
-        diagnoses = watched(leaking, tmp_path / "reports", Failing())
+        diagnoses = watched(leaking, tmp_path / "reports", Failing)
     (said,) = [item for item in logs if item["event"] == "not diagnosed"]
     assert said["log_level"] == "warning"
     assert said["why"] == "reactorwatch: record.mcap: T must vary"
@@ -91,19 +91,19 @@ def test_a_diagnosis_that_fails_is_reported_and_the_next_one_is_done(leaking: Re
 def test_a_folder_that_cannot_be_made_is_reported(leaking: Record, tmp_path: Path) -> None:
     (tmp_path / "reports").write_text("a file")
     with structlog.testing.capture_logs() as logs:
-        watched(leaking, tmp_path / "reports", Command())
+        watched(leaking, tmp_path / "reports")
     (said,) = [item for item in logs if item["event"] == "not diagnosed"]
     assert "the folder cannot be made" in said["why"]
 
 
 def test_a_second_report_of_the_same_moment_does_not_overwrite_the_first(leaking: Record, tmp_path: Path) -> None:
-    class Nothing(Command):
-        def __call__(self, arguments: list[str]) -> tuple[int, str, str]:
+    class Nothing(DiagnosisRunner):
+        def execute(self, arguments: list[str]) -> tuple[int, str, str]:
             return 2, "", "nothing"
 
     short = Record(leaking.time_min[:1500], {k: v[:1500] for k, v in leaking.columns.items()}, "short")
     for _ in range(2):
-        watched(short, tmp_path / "reports", Nothing())
+        watched(short, tmp_path / "reports", Nothing)
     names = sorted(path.name for path in (tmp_path / "reports").iterdir())
     assert len(names) == 2
     assert names[1] == f"{names[0]}-2"

@@ -22,7 +22,7 @@ from reactorwatch.runtime.event_loop import StopSignal
 from recorder import RecordedMessage
 from recorder.__main__ import record
 from recorder.config import RecorderConfig, ReplayConfig
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.replay import replay
 from tests.running import WITHIN_S, running
@@ -52,7 +52,7 @@ def samples(count: int) -> Iterator[Encoded]:
 
 
 def of_others(path: Path) -> list[RecordedMessage]:
-    return [entry for entry in read_messages(path) if not entry.key.endswith("health/recorder")]
+    return [entry for entry in Recording(path).messages() if not entry.key.endswith("health/recorder")]
 
 
 def test_a_burst_is_recorded_without_a_loss_and_in_order(tmp_path: Path, bus_config: BusConfig) -> None:
@@ -66,7 +66,7 @@ def test_a_burst_is_recorded_without_a_loss_and_in_order(tmp_path: Path, bus_con
             plant.publish(message)
         assert heard.wait(len(sent))
     assert [(entry.key, entry.payload, entry.encoding) for entry in of_others(path)] == [item[:3] for item in sent]
-    last = list(read_messages(path))[-1]
+    last = list(Recording(path).messages())[-1]
     health = decode(last.payload, last.encoding)
     assert isinstance(health, messages.Health)
     assert (health.phase, health.lost, health.duplicated, health.refused) == ("stopped", 0, 0, 0)

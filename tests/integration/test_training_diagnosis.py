@@ -11,7 +11,7 @@ from reactorwatch.cli.verification import run
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Baseline
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 
 from .live_run import LiveRun
 
@@ -37,7 +37,7 @@ def test_a_live_training_is_diagnosed_and_the_change_of_the_model_is_recorded_an
         plant.terminate()
         plant.wait()
         assert live.nodes.stop(["monitor", "recorder"]) == {"monitor": 0, "recorder": 0}
-    (recorded,) = [decode(item.payload, item.encoding) for item in read_messages(live.recording, {keys.BASELINE})]
+    (recorded,) = [decode(item.payload, item.encoding) for item in Recording(live.recording).messages({keys.BASELINE})]
     assert isinstance(recorded, Baseline)
     assert recorded == decode(changes[0].payload, changes[0].encoding)
     (effect,) = msgspec.json.decode(recorded.model)["effects"]

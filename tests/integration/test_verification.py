@@ -18,7 +18,7 @@ from reactorwatch.version import UNKNOWN, build_metadata, describe_build
 from recorder import RecordedMessage
 from recorder.files.copies import cut, recover, sample_window
 from recorder.files.metadata import GAP, gap_metadata
-from recorder.files.recording import read_messages, read_metadata, recordings_in
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 
 from .watched_hour import ROWS, START_NS, record_hour
@@ -42,25 +42,27 @@ def verified(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, Repor
 
 
 def recorded(path: Path, kind: str) -> int:
-    return sum(1 for entry in read_messages(path, {kind}) if not entry.latched)
+    return sum(1 for entry in Recording(path).messages({kind}) if not entry.latched)
 
 
 def events(path: Path) -> set[tuple[str, str]]:
-    alarms = (decode(entry.payload, entry.encoding) for entry in read_messages(path, {keys.ALARM}))
+    alarms = (decode(entry.payload, entry.encoding) for entry in Recording(path).messages({keys.ALARM}))
     return {(alarm.alarm, alarm.event) for alarm in alarms if isinstance(alarm, Alarm)}
 
 
 def rewritten(path: Path, out: Path, change: Change) -> Path:
     """The recording with its messages changed; those for which None is returned are left out."""
-    with RecordingWriter(out, read_metadata(path)) as writer:
-        for entry in read_messages(path):
+    with RecordingWriter(out, Recording(path).metadata) as writer:
+        for entry in Recording(path).messages():
             if (changed := change(entry)) is not None:
                 writer.write(changed)
     return out
 
 
 def first_after(path: Path, key: str, minutes: float) -> RecordedMessage:
-    return next(e for e in read_messages(path) if e.key == key and e.publish_time_ns >= START_NS + minutes * 60e9)
+    return next(
+        e for e in Recording(path).messages() if e.key == key and e.publish_time_ns >= START_NS + minutes * 60e9
+    )
 
 
 def test_an_hour_with_faults_is_reproduced_value_for_value(hour: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -94,7 +96,7 @@ def test_commands_and_alarms_of_the_clock_are_reproduced_too(hour: Path) -> None
 
 def test_a_rotated_run_is_exact_as_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record_hour(tmp_path, rotate_min=0.2, black_box_min=0.0).stop()
-    assert len(recordings_in(tmp_path)) >= 4
+    assert len(Recording(tmp_path).files) >= 4
     code, report = verified(tmp_path, capsys)
     assert (code, report["rows"], report["differing"]) == (0, ROWS, 0)
 
@@ -102,7 +104,7 @@ def test_a_rotated_run_is_exact_as_a_folder(tmp_path: Path, capsys: pytest.Captu
 def test_its_second_file_alone_cannot_be_verified_and_the_reason_is_reported(tmp_path: Path) -> None:
     record_hour(tmp_path, rotate_min=0.5, black_box_min=0.0).stop()
     with pytest.raises(InputError, match=r"the monitor was running before this recording begins.*verify the folder"):
-        run(recordings_in(tmp_path)[1], None, None, as_json=False)
+        run(Recording(tmp_path).files[1], None, None, as_json=False)
 
 
 def test_a_recovered_run_is_exact_up_to_where_it_was_cut_off(
@@ -118,7 +120,7 @@ def test_a_recovered_run_is_exact_up_to_where_it_was_cut_off(
 def test_a_recording_that_ends_between_a_sample_and_its_results_is_exact(
     hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    last = list(read_messages(hour))[:-5][-1]
+    last = list(Recording(hour).messages())[:-5][-1]
     cut_off = rewritten(
         hour, tmp_path / "x.mcap", lambda entry: entry if entry.log_time_ns < last.log_time_ns else None
     )
@@ -143,10 +145,10 @@ OTHER_BUILDS: dict[str, dict[str, str]] = {
 
 def of_build(hour: Path, out: Path, build: dict[str, str], settings: str | None = None) -> Path:
     """The hour as another build would have recorded it."""
-    metadata = {name: value for name, value in read_metadata(hour).items() if name not in OWN}
+    metadata = {name: value for name, value in Recording(hour).metadata.items() if name not in OWN}
     metadata |= {} if settings is None else {"settings": settings}
     with RecordingWriter(out, metadata | build) as writer:
-        for entry in read_messages(hour):
+        for entry in Recording(hour).messages():
             writer.write(entry)
     return out
 
@@ -183,9 +185,9 @@ def test_a_copy_of_a_part_states_the_build_that_recorded_it(hour: Path, tmp_path
             (source,),
             tmp_path / f"{name} cut.mcap",
             sample_window((source,), START_NS, START_NS + 300_000_000_000),
-            read_metadata(source),
+            Recording(source).metadata,
         )
-        copied = read_metadata(tmp_path / f"{name} cut.mcap")
+        copied = Recording(tmp_path / f"{name} cut.mcap").metadata
         assert {key: copied[key] for key in OWN if key in copied} == build
 
 
@@ -195,10 +197,10 @@ def as_after_a_cut(hour: Path, out: Path, lost: Callable[[RecordedMessage], bool
     What it missed came afterwards, all of one kind after the other; but for what was lost.
     """
     begin_ns, end_ns = (first_after(hour, keys.key("cstr", keys.SAMPLE, "qc"), at).log_time_ns for at in (25.0, 35.0))
-    entries = list(read_messages(hour))
+    entries = list(Recording(hour).messages())
     missed = [entry for entry in entries if begin_ns <= entry.log_time_ns < end_ns]
     gaps: Counter[str] = Counter()
-    with RecordingWriter(out, read_metadata(hour)) as writer:
+    with RecordingWriter(out, Recording(hour).metadata) as writer:
         for entry in (entry for entry in entries if entry.log_time_ns < begin_ns):
             writer.write(entry)
         for entry in sorted(missed, key=lambda entry: entry.key.split("/")[2]):
@@ -217,8 +219,8 @@ def test_what_was_recovered_after_a_cut_link_is_exact_whatever_the_order_of_the_
     hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cut_link = as_after_a_cut(hour, tmp_path / "cut.mcap")
-    kinds = [entry.key.split("/")[2] for entry in read_messages(cut_link)]
-    assert kinds != [entry.key.split("/")[2] for entry in read_messages(hour)]
+    kinds = [entry.key.split("/")[2] for entry in Recording(cut_link).messages()]
+    assert kinds != [entry.key.split("/")[2] for entry in Recording(hour).messages()]
     code, report = verified(cut_link, capsys)
     assert (code, report["rows"], report["differing"]) == (0, ROWS, 0)
 
@@ -296,8 +298,8 @@ def test_an_alarm_that_was_taken_out_or_put_in_is_found_out(
     assert (code, report["differing"], report["differences"][0]["what"]) == (1, 1, "not recorded")
     other = alarm._replace(key=alarm.key.replace("ewma", "cusum"))
     forged = rewritten(hour, tmp_path / "b.mcap", lambda e: e)
-    with RecordingWriter(tmp_path / "c.mcap", read_metadata(forged)) as writer:
-        for entry in read_messages(forged):
+    with RecordingWriter(tmp_path / "c.mcap", Recording(forged).metadata) as writer:
+        for entry in Recording(forged).messages():
             writer.write(entry)
             if entry == alarm:
                 writer.write(other)
@@ -316,7 +318,7 @@ def test_a_monitor_that_was_restarted_is_verified_as_two_runs(
 
 def test_a_cut_from_the_middle_is_reported_as_not_verifiable(hour: Path, tmp_path: Path) -> None:
     window = sample_window([hour], START_NS + 20 * 60 * 10**9, START_NS + 40 * 60 * 10**9)
-    cut([hour], tmp_path / "cut.mcap", window, read_metadata(hour))
+    cut([hour], tmp_path / "cut.mcap", window, Recording(hour).metadata)
     with pytest.raises(InputError, match="was running before this recording begins"):
         run(tmp_path / "cut.mcap", None, None, as_json=False)
 
@@ -334,7 +336,7 @@ def test_people_are_shown_a_table_and_the_first_differences(
     assert "25 min  reactor/cstr/estimate/T: not recorded" in said
     bare = tmp_path / "bare.mcap"
     with RecordingWriter(bare, {}) as writer:
-        for entry in read_messages(hour):
+        for entry in Recording(hour).messages():
             writer.write(entry)
     with pytest.raises(InputError, match=r"does not say how the monitor was set.*--config"):
         run(bare, None, None, as_json=False)

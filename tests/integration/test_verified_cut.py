@@ -11,7 +11,7 @@ import pytest
 from benchmarks.link_cuts import Heard, Proxy, Router, connect_client
 from monitor_node.alarms.commands import COMMANDS
 from monitor_node.config import MonitorConfig
-from monitor_node.core import Monitor
+from monitor_node.node import MonitorNode
 from plant_node.__main__ import serve_plant
 from plant_node.config import PlantConfig
 from plant_node.node import PlantNode
@@ -39,7 +39,7 @@ OF_RECORDER = keys.key("cstr", keys.HEALTH, "recorder")
 
 def watch(bus_config: BusConfig, stop: StopSignal) -> None:
     with contextlib.closing(connect_client(bus_config)) as bus:
-        loop = EventLoop(Monitor(MONITOR, time.time_ns()), bus, stop, drain_timeout_s=0.5)
+        loop = EventLoop(MonitorNode(MONITOR, time.time_ns()), bus, stop, drain_timeout_s=0.5)
         loop.subscribe(keys.all_keys("cstr", keys.SAMPLE))
         loop.accept_commands(*(keys.key("cstr", keys.COMMAND, name) for name in COMMANDS))
         bus.declare_token(keys.key("cstr", keys.ALIVE, "monitor"))

@@ -20,8 +20,9 @@ from reactorwatch.cli.main import app
 from reactorwatch.contract.codec import encode
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.records.write_table import write_table
+from recorder.config import ReplayConfig
 from recorder.tools.convert import export_csv, import_csv
-from recorder.tools.replay import ReplayConfig, open_tape
+from recorder.tools.replay import open_tape
 
 ROWS, JUMP = 240, 180
 BOUNDS = {"level": (50.0, 120.0), "valve": (0.0, 100.0)}

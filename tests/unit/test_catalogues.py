@@ -15,7 +15,7 @@ import monitor_node.checks
 import reactorwatch.process.library.cstr.effects
 import reactorwatch.spc.charts
 import recorder.panels
-from monitor_node.checks.catalogue import CHECKS
+from monitor_node.checks.stage import CHECKS
 from monitor_node.config import CHART_SIGNALS, MonitorConfig
 from monitor_node.watch import row_frame, row_step
 from reactorwatch.spc.charts.catalogue import CHARTS
@@ -100,7 +100,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder,
         f"{checks}/jump.py",
         example("Add a signal check"),
-        f"{checks}/catalogue.py",
+        f"{checks}/stage.py",
         "JumpCheck",
         "JumpCheck",
         ")",

@@ -14,6 +14,7 @@ from reactorwatch.cli.verification import _recorded_process
 from reactorwatch.errors import InputError
 from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.library.three_tanks.model import three_tanks
+from recorder.files.recording import Recording
 from tests.unit.process.test_three_tanks import measure
 
 DESCRIPTION = """
@@ -141,9 +142,9 @@ def test_a_recording_judged_by_code_is_not_verified_by_code_that_only_it_names(
     assert run.exit_code == 0, run.output
     config = MonitorConfig(plant="rig", process=str(code))
     if is_held:
-        held = _recorded_process(recording, config)
+        held = _recorded_process(Recording(recording), config)
         assert held is not None
         assert fingerprint(held.require_model()) == fingerprint(replace(three_tanks(), name="code"))
     else:
         with pytest.raises(InputError, match=r"in no catalogue here.*name its file by --process"):
-            _recorded_process(recording, config)
+            _recorded_process(Recording(recording), config)

@@ -24,7 +24,7 @@ from reactorwatch.runtime.model_file import write_extended_model
 from reactorwatch.spc.charts.base import format_quantity
 from recorder.columns.run import find_model, signal_title
 from recorder.columns.run_reader import read_run
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 from recorder.panels.signals import OVERVIEW
 from recorder.tools.convert import import_csv, read_record
 from recorder.tools.player import samples_of
@@ -90,7 +90,7 @@ def test_the_signals_of_any_process_are_published_with_its_units(build: object) 
 def test_units_go_into_recordings_and_drawings_and_back(rig: Path, tmp_path: Path) -> None:
     import_csv(rig, tmp_path / "rig.mcap", "rig", COLUMNS)
     assert read_record(tmp_path / "rig.mcap").units == {"C": "degC"}
-    drawn = read_run(read_messages(tmp_path / "rig.mcap"))
+    drawn = read_run(Recording(tmp_path / "rig.mcap").messages())
     assert drawn.units == {"C": "degC"}
     assert {(view.title, view.unit) for view in OVERVIEW.draw(drawn)[:3]} == {("C", "degC"), ("T", ""), ("qc", "")}  # type: ignore[union-attr]
     assert find_model(drawn.units) is None

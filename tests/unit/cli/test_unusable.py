@@ -11,7 +11,7 @@ from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_BAD, QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
-from recorder.files.recording import recordings_in
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from tests.unit.cli.test_crash import run
 
@@ -92,4 +92,4 @@ def test_suffixes_in_capitals_are_suffixes(folder: Path) -> None:
     assert expand_files([Path("in")]) == [Path("in/A.CSV"), Path("in/B.Csv")]
     (folder / "bad.mcap").rename(folder / "in" / "C.MCAP")
     assert expand_files([Path("in")]) == [Path("in/A.CSV"), Path("in/B.Csv"), Path("in/C.MCAP")]
-    assert recordings_in(Path("in")) == [Path("in/C.MCAP")]
+    assert Recording(Path("in")).files == [Path("in/C.MCAP")]

@@ -1,10 +1,11 @@
 """Messages of a plant, made in the test."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from monitor_node.core import Monitor
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Quality, Sample
@@ -45,3 +46,12 @@ def samples(time_min: Rows, columns: dict[str, Rows]) -> Iterator[Encoded]:
     for row, minute in enumerate(time_min):
         for signal, values in columns.items():
             yield sample(signal, row, float(minute), float(values[row]))
+
+
+def feed_row(monitor: Monitor, number: int, time_ns: int, values: Sequence[float]) -> list[Publication]:
+    """Publications of a monitor because of a row, whose values have no units."""
+    published = list[Publication]()
+    for signal, value in zip(monitor.config.signals, values, strict=True):
+        message = Sample(time_ns=time_ns, sequence=number, value=value, quality=Quality.QUALITY_GOOD)
+        published += monitor.on_sample(signal, message, 0)
+    return published

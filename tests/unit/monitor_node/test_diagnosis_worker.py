@@ -41,7 +41,7 @@ def wait_for_findings(worker: DiagnosisWorker) -> list[PlantFinding]:
 
 def test_a_training_that_cannot_be_diagnosed_is_a_finding_and_the_next_is_diagnosed() -> None:
     worker = DiagnosisWorker(SerialExecutor())
-    for name in ("a", "b", "a"):
+    for name in ("a", "b"):
         worker.submit(name, SHORT)
     found = wait_for_findings(worker)
     worker.close()
@@ -78,13 +78,13 @@ def test_a_live_monitor_continues_while_its_training_is_diagnosed_and_changes_th
         published += node.on_message(message, 0)
     monitor = node.monitor(CONFIG.plant)
     assert not node._worker.is_busy
-    assert monitor.equations is monitor.model
+    assert monitor.pipeline.baselines.equations is monitor.pipeline.model
     for message in warm.messages[TRAINED:LATE]:
         published += node.on_message(message, 0)
     assert monitor.rows == LATE // 3
     assert not changes(published)
     now_ns, until_s = 0, time.monotonic() + 5.0 * WITHIN_S  # a diagnosis computes for two seconds on an idle machine
-    while monitor.awaits_diagnosis:
+    while monitor.pipeline.baselines.update.is_pending:
         assert time.monotonic() < until_s
         assert node.next_tick_ns() <= now_ns + 100_000_000  # it looks for the finding soon
         now_ns += 100_000_000
@@ -99,4 +99,6 @@ def test_a_live_monitor_continues_while_its_training_is_diagnosed_and_changes_th
     assert not node._worker.is_busy
     reference = monitor.pipeline.evaluation.reference
     assert isinstance(reference, ProcessReference)
-    assert reference.model is monitor.equations is read_equations(change.model)  # the one that was prepared
+    assert (
+        reference.model is monitor.pipeline.baselines.equations is read_equations(change.model)
+    )  # the one that was prepared

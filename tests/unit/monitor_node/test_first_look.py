@@ -106,7 +106,7 @@ def test_looks_of_a_monitor_that_is_prepared_compile_nothing(work: Work, monkeyp
     monkeypatch.setattr(Isolation, "suspects", noted)
     monitor = Monitor(CONFIG, 0, points=False, model=replace(cstr()))
     work.forget()
-    assert sum(1 for _ in stage.preparation(CONFIG, monitor.model)) > 10
+    assert sum(1 for _ in stage.preparation(CONFIG, monitor.pipeline.model)) > 10
     assert work.made > 40
     for message in samples(*leaking_run(-0.2, 18.0, 23.0, seed=3)):
         monitor.on_message(message, 0)
@@ -116,7 +116,7 @@ def test_looks_of_a_monitor_that_is_prepared_compile_nothing(work: Work, monkeyp
 
 @pytest.mark.parametrize("config", [MonitorConfig(isolation=False), MonitorConfig(reference="arx")])
 def test_a_monitor_that_looks_for_no_causes_prepares_nothing(config: MonitorConfig) -> None:
-    assert list(stage.preparation(config, Monitor(config, 0).model)) == []
+    assert list(stage.preparation(config, Monitor(config, 0).pipeline.model)) == []
 
 
 def test_an_error_in_what_is_prepared_is_left_to_the_first_look(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,11 +6,12 @@ import pytest
 from benchmarks.exchanger import config_of, random_exchanger, simulate
 from monitor_node.config import ReferenceName
 from monitor_node.core import Monitor
-from monitor_node.ingest.alignment import Row
 from monitor_node.learn.arx import COPY_ROWS
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Estimate, ModelSnapshot
+
+from .samples import feed_row
 
 ROWS, SECOND_NS, ORDER = 1600, 10**9, 3
 
@@ -22,7 +23,7 @@ def plant() -> tuple[Array, Array]:
 
 
 def take(monitor: Monitor, row: int, values: tuple[float, float]) -> list[Publication]:
-    return monitor.on_rows([Row(row * SECOND_NS, values, False)])
+    return feed_row(monitor, row, row * SECOND_NS, values)
 
 
 def adaptive(monitor: Monitor) -> ModelSnapshot:

@@ -7,7 +7,7 @@ from monitor_node.replay.backtest import run
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode
-from recorder.tools.replay import samples_of
+from recorder.tools.player import samples_of
 
 
 @pytest.mark.parametrize("noise_sd", [{"C": 0.0, "T": 0.0}, {"C": 0.0, "T": 0.3}, {"C": 0.002, "T": 0.0}])

@@ -22,7 +22,7 @@ from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write_table import write_table
 from recorder.config import ReplayConfig
 from recorder.files.copies import cut, receipt_window
-from recorder.files.recording import read_messages, recorded_process
+from recorder.files.recording import Recording
 from recorder.tools.convert import export_csv, import_csv, read_record
 from recorder.tools.inspect import inspect
 from recorder.tools.replay import open_tape
@@ -94,7 +94,7 @@ def test_a_record_of_any_process_comes_back_identical(tmp_path: Path, data: st.D
     found = inspect(mcap)
     assert signals_of(found.processes) == signals_of({"rig": process})
     assert (found.overview.lost, found.overview.duplicated, found.overview.out_of_place) == (0, 0, 0)
-    sent = {entry.key for entry in read_messages(mcap)}
+    sent = {entry.key for entry in Recording(mcap).messages()}
     assert sent <= {f"reactor/rig/sample/{item.name}" for item in process.signals}
     exported = export_csv(mcap, again)
     assert_same(exported, record)
@@ -187,7 +187,7 @@ def test_a_recording_that_nothing_describes_gives_all_its_signals_in_the_order_o
         columns = {name: shuffled[name] for name in names}
         path = tmp_path / "undescribed.mcap"
         write_undescribed(path, Record(record.time_min, columns, "x", units=record.units))
-        assert recorded_process(path, "rig") is None
+        assert Recording(path).process("rig") is None
         assert list(read_record(path).columns) == expected
     write_undescribed(path, Record(record.time_min, {"z": record.time_min, "Q2": record.time_min}, "x"))
     assert list(read_record(path).columns) == ["z", "Q2"]

@@ -10,7 +10,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from recorder import RecordedMessage, keep
 from recorder.core import KEYS_ALARM
-from recorder.files.recording import read_messages, recordings_in
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter, WriteError
 from recorder.keep import MAX_OTHER_CHANNELS, Channel, ChannelBudget
 from tests.unit.recorder import golden
@@ -39,7 +39,7 @@ def receive(fed: Fed, received: Iterable[Encoded], apart_ns: int = 0) -> None:
 
 
 def recorded_keys(folder: Path) -> set[str]:
-    return {entry.key for entry in read_messages(folder)}
+    return {entry.key for entry in Recording(folder).messages()}
 
 
 @pytest.mark.parametrize("kind", STRAYS)
@@ -67,7 +67,7 @@ def test_messages_of_the_product_beyond_the_budget_raise_the_alarm_and_those_wit
     assert "for more keys of this software" in raised.text
     assert "'reactor/p100/sample/T'" in raised.text
     fed.stop()
-    files = recordings_in(tmp_path)
+    files = Recording(tmp_path).files
     assert len(files) == 1  # every key is in use: another file would have no room for more
     samples = {f"reactor/p{number}/sample/T" for number in range(100)}
     own = {f"reactor/cstr/alarm/{KEYS_ALARM}", "reactor/cstr/health/recorder"}
@@ -87,7 +87,7 @@ def test_silent_keys_give_their_budget_to_others_in_the_next_file(tmp_path: Path
     receive(fed, (sample("cstr", second) for second in range(100, 200)), SECOND)
     assert [item.event for item in fed.alarms()] == ["raised", "cleared"]
     fed.stop()
-    first, second_file = recordings_in(tmp_path)
+    first, second_file = Recording(tmp_path).files
     assert recorded_keys(second_file) == {"reactor/cstr/sample/T", "reactor/cstr/health/recorder"}
     assert "reactor/cstr/sample/T" not in recorded_keys(first)
 
@@ -117,6 +117,29 @@ def test_messages_repeated_at_the_start_of_a_file_count_too() -> None:
     room = ChannelBudget(100)
     room.reset(latched=50)
     assert sum(room.admit(Channel(f"reactor/{n}/sample/T", "", is_product=True), 0) for n in range(100)) == 50
+
+
+def test_a_new_file_has_channels_for_other_programs_again() -> None:
+    room = ChannelBudget(100)
+    others = [Channel(f"weather/{n}", "", is_product=False) for n in range(MAX_OTHER_CHANNELS + 1)]
+    assert [room.admit(item, 0) for item in others] == [True] * MAX_OTHER_CHANNELS + [False]
+    room.reset(latched=0)
+    assert not room.has(others[0])
+    assert room.admit(others[-1], 0)
+
+
+@pytest.mark.parametrize(("inactive", "is_needed"), [(9, False), (10, True)])
+def test_a_full_file_is_followed_by_another_if_a_tenth_of_its_keys_is_inactive(inactive: int, is_needed: bool) -> None:
+    room = ChannelBudget(100)
+    own = [Channel(f"reactor/{n}/sample/T", "", is_product=True) for n in range(101)]
+    for n in range(100):
+        room.admit(own[n], 0 if n < inactive else 1)
+    assert room.needs_new_file(own[100], keep.INACTIVE_NS) == is_needed
+    assert not room.needs_new_file(own[100], keep.INACTIVE_NS + keep.CHECK_INTERVAL_NS)  # asked once an interval
+
+
+def test_latched_messages_take_at_most_half_of_the_keys_of_a_file() -> None:
+    assert ChannelBudget(100).max_latched_messages == 50
 
 
 def test_a_channel_beyond_those_that_the_format_can_number_is_refused_in_one_line(

@@ -15,7 +15,7 @@ from mcap.writer import MCAP0_MAGIC
 from reactorwatch.errors import InputError
 from recorder.files.copies import cut, receipt_window, recover
 from recorder.files.index import LARGEST_MB, LATEST_NS
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 from recorder.tools.inspect import inspect
 
 BOMB_BYTES = 40_000_000
@@ -94,7 +94,7 @@ BOMBS: dict[str, Callable[[str], tuple[Chunk, int | None]]] = {
     "not what the index claims": lambda packing: (chunk(message(3), packing), 7),
 }
 READERS: dict[str, Callable[[Path, Path], object]] = {
-    "read": lambda path, _: list(read_messages(path)),
+    "read": lambda path, _: list(Recording(path).messages()),
     "cut": lambda path, out: cut([path], out, receipt_window(0, LATEST_NS), {}),
 }
 
@@ -145,14 +145,14 @@ def test_a_chunk_within_the_limit_is_read_whole(tmp_path: Path, packing: str) ->
     for indexed in (True, False):
         path = tmp_path / f"{indexed}.mcap"
         path.write_bytes(recording([chunk(data, packing)], indexed=indexed))
-        assert [entry.log_time_ns for entry in read_messages(path)] == list(range(1, 200))
+        assert [entry.log_time_ns for entry in Recording(path).messages()] == list(range(1, 200))
 
 
 def test_chunks_that_overlap_give_their_messages_in_the_order_of_receipt(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     for indexed in (True, False):
         path.write_bytes(recording(list(WIDE), indexed=indexed))
-        assert [entry.log_time_ns for entry in read_messages(path)] == [1, 5, 9]
+        assert [entry.log_time_ns for entry in Recording(path).messages()] == [1, 5, 9]
 
 
 @pytest.mark.parametrize("text", ["", "0", "-1", "much", "nan", "inf"])
@@ -161,4 +161,4 @@ def test_a_limit_that_makes_no_sense_is_named(tmp_path: Path, monkeypatch: pytes
     path = tmp_path / "run.mcap"
     path.write_bytes(recording([SOUND]))
     with pytest.raises(InputError, match=f"{LARGEST_MB} must be a positive number, got '{text}'"):
-        list(read_messages(path))
+        list(Recording(path).messages())

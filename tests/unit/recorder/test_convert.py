@@ -12,7 +12,7 @@ from reactorwatch.cli.recording_reports import info_object
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write_table import write_table
-from recorder.files.recording import read_messages, read_metadata
+from recorder.files.recording import Recording
 from recorder.tools.convert import export_csv, import_csv, read_record
 from recorder.tools.inspect import inspect
 from tests.tables import read_csv
@@ -59,7 +59,7 @@ def assert_comes_back(tmp_path: Path, record: Record, zero_ns: int) -> None:
     assert export_csv(tmp_path / "run.mcap", tmp_path / "again.csv").rows == record.rows
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "run.csv").read_bytes()
     assert_same(read_record(tmp_path / "run.mcap"), read_csv(tmp_path / "run.csv"))
-    entries = list(read_messages(tmp_path / "run.mcap"))
+    entries = list(Recording(tmp_path / "run.mcap").messages())
     assert all(entry.publish_time_ns >= 0 for entry in entries)
     assert [entry.log_time_ns for entry in entries] == sorted(entry.log_time_ns for entry in entries)
     seen = inspect(tmp_path / "run.mcap")
@@ -78,12 +78,12 @@ def test_an_imported_record_is_a_recording_received_when_it_was_measured(tmp_pat
     csv, mcap = tmp_path / "run.csv", tmp_path / "run.mcap"
     csv.write_text("t,qc,C,T\n6,1,2,3\n12,4,5,6\n")
     import_csv(csv, mcap, "site", {"time_s": "t"}, zero_ns=1000)
-    entries = list(read_messages(mcap))
+    entries = list(Recording(mcap).messages())
     assert [entry.key.rsplit("/", 1)[1] for entry in entries] == ["qc", "C", "T"] * 2
     assert {entry.key.split("/")[1] for entry in entries} == {"site"}
     assert [entry.log_time_ns for entry in entries] == [6_000_001_000] * 3 + [12_000_001_000] * 3
     assert [entry.publish_time_ns for entry in entries] == [entry.log_time_ns for entry in entries]
-    metadata = read_metadata(mcap)
+    metadata = Recording(mcap).metadata
     assert (metadata["plant"], metadata["source"], metadata["zero_ns"]) == ("site", "run.csv", "1000")
 
 
@@ -91,7 +91,7 @@ def test_a_recording_of_negative_minutes_holds_shifted_times_and_their_zero_and_
     csv, mcap = tmp_path / "run.csv", tmp_path / "run.mcap"
     csv.write_text("time_min,qc,C,T\n-1500,1,2,3\n0,4,5,6\n")
     import_csv(csv, mcap, "cstr")
-    assert read_metadata(mcap)["zero_ns"] == str(2880 * 60 * 10**9)  # two days
+    assert Recording(mcap).metadata["zero_ns"] == str(2880 * 60 * 10**9)  # two days
     record = read_record(mcap)
     assert (record.time_min.tolist(), record.zero, record.zero_ns) == ([-1500.0, 0.0], None, 0)
     seen = info_object(inspect(mcap), mcap)

@@ -12,7 +12,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from recorder import RecordedMessage
 from recorder.files.copies import cut, receipt_window, sample_window
-from recorder.files.recording import plants_in, read_messages, read_metadata
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import read_record
 from tests.unit.recorder import golden
@@ -41,7 +41,7 @@ def test_a_cut_by_receipt_holds_what_was_received_then(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES)
     window = receipt_window(ENTRIES[250].log_time_ns, ENTRIES[449].log_time_ns)
     assert cut([source], tmp_path / "cut.mcap", window, {}) == 200
-    kept = [entry for entry in read_messages(tmp_path / "cut.mcap") if not entry.latched]
+    kept = [entry for entry in Recording(tmp_path / "cut.mcap").messages() if not entry.latched]
     assert kept == ENTRIES[250:450]
 
 
@@ -49,7 +49,7 @@ def test_a_cut_by_sample_time_holds_the_messages_about_it_and_those_received_mea
     source = recorded(tmp_path / "run.mcap", ENTRIES)
     out = tmp_path / "cut.mcap"
     cut([source], out, sample_window([source], at(10.0), at(20.0)), {})
-    kept = [entry for entry in read_messages(out) if not entry.latched]
+    kept = [entry for entry in Recording(out).messages() if not entry.latched]
     spoken = [entry for entry in ENTRIES if "/health/" not in entry.key]
     expected = [entry for entry in spoken if at(10.0) <= entry.publish_time_ns <= at(20.0)]
     assert [entry for entry in kept if "/health/" not in entry.key] == expected
@@ -67,20 +67,20 @@ def test_a_cut_starts_with_the_latched_messages(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES)
     out = tmp_path / "cut.mcap"
     cut([source], out, sample_window([source], at(24.0), at(30.0)), {})
-    entries = list(read_messages(out))
+    entries = list(Recording(out).messages())
     standing = [entry for entry in entries if entry.latched]
     assert entries[: len(standing)] == standing
     assert [entry.key.split("/", 2)[2] for entry in standing] == ["fault/coolant_flow", "alarm/shewhart/T"]
     again = tmp_path / "again.mcap"
     cut([out], again, sample_window([out], at(25.0), at(26.0)), {})
-    assert [entry[:3] for entry in read_messages(again) if entry.latched] == [entry[:3] for entry in standing]
+    assert [entry[:3] for entry in Recording(again).messages() if entry.latched] == [entry[:3] for entry in standing]
 
 
 def test_a_cut_of_several_files_goes_across_them(tmp_path: Path) -> None:
     halves = [recorded(tmp_path / "b.mcap", ENTRIES[800:]), recorded(tmp_path / "a.mcap", ENTRIES[:800])]
     window = receipt_window(ENTRIES[700].log_time_ns, ENTRIES[899].log_time_ns)
     assert cut(halves, tmp_path / "cut.mcap", window, {}) == 200
-    assert [entry for entry in read_messages(tmp_path / "cut.mcap") if not entry.latched] == ENTRIES[700:900]
+    assert [entry for entry in Recording(tmp_path / "cut.mcap").messages() if not entry.latched] == ENTRIES[700:900]
 
 
 def test_what_cannot_be_read_is_cut_out_as_it_is(tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_what_cannot_be_read_is_cut_out_as_it_is(tmp_path: Path) -> None:
         writer.write(strange, readable=False)
     window = receipt_window(ENTRIES[5].log_time_ns, strange.log_time_ns)
     cut([path], tmp_path / "cut.mcap", window, {})
-    assert list(read_messages(tmp_path / "cut.mcap")) == [*ENTRIES[5:10], strange]
+    assert list(Recording(tmp_path / "cut.mcap").messages()) == [*ENTRIES[5:10], strange]
 
 
 def test_where_nothing_was_received_no_file_is_written(tmp_path: Path) -> None:
@@ -130,12 +130,12 @@ def test_a_cut_of_recordings_made_side_by_side_gives_all_in_order_of_receipt(tmp
     a = recorded(tmp_path / "a.mcap", ENTRIES)
     b = recorded(tmp_path / "b.mcap", other, every=33)
     assert cut([b, a], tmp_path / "both.mcap", ALWAYS, {"plant": "both"}) == 2 * len(ENTRIES)
-    both = list(read_messages(tmp_path / "both.mcap"))
+    both = list(Recording(tmp_path / "both.mcap").messages())
     assert [entry.log_time_ns for entry in both] == sorted(entry.log_time_ns for entry in (*ENTRIES, *other))
     assert [entry for entry in both if "/cstr/" in entry.key] == ENTRIES
     assert [entry for entry in both if "/b/" in entry.key] == other
-    assert plants_in(tmp_path / "both.mcap") == ("b", "cstr")
-    assert read_metadata(tmp_path / "both.mcap")["plant"] == "both"
+    assert Recording(tmp_path / "both.mcap").plants == ("b", "cstr")
+    assert Recording(tmp_path / "both.mcap").metadata["plant"] == "both"
 
 
 def test_two_cuts_in_one_folder_are_read_as_the_same_record(tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def test_two_cuts_in_one_folder_are_read_as_the_same_record(tmp_path: Path) -> N
     assert np.array_equal(first.time_min, again.time_min)
     for signal in ("qc", "C", "T"):
         assert np.array_equal(first.columns[signal], again.columns[signal])
-    assert [entry for entry in read_messages(tmp_path / "parts") if entry.latched] == []
+    assert [entry for entry in Recording(tmp_path / "parts").messages() if entry.latched] == []
 
 
 def test_the_model_that_stands_is_that_of_the_moment_and_not_a_later_one(tmp_path: Path) -> None:
@@ -163,7 +163,7 @@ def test_the_model_that_stands_is_that_of_the_moment_and_not_a_later_one(tmp_pat
                 entries.append(RecordedMessage(*encoded[:3], 10 + number * MINUTE, number * MINUTE))
     source = recorded(tmp_path / "run.mcap", entries, every=1000)
     cut([source], tmp_path / "cut.mcap", sample_window([source], 12 * MINUTE, 14 * MINUTE), {})
-    (standing,) = [entry for entry in read_messages(tmp_path / "cut.mcap") if entry.latched]
+    (standing,) = [entry for entry in Recording(tmp_path / "cut.mcap").messages() if entry.latched]
     model = decode(standing.payload, standing.encoding)
     assert isinstance(model, messages.ModelSnapshot)
     assert model.rows == 10

@@ -10,7 +10,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import decode
 from recorder.core import DISK_ALARM
 from recorder.files.part_file import PartFile
-from recorder.files.recording import read_messages, recordings_in
+from recorder.files.recording import Recording
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import SECOND, recorder
 from tests.unit.recorder.test_files import alarm, samples
@@ -43,7 +43,7 @@ def recorded(folder: Path) -> list[int]:
     """The sequence numbers of the samples in its recordings."""
     return [
         message.sequence
-        for entry in read_messages(folder)
+        for entry in Recording(folder).messages()
         if isinstance(message := decode(entry.payload, entry.encoding), messages.Sample)
     ]
 
@@ -123,11 +123,11 @@ def test_a_disk_that_is_full_when_a_file_is_completed_loses_nothing_that_was_flu
     disk.room = 10**9
     fed.receive(samples(100, first=3010), SECOND // 10)
     fed.stop()
-    first, second = recordings_in(tmp_path)
+    first, second = Recording(tmp_path).files
     assert not list(tmp_path.glob("*.part"))
     kept = recorded(tmp_path)
     assert kept[:2910] == list(range(2910))
     assert kept[-1] == 3109
     assert fed.last_health().refused_by_reason["disk"] == 3110 - len(kept)
-    assert [entry.key for entry in read_messages(second) if entry.latched] == ["reactor/cstr/alarm/ewma/T"]
+    assert [entry.key for entry in Recording(second).messages() if entry.latched] == ["reactor/cstr/alarm/ewma/T"]
     assert first.name == "run.mcap"

@@ -14,7 +14,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.version import version
 from recorder import RecordedMessage
 from recorder.files.reader import Reader
-from recorder.files.recording import plants_in, read_messages, read_metadata, recordings_in
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.recording_files import BackgroundTasks
 from recorder.tools.convert import read_record
@@ -26,7 +26,7 @@ ALL = [encode(publication) for publication in golden.publications()]
 
 
 def of_others(path: Path) -> list[RecordedMessage]:
-    return [entry for entry in read_messages(path) if not entry.key.endswith("health/recorder")]
+    return [entry for entry in Recording(path).messages() if not entry.key.endswith("health/recorder")]
 
 
 def alarm(name: str, event: str = "raised") -> Publication:
@@ -47,7 +47,7 @@ def test_files_follow_each_other_by_age_and_hold_everything_between_them(tmp_pat
     assert [path.name for path in files] == ["run.mcap", "run-2.mcap", "run-3.mcap"]
     assert [entry[:3] for entry in of_others(tmp_path)] == [message[:3] for message in ALL]
     for path in files:
-        times = [entry.log_time_ns for entry in read_messages(path)]
+        times = [entry.log_time_ns for entry in Recording(path).messages()]
         assert times == sorted(times)
         assert times[-1] - times[0] <= MINUTE
 
@@ -56,7 +56,7 @@ def test_files_follow_each_other_by_size(tmp_path: Path) -> None:
     fed = recorder(tmp_path, START, rotate_mb=0.08, black_box_min=0.0)
     fed.receive(golden.publications(), SECOND // 10)
     fed.stop()
-    sizes = [path.stat().st_size for path in recordings_in(tmp_path)]
+    sizes = [path.stat().st_size for path in Recording(tmp_path).files]
     assert len(sizes) > 2
     assert all(80_000 <= size <= 130_000 for size in sizes[:-1])  # and what its index takes
     assert [entry[:3] for entry in of_others(tmp_path)] == [message[:3] for message in ALL]
@@ -69,28 +69,28 @@ def test_every_file_starts_with_the_latched_messages_and_a_folder_yields_them_on
     fed.receive([*samples(1), *stands], SECOND)
     fed.receive(samples(200, first=1), SECOND)
     fed.stop()
-    files = recordings_in(tmp_path)
+    files = Recording(tmp_path).files
     assert len(files) == 4
     for path in files[1:]:
-        first = [entry for entry in read_messages(path) if entry.latched]
+        first = [entry for entry in Recording(path).messages() if entry.latched]
         assert [decode(entry.payload, entry.encoding) for entry in first] == [item.message for item in stands]
-        assert list(read_messages(path))[: len(first)] == first
+        assert list(Recording(path).messages())[: len(first)] == first
         assert [entry.publish_time_ns for entry in first] == [5, 1]
-    assert not any(entry.latched for entry in read_messages(tmp_path))
-    assert sum("/alarm/" in entry.key for entry in read_messages(tmp_path)) == 1
+    assert not any(entry.latched for entry in Recording(tmp_path).messages())
+    assert sum("/alarm/" in entry.key for entry in Recording(tmp_path).messages()) == 1
 
 
 def test_every_file_opens_by_itself_and_states_its_origin(tmp_path: Path) -> None:
     fed = recorder(tmp_path, START, rotate_min=1.0, about={"seed": "7"})
     fed.receive(samples(100), SECOND)
     fed.stop()
-    first, second = recordings_in(tmp_path)
+    first, second = Recording(tmp_path).files
     for number, path in enumerate((first, second), start=1):
         assert read_record(path).rows
-        said = read_metadata(path)
+        said = Recording(path).metadata
         assert (said["plant"], said["version"], said["seed"], said["file"]) == ("cstr", version(), "7", str(number))
         assert tomllib.loads(said["configuration"])["rotate_min"] == 1.0
-    assert read_metadata(second)["after"] == first.name
+    assert Recording(second).metadata["after"] == first.name
 
 
 def test_a_folder_is_read_as_one_recording(tmp_path: Path) -> None:
@@ -100,9 +100,9 @@ def test_a_folder_is_read_as_one_recording(tmp_path: Path) -> None:
     for each in (fed, one):
         each.receive(golden.publications(), MINUTE // 500)
         each.stop()
-    assert len(recordings_in(tmp_path / "folder")) > 2
+    assert len(Recording(tmp_path / "folder").files) > 2
     assert of_others(tmp_path / "folder") == of_others(tmp_path / "one.mcap")
-    assert plants_in(tmp_path / "folder") == ("cstr",)
+    assert Recording(tmp_path / "folder").plants == ("cstr",)
     a, b = read_record(tmp_path / "folder"), read_record(tmp_path / "one.mcap")
     assert a.time_min.tolist() == b.time_min.tolist()
     assert a.columns["T"].tolist() == b.columns["T"].tolist()
@@ -122,7 +122,7 @@ def test_files_that_overlap_in_time_are_read_together_in_order_of_receipt(tmp_pa
 
 def test_a_folder_without_recordings_is_reported_as_such(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds no recording \(\.mcap\)"):
-        read_messages(tmp_path)
+        Recording(tmp_path).messages()
 
 
 def test_the_oldest_are_deleted_and_never_the_one_being_written_nor_a_black_box(tmp_path: Path) -> None:
@@ -133,7 +133,7 @@ def test_the_oldest_are_deleted_and_never_the_one_being_written_nor_a_black_box(
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == [".run.ages", "black-box", "mine.mcap", "run-7.mcap", "run-8.mcap"]
     assert len(list((tmp_path / "black-box").iterdir())) == 1
-    last = [entry for entry in read_messages(tmp_path / "run-8.mcap") if "/sample/" in entry.key]
+    last = [entry for entry in Recording(tmp_path / "run-8.mcap").messages() if "/sample/" in entry.key]
     assert last
 
 
@@ -144,8 +144,8 @@ def test_a_black_box_holds_what_came_before_and_after_the_alarm_and_how_things_s
     first, second = sorted((tmp_path / "black-box").iterdir())
     assert first.name.endswith("Z-shewhart-C.mcap")
     assert second.name.endswith("Z-ewma-T.mcap")
-    assert read_metadata(second)["alarm"] == "ewma/T"
-    (standing,) = [entry for entry in read_messages(second) if entry.latched]
+    assert Recording(second).metadata["alarm"] == "ewma/T"
+    (standing,) = [entry for entry in Recording(second).messages() if entry.latched]
     assert standing.key == "reactor/cstr/alarm/shewhart/C"
     kept = [entry for entry in of_others(second) if not entry.latched]
     (at,) = [entry.log_time_ns for entry in kept if "/alarm/" in entry.key]
@@ -195,7 +195,7 @@ def test_the_next_start_recovers_what_a_kill_left_and_resumes_in_a_new_file(tmp_
     fed.receive(samples(50, first=100), SECOND // 10)
     fed.stop()
     assert not list(tmp_path.glob("*.part"))
-    first, _second = recordings_in(tmp_path)
+    first, _second = Recording(tmp_path).files
     assert first.name == part.name.removesuffix(".part")
     sequences = [
         message.sequence

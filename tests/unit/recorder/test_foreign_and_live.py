@@ -13,7 +13,7 @@ from plant_node.record import simulate_record
 from reactorwatch.api.files import expand_folder
 from reactorwatch.errors import InputError
 from recorder.files.part_file import PART
-from recorder.files.recording import read_metadata
+from recorder.files.recording import Recording
 from recorder.tools.convert import read_record
 from recorder.tools.inspect import inspect
 from recorder.tools.player import samples_of
@@ -78,7 +78,7 @@ def test_a_folder_with_only_a_live_file_is_read_and_reported_as_live(tmp_path: P
     assert found.columns["T"] == pytest.approx(record.columns["T"], rel=0, abs=0)
     assert f"{part.name}, which is still being recorded" in found.read_as
     assert inspect(tmp_path).live == part.name
-    assert read_metadata(tmp_path)["plant"] == "cstr"
+    assert Recording(tmp_path).metadata["plant"] == "cstr"
     assert expand_folder(tmp_path) == [tmp_path]
     fed.kill()
     with pytest.raises(InputError, match=rf"holds no recording .*{part.name} is left of a recorder that was killed"):

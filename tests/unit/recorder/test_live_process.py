@@ -21,7 +21,7 @@ from recorder.config import RecorderConfig
 from recorder.core import Recorder
 from recorder.files.copies import cut, receipt_window
 from recorder.files.metadata import PROCESS, process_metadata, processes_in
-from recorder.files.recording import recorded_process
+from recorder.files.recording import Recording
 from recorder.recording_files import RecordingFiles
 from recorder.tools.inspect import inspect
 from recorder.tools.player import samples_of
@@ -102,7 +102,7 @@ def test_a_live_recording_is_read_and_diagnosed_with_no_option(tmp_path: Path) -
     path = tmp_path / "tanks.mcap"
     with open_files(RecorderConfig(plant="tanks", out=str(path), processes={"tanks": "three_tanks"})) as files:
         write_samples(files, "tanks", "three_tanks", 200)
-    described = recorded_process(path, None)
+    described = Recording(path).process(None)
     assert described is not None
     assert (described.name, described.inputs) == ("three_tanks", ("Q1", "Q2"))
     case = load_case(path, DiagnosisOptions())

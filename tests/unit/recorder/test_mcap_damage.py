@@ -9,7 +9,7 @@ import pytest
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.index import FOOTER, RECORD, TABLE_CURE, read_summary
-from recorder.files.recording import plants_in, read_messages, read_metadata
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import read_record
 from tests.unit.recorder import golden
@@ -32,7 +32,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def read(path: Path) -> list[RecordedMessage] | str:
     """What is in a file, or the line that says why it cannot be told."""
     try:
-        return list(read_messages(path))
+        return list(Recording(path).messages())
     except InputError as error:
         return str(error)
 
@@ -72,7 +72,7 @@ def test_a_chunk_of_zeros_names_its_place_and_keeps_what_came_before(tmp_path: P
     path = tmp_path / "run.mcap"
     at = whole.index(b"\x28\xb5\x2f\xfd", whole.index(b"\x28\xb5\x2f\xfd") + 1)  # second frame of zstd
     path.write_bytes(whole[:at] + bytes(50) + whole[at + 50 :])
-    messages = read_messages(path)
+    messages = Recording(path).messages()
     assert [next(messages) for _ in range(20)] == ENTRIES[:20]
     with pytest.raises(InputError, match=r"the chunk at byte \d+ cannot be read .*recover"):
         next(messages)
@@ -97,7 +97,7 @@ def test_a_file_that_is_no_recording_is_reported_as_such_and_offers_no_rescue(
 def test_every_way_of_reading_reports_the_same_error_at_the_call(tmp_path: Path, whole: bytes) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(whole[:-1])
-    for reading in (read_messages, read_record, read_metadata, plants_in):
+    for reading in (Recording, read_record):
         with pytest.raises(InputError, match="is cut off"):
             reading(path)
         with pytest.raises(InputError, match="there is no such file"):
@@ -133,4 +133,4 @@ def test_an_index_that_names_another_record_as_metadata_is_named(whole: bytes, t
     header = struct.pack("<QQ", 8, length)
     path.write_bytes(bytes(content).replace(struct.pack("<QQ", item.offset, item.length), header))
     with pytest.raises(InputError, match="its metadata cannot be read"):
-        read_metadata(path)
+        _ = Recording(path).metadata

@@ -17,7 +17,7 @@ from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.version import build_metadata
 from recorder import RecordedMessage
-from recorder.files.recording import plants_in, read_messages, read_metadata
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import read_record
 from tests.unit.recorder import golden
@@ -48,7 +48,7 @@ def sample(
 @pytest.mark.parametrize("every", [0, 100])
 def test_every_entry_comes_back_in_the_order_of_receipt(tmp_path: Path, every: int) -> None:
     entries = list(golden.entries())
-    assert list(read_messages(recorded(tmp_path / "run.mcap", entries, every))) == entries
+    assert list(Recording(recorded(tmp_path / "run.mcap", entries, every)).messages()) == entries
 
 
 def test_other_software_reads_the_same_values_by_the_schemas_in_the_file(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_foreign_bytes_are_kept_with_their_stated_encoding_and_no_schema(tmp_pat
         writer.write(sample(1))
         for entry in strange:
             writer.write(entry, readable=False)
-    assert list(read_messages(path))[1:] == strange
+    assert list(Recording(path).messages())[1:] == strange
     with path.open("rb") as stream:
         factory = DecoderFactory()
         decodable = [
@@ -89,25 +89,25 @@ def test_foreign_bytes_are_kept_with_their_stated_encoding_and_no_schema(tmp_pat
 
 
 def test_metadata_holds_the_version_and_the_given_entries(tmp_path: Path) -> None:
-    assert read_metadata(recorded(tmp_path / "run.mcap", [])) == {**build_metadata(), "seed": "3"}
+    assert Recording(recorded(tmp_path / "run.mcap", [])).metadata == {**build_metadata(), "seed": "3"}
 
 
 def test_a_recording_of_nothing_is_a_recording(tmp_path: Path) -> None:
     path = recorded(tmp_path / "run.mcap", [])
-    assert list(read_messages(path)) == []
-    assert plants_in(path) == ()
+    assert list(Recording(path).messages()) == []
+    assert Recording(path).plants == ()
 
 
 def test_reading_can_be_limited_to_kinds_and_to_a_plant(tmp_path: Path) -> None:
     entries = [*golden.entries(), *(entry._replace(key=entry.key.replace("cstr", "b")) for entry in golden.entries())]
     entries.append(RecordedMessage("reactor/odd", b"", "?", entries[-1].log_time_ns, 0))
     path = recorded(tmp_path / "run.mcap", entries)
-    alarms = list(read_messages(path, {keys.ALARM, keys.FAULT}, "b"))
+    alarms = list(Recording(path).messages({keys.ALARM, keys.FAULT}, "b"))
     assert {entry.key for entry in alarms} == {"reactor/b/alarm/shewhart/T", "reactor/b/fault/coolant_flow"}
     assert len(alarms) == 3
-    assert len(list(read_messages(path, {keys.SAMPLE}))) == 2 * 3 * golden.ROWS
-    assert len(list(read_messages(path, plant="b"))) == len(list(golden.entries()))
-    assert plants_in(path) == ("b", "cstr")
+    assert len(list(Recording(path).messages({keys.SAMPLE}))) == 2 * 3 * golden.ROWS
+    assert len(list(Recording(path).messages(plant="b"))) == len(list(golden.entries()))
+    assert Recording(path).plants == ("b", "cstr")
 
 
 @pytest.mark.parametrize("every", [0, 1, 3], ids=["in a chunk", "between chunks", "both"])
@@ -116,7 +116,7 @@ def test_what_is_not_in_order_in_the_file_is_read_in_order_of_receipt(tmp_path: 
     received = [5, 3, 3, 9, 1, 5, 7, 2, 9, 8]
     entries = [sample(number, received_ns=at) for number, at in enumerate(received)]
     path = recorded(tmp_path / "run.mcap", entries, every)
-    assert list(read_messages(path)) == sorted(entries, key=lambda entry: entry.log_time_ns)
+    assert list(Recording(path).messages()) == sorted(entries, key=lambda entry: entry.log_time_ns)
 
 
 @pytest.mark.parametrize(
@@ -138,9 +138,9 @@ def test_files_that_other_programs_write_in_another_way_are_read_as_well(
             writer.add_message(channels[entry.key], entry.log_time_ns, entry.payload, entry.publish_time_ns)
         writer.finish()  # type: ignore[no-untyped-call]
     sampled = [entry for entry in entries if keys.SAMPLE in entry.key]
-    assert list(read_messages(path, {keys.SAMPLE})) == sampled
-    assert plants_in(path) == ("cstr",)
-    assert read_metadata(path) == {}
+    assert list(Recording(path).messages({keys.SAMPLE})) == sampled
+    assert Recording(path).plants == ("cstr",)
+    assert Recording(path).metadata == {}
 
 
 def test_records_that_are_private_to_another_program_are_passed_over(tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_records_that_are_private_to_another_program_are_passed_over(tmp_path: P
         stream.write(b"\x85" + (3).to_bytes(8, "little") + b"abc")
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()  # type: ignore[no-untyped-call]
-    assert [entry.log_time_ns for entry in read_messages(path)] == [1, 2]
+    assert [entry.log_time_ns for entry in Recording(path).messages()] == [1, 2]
 
 
 def test_a_recording_is_never_written_over(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from reactorwatch.runtime.event_loop import EventLoop, StopSignal
 from recorder import RecordedMessage
 from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 from recorder.node import RecorderNode
 from recorder.recording_files import RecordingFiles
 from tests.memory_bus import Exchange, MemoryBus
@@ -56,7 +56,7 @@ def test_all_that_is_published_is_in_the_file_in_order_and_health_is_in_it_once(
         for message in published:
             plant.publish(message)
         plant.publish(Encoded("elsewhere/x", b"", ""))
-    entries = list(read_messages(tmp_path / "run.mcap"))
+    entries = list(Recording(tmp_path / "run.mcap").messages())
     own = [entry for entry in entries if entry.key == "reactor/cstr/health/recorder"]
     others = [entry for entry in entries if entry not in own]
     assert [entry[:3] for entry in others] == [message[:3] for message in published]
@@ -107,4 +107,4 @@ def test_the_file_is_closed_when_the_loop_ends_by_an_exception(tmp_path: Path) -
     loop.subscribe(keys.EVERYTHING)
     with pytest.raises(ConnectionError), writer:
         loop.run()
-    assert next(read_messages(tmp_path / "run.mcap")).payload == message.payload
+    assert next(Recording(tmp_path / "run.mcap").messages()).payload == message.payload

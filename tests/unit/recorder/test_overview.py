@@ -8,6 +8,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, encode
 from recorder import RecordedMessage
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.inspect import FileInfo, MissingSamples, inspect, overview, zero_ns_of
 from tests.unit.recorder import golden
@@ -94,7 +95,7 @@ def test_a_file_that_is_cut_off_is_looked_over_as_far_as_it_goes(tmp_path: Path)
                 half = (tmp_path / "run.mcap.part").stat().st_size
     whole = inspect(path)
     assert (whole.overview.messages, whole.damages, whole.metadata["seed"]) == (len(entries), (), "5")
-    assert whole.zero_ns == zero_ns_of(path) == golden.ZERO_NS
+    assert whole.zero_ns == zero_ns_of(Recording(path)) == golden.ZERO_NS
     assert inspect(tmp_path).overview == whole.overview
     path.write_bytes(path.read_bytes()[:half])
     cut_off = inspect(path)

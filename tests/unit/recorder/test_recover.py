@@ -17,7 +17,7 @@ from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.copies import RecoveryResult, recover
 from recorder.files.reader import Reader, StoredMessage, metadata_records
-from recorder.files.recording import read_messages, read_metadata
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from tests.unit.recorder import golden
 
@@ -58,7 +58,7 @@ def recovered(folder: Path, content: bytes) -> tuple[list[RecordedMessage], Reco
     saved = recover(damaged, out)
     assert damaged.read_bytes() == content
     assert sorted(path.name for path in folder.iterdir()) == ["damaged.mcap", "out.mcap"]
-    return list(read_messages(out)), saved
+    return list(Recording(out).messages()), saved
 
 
 def expected_of_a_cut(content: bytes, length: int) -> list[RecordedMessage]:
@@ -121,7 +121,7 @@ def test_a_byte_that_is_wrong_costs_one_chunk_at_most_and_no_message_is_altered(
     for place in range(0, len(whole), 61):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
         saved = recover(path, out)
-        kept = list(read_messages(out))
+        kept = list(Recording(out).messages())
         assert kept == ENTRIES or (kept in may_be_left and saved.losses), place
 
 
@@ -140,7 +140,7 @@ def test_saved_messages_are_reported_by_topic_and_time(tmp_path: Path, whole: by
 
 def test_a_recovered_file_states_its_origin_and_what_is_missing(tmp_path: Path, whole: bytes) -> None:
     recovered(tmp_path, whole[:-1])
-    metadata = read_metadata(tmp_path / "out.mcap")
+    metadata = Recording(tmp_path / "out.mcap").metadata
     assert (metadata["plant"], metadata["seed"]) == ("cstr", "3")
     said = {record.name: record.metadata for record in metadata_records(tmp_path / "out.mcap")}
     assert said["recovered"]["from"] == "damaged.mcap"

@@ -66,8 +66,8 @@ def test_a_file_is_full_by_age_or_by_size() -> None:
     decide = filing(rotate_s=60, rotate_bytes=1000)
     decide.count_message(START)
     assert not decide.is_full(START + 59 * SECOND_NS, 999)
+    assert decide.is_full(START + 59 * SECOND_NS, 1000)
     assert decide.is_full(START + 60 * SECOND_NS, 0)
-    assert decide.is_full(START, 1000)
     decide.start_file(START + 60 * SECOND_NS)
     decide.count_message(START + 60 * SECOND_NS)
     assert not decide.is_full(START + 119 * SECOND_NS, 0)
@@ -80,3 +80,13 @@ def test_a_clock_that_is_set_back_puts_nothing_off() -> None:
     assert not decide.flush_is_due(hour_ago)
     assert decide.flush_is_due(hour_ago + HALF)
     assert decide.is_full(hour_ago + 60 * SECOND_NS, 0)
+
+
+def test_a_sync_is_due_a_second_after_the_last_one_when_the_clock_is_set_back_before_it() -> None:
+    decide = filing("second")
+    decide.count_message(START)
+    decide.mark_flushed()
+    hour_ago = START - 3600 * SECOND_NS
+    assert not decide.sync_is_due(hour_ago)
+    assert decide.next_due_ns() == hour_ago + SECOND_NS
+    assert decide.sync_is_due(hour_ago + SECOND_NS)

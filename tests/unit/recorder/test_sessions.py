@@ -10,7 +10,7 @@ from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import Record
 from recorder import RecordedMessage
 from recorder.columns.run_reader import read_run
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import export_csv, read_record
 from recorder.tools.inspect import inspect, zero_ns_of
@@ -69,20 +69,20 @@ def test_minutes_count_from_the_first_row_of_the_first_run(tmp_path: Path) -> No
     write_session(tmp_path / "runs", 0, 0)
     write_session(tmp_path / "runs", 1, 60)
     back = tmp_path / "runs" / "session-1.mcap"
-    assert zero_ns_of(tmp_path / "runs") == START_NS
+    assert zero_ns_of(Recording(tmp_path / "runs")) == START_NS
     assert read_record(tmp_path / "runs").zero_ns == START_NS
     assert read_record(back).zero_ns == START_NS + 60 * SECOND
 
 
 def test_a_drawing_shows_one_run_after_the_other(folder: Path) -> None:
-    shown = read_run(read_messages(folder)).samples["T"]
+    shown = read_run(Recording(folder).messages()).samples["T"]
     assert shown.time_ns.size == 3 * ROWS
     assert (np.diff(shown.time_ns) > 0).all()
     assert (np.diff(shown.value) > 0).all()
 
 
 def test_each_run_is_played_at_its_pace(folder: Path) -> None:
-    player = Player(lambda: filter_playable(read_messages(folder)), 1.0)
+    player = Player(lambda: filter_playable(Recording(folder).messages()), 1.0)
     now_ns, moments = 0, []
     while not player.finished:
         now_ns = max(now_ns, player.next_tick_ns())

@@ -13,7 +13,7 @@ from recorder import RecordedMessage
 from recorder.files.copies import recover
 from recorder.files.part_file import PartFile
 from recorder.files.reader import Reader
-from recorder.files.recording import read_messages
+from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter, WriteError
 from tests.unit.recorder import golden
 
@@ -112,7 +112,7 @@ def test_a_chunk_that_fills_up_is_handed_over_at_once_and_counted_if_the_disk_is
     saved = writer.abandon()
     assert 0 < saved < len(written)
     recover(tmp_path / "run.mcap.part", tmp_path / "out.mcap")
-    assert list(read_messages(tmp_path / "out.mcap")) == written[:saved]
+    assert list(Recording(tmp_path / "out.mcap").messages()) == written[:saved]
 
 
 @pytest.mark.parametrize("act", [RecordingWriter.flush, RecordingWriter.sync, RecordingWriter.close])

@@ -8,10 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from monitor_node.alarms.alarms import Condition, OnOffDelay
+from monitor_node.alarms.alarms import AlarmMemory, ChartAlarm
 from reactorwatch.errors import InputError
 from reactorwatch.spc import false_alarm_budget as budget
 from reactorwatch.spc.charts import cusum, ewma, shewhart
+from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma
@@ -145,11 +146,12 @@ def test_the_width_of_a_rule_of_several_points_gives_its_rate() -> None:
     width = shewhart.designed_width(budget.point_probability(3000.0, 3, 5), KNOWN)
     out = np.abs(np.random.default_rng(5).normal(size=1_000_000)) > width
     alarms = 0
-    rule, condition = OnOffDelay(3, 5, 1), Condition()
-    for point in out.tolist():
-        if rule.update(condition, point):
+    alarm = ChartAlarm("shewhart", "T", "medium", (3, 5, 1), 0.1)
+    points = {False: Judgement(0.0, 0.0, -width, width, False), True: Judgement(2 * width, 0.0, -width, width, True)}
+    for is_out in out.tolist():
+        if alarm.update(points[is_out]) is not None:
             alarms += 1
-            condition = Condition()
+            alarm.memory = AlarmMemory()
     assert alarms * 3000.0 / out.size == pytest.approx(1.0, abs=4 / np.sqrt(333))
 
 

@@ -4,7 +4,7 @@ from typing import TypeVar
 
 from google.protobuf.message import Message
 
-from monitor_node.alarms.alarms import AlarmChange, ChartAlarm, Explanation
+from monitor_node.alarms.alarms import ChartAlarm
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract.codec import Publication
@@ -39,10 +39,10 @@ class Desk:
 
     def judge(self, alarm: ChartAlarm, minutes: float, judgement: Judgement) -> None:
         """A point of an alarm's chart."""
-        raised = alarm.update(judgement)
-        if raised is not None:
-            explanation = Explanation(f"{alarm.name} is out", {}) if raised else None
-            self.published += self.board.apply(to_time_ns(minutes), [AlarmChange(alarm, judgement, "K", explanation)])
+        change = alarm.update(judgement, "K")
+        if change is not None:
+            change.text = f"{alarm.name} is out"
+            self.published += self.board.apply(to_time_ns(minutes), [change])
 
     def messages(self, kind: type[M]) -> list[M]:
         """The messages of a kind."""

@@ -1,5 +1,6 @@
 """The figures of EEMUA 191, against cases counted by hand."""
 
+from reactorwatch.contract.alarm_states import Event
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Priority
 from reactorwatch.records.record import to_time_ns
 
@@ -63,7 +64,7 @@ def test_priorities_and_states_are_counted() -> None:
     raise_at(desk, 0, 1)
     desk.point(2, T=OUT, C=OUT)
     assert desk.figures().unacknowledged == 2
-    desk.published += desk.board.shelve("shewhart/C", 5.0, "Anna", "")
+    desk.published += desk.board.act("shewhart/C", Event.SHELVE, "Anna", "", 5.0)
     figures = desk.figures()
     counts = {Priority.Name(item.priority): (item.raised, item.standing) for item in figures.priorities}
     assert counts == {

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor_node.alarms.alarms import AlarmChange, Explanation, SuspectedCause
+from monitor_node.alarms.alarms import SuspectedCause
 from monitor_node.alarms.annunciator import AnnunciatorMemory
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
@@ -191,7 +191,7 @@ def test_an_incident_that_a_later_one_follows_keeps_its_suspects_and_is_publishe
 def test_a_shelf_ends_with_its_time_and_a_standing_alarm_comes_up_again() -> None:
     desk = Desk()
     desk.point(0, T=OUT)
-    (change, *_) = desk.board.shelve("shewhart/T", 10.0, "Anna", "known")
+    (change, *_) = desk.board.act("shewhart/T", Event.SHELVE, "Anna", "known", 10.0)
     assert isinstance(change.message, Alarm)
     assert change.message.shelved_until_ns == to_time_ns(10.0)
     desk.point(9.9, T=OUT)
@@ -221,7 +221,7 @@ def test_changes_of_a_suppressed_alarm_are_published_and_count_when_it_returns()
 def test_a_clock_that_is_set_back_ends_a_shelf() -> None:
     desk = Desk()
     desk.point(100, T=OUT)
-    desk.board.shelve("shewhart/T", 60.0, "Anna", "")
+    desk.board.act("shewhart/T", Event.SHELVE, "Anna", "", 60.0)
     desk.point(50, T=OUT)
     assert desk.alarm().memory.state is State.UNACKNOWLEDGED
 
@@ -245,7 +245,7 @@ def busy_desk() -> Desk:
     desk.point(0, T=OUT)
     desk.point(1, C=OUT)
     desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Anna", "seen")
-    desk.board.shelve("shewhart/C", 30.0, "Ben", "")
+    desk.board.act("shewhart/C", Event.SHELVE, "Ben", "", 30.0)
     return desk
 
 
@@ -256,10 +256,11 @@ def stored(desk: Desk) -> AnnunciatorMemory:
 
 def test_a_change_that_an_error_kept_from_being_applied_is_found_again() -> None:
     desk, out = Desk(), Judgement(OUT, 0.0, -3.0, 3.0, True)
-    assert desk.alarm().update(out) is True
+    assert desk.alarm().update(out) is not None
     again = desk.board.declare("shewhart", "T")  # as the pipeline does that is made after the error
-    assert again.update(out) is True
-    desk.published += desk.board.apply(to_time_ns(1.0), [AlarmChange(again, out, "K", Explanation("out", {}))])
+    change = again.update(out)
+    assert change is not None
+    desk.published += desk.board.apply(to_time_ns(1.0), [change])
     assert desk.changes() == [("shewhart/T", "raised")]
     assert desk.board.declare("shewhart", "T").update(out) is None, "one that is active is not raised again"
 

@@ -3,16 +3,22 @@
 import numpy as np
 import pytest
 
-from monitor_node.alarms.alarms import Condition, OnOffDelay
+from monitor_node.alarms.alarms import ChartAlarm
+from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.shewhart import probability_out
 from reactorwatch.spc.m_of_n import false_alarm_rate
 
+POINTS = {False: Judgement(0.0, 0.0, -3.0, 3.0, False), True: Judgement(5.0, 0.0, -3.0, 3.0, True)}
 
-def changes(rule: OnOffDelay, points: str) -> list[tuple[int, bool]]:
+
+def alarm(raise_count: int, window: int, clear_count: int) -> ChartAlarm:
+    return ChartAlarm("shewhart", "T", "medium", (raise_count, window, clear_count), 0.1)
+
+
+def changes(rule: ChartAlarm, points: str) -> list[tuple[int, bool]]:
     """Points as text, x for out; returns (position, raised or cleared)."""
-    condition = Condition()
-    found = [(position, rule.update(condition, point == "x")) for position, point in enumerate(points)]
-    return [(position, change) for position, change in found if change is not None]
+    found = [(position, rule.update(POINTS[point == "x"])) for position, point in enumerate(points)]
+    return [(position, change.is_raised) for position, change in found if change is not None]
 
 
 @pytest.mark.parametrize(
@@ -28,7 +34,7 @@ def changes(rule: OnOffDelay, points: str) -> list[tuple[int, bool]]:
     ],
 )
 def test_three_of_five_raise_and_three_in_a_row_clear(points: str, expected: list[tuple[int, bool]]) -> None:
-    assert changes(OnOffDelay(3, 5, 3), points) == expected
+    assert changes(alarm(3, 5, 3), points) == expected
 
 
 @pytest.mark.parametrize(
@@ -53,8 +59,8 @@ def test_the_rate_is_what_simulation_finds() -> None:
     p, generator = 0.08, np.random.default_rng(5)
     lengths = []
     for _ in range(2000):
-        rule, condition, length = OnOffDelay(3, 5, 1), Condition(), 1
-        while rule.update(condition, bool(generator.random() < p)) is None:
+        rule, length = alarm(3, 5, 1), 1
+        while rule.update(POINTS[bool(generator.random() < p)]) is None:
             length += 1
         lengths.append(length)
     mean, error = np.mean(lengths), np.std(lengths) / np.sqrt(len(lengths))
@@ -64,4 +70,4 @@ def test_the_rate_is_what_simulation_finds() -> None:
 @pytest.mark.parametrize("rule", [(0, 5, 1), (6, 5, 1), (3, 13, 1), (3, 5, 0)])
 def test_numbers_that_make_no_rule_are_refused(rule: tuple[int, int, int]) -> None:
     with pytest.raises(ValueError, match="must be"):
-        OnOffDelay(*rule)
+        alarm(*rule)

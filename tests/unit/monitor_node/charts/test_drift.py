@@ -5,8 +5,7 @@ import pytest
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts import drift
 from monitor_node.config import MonitorConfig, ReferenceName
-from monitor_node.learn.arx import JUDGING_FORGETTING
-from monitor_node.learn.arx_fit import arx_structure
+from monitor_node.learn.arx import JUDGING_FORGETTING, arx_structure
 from reactorwatch.spc.parameter_drift import adaptive_weight
 from reactorwatch.spc.run_length.parameters import parameter_limit
 

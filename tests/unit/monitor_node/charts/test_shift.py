@@ -6,12 +6,11 @@ import pytest
 from benchmarks.exchanger import Result, config_of, random_exchanger, simulate, watch
 from monitor_node.config import MonitorConfig, ReferenceName
 from monitor_node.core import Monitor
-from monitor_node.ingest.alignment import Row
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, ChartPoint
 
-from ..samples import leaking_run, samples
+from ..samples import feed_row, leaking_run, samples
 
 ROWS, SECOND_NS = 1500, 10**9
 SIZES = (2.0, -2.0, 4.0, -20.0)
@@ -25,7 +24,7 @@ def exchanger(seed: int, rows: int = ROWS) -> tuple[Array, Array]:
 
 
 def take(monitor: Monitor, row: int, values: tuple[float, float]) -> list[Publication]:
-    return monitor.on_rows([Row(row * SECOND_NS, values, False)])
+    return feed_row(monitor, row, row * SECOND_NS, values)
 
 
 @pytest.fixture(scope="module", params=["arx", "black-box"])

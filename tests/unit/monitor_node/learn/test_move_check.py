@@ -5,18 +5,19 @@ import pytest
 
 from benchmarks.promise.black_box import TRAINING_MIN, sound_record, without_equations
 from monitor_node.core import Monitor
-from monitor_node.ingest.alignment import Row
 from monitor_node.learn.training_rows import AfterMoves, after_largest_moves, compare_after_moves
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Promise
 from reactorwatch.records.record import MINUTE_NS
 
+from ..samples import feed_row
+
 
 def promise_after(time_min: Array, rows: Array) -> Promise:
     """Promise of the ARX models after a training on rows of qc, C and T."""
     monitor = Monitor(without_equations("arx"), 0, points=False)
-    for minute, row in zip(time_min.tolist(), rows.tolist(), strict=True):
-        monitor.on_rows([Row(round(minute * MINUTE_NS), tuple(row), False)])
+    for number, (minute, row) in enumerate(zip(time_min.tolist(), rows.tolist(), strict=True)):
+        feed_row(monitor, number, round(minute * MINUTE_NS), row)
     promise = monitor.promise
     assert promise is not None
     return promise

@@ -87,7 +87,7 @@ def test_any_value_out_of_range_is_as_good_as_missing_and_raises_one_alarm_at_on
     cleared = next(item for item in alarms if item.alarm == first.alarm and item.event == "cleared")
     assert cleared.time_ns == (FIRST_BAD + BAD_ROWS + CONFIG.clear_count - 1) * 6 * 10**9
     assert filter_state(shown) == filter_state(missing)
-    learned = [replace(item.state.watch.evaluation, signals={}).to_bytes() for item in (shown, missing)]
+    learned = [replace(item.pipeline.memory.evaluation, signals={}).to_bytes() for item in (shown, missing)]
     assert learned[0] == learned[1]
     assert shown.failures.by_stage == {}
 

@@ -19,10 +19,10 @@ CONFIG = MonitorConfig(training_min=6.0, isolation=False)
 
 def test_a_state_names_the_build_that_stored_it_and_its_refusal_names_another_build() -> None:
     monitor = Monitor(CONFIG, 0, points=False)
-    settings = learning_settings(CONFIG, monitor.model, points=False)
+    settings = learning_settings(CONFIG, monitor.pipeline.model, points=False)
     data = monitor.to_bytes()
     assert MonitorState.from_bytes(SEAL.open(data)).build == this_build()
-    other = msgspec.structs.replace(monitor.state, settings=settings, build="0.2.0 (commit 0123456789ab)").to_bytes()
+    other = msgspec.structs.replace(open_state(data, settings), build="0.2.0 (commit 0123456789ab)").to_bytes()
     assert open_state(SEAL.close(other), settings).settings == settings
     with pytest.raises(OtherSettingsError, match=r"learned by 0\.2\.0 \(commit 0123456789ab\) with other settings"):
         open_state(SEAL.close(other), settings | {"training_min": 7.0})

@@ -253,7 +253,7 @@ def test_alarms_are_not_older_than_those_of_other_settings_after_a_state_was_asi
     node.on_stop(0)
     standing = next(alarm.alarm for alarm in own(node).alarms.all_alarms() if stands(alarm))
     other = start_node(msgspec.structs.replace(both, order=2), 0)
-    own(other).alarms.comment(standing, "Anna", "the valve is being repaired")
+    own(other).alarms.act(standing, "comment", "Anna", "the valve is being repaired")
     other.on_tick(0)
     again = start_node(both, 0)
     assert own(again).rows == own(node).rows

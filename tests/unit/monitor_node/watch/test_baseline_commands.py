@@ -6,11 +6,12 @@ import pytest
 from benchmarks.exchanger import PLANT, config_of, random_exchanger, simulate
 from monitor_node.config import ReferenceName
 from monitor_node.core import Monitor
-from monitor_node.ingest.alignment import Row
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, Baseline, BaselineCommand, CommandReply
+
+from ..samples import feed_row
 
 SECOND_NS, TRAINING, CHANGE, END = 10**9, 1000, 1100, 2600
 KEY = keys.key(PLANT, keys.COMMAND, "baseline")
@@ -36,7 +37,7 @@ class Run:
 
     def take_until(self, end: int) -> "Run":
         for k in range(self.next, end):
-            self.published += self.monitor.on_rows([Row(k * SECOND_NS, self.rows[k], False)])
+            self.published += feed_row(self.monitor, k, k * SECOND_NS, self.rows[k])
         self.next = max(end, self.next)
         return self
 

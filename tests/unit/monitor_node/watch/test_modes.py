@@ -7,10 +7,11 @@ import pytest
 from benchmarks.exchanger import PLANT, config_of
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.ingest.alignment import Row
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, BaselineCommand, ChartPoint, Quality, Sample
+
+from ..samples import feed_row
 
 SECOND_NS, TRAINING = 10**9, 400
 CONFIG = msgspec.structs.replace(
@@ -47,7 +48,7 @@ class Run:
             if k == 0 or mode != self.rows[k - 1][0]:
                 sample = Sample(time_ns=k * SECOND_NS, value=mode, quality=Quality.QUALITY_GOOD)
                 self.monitor.on_message(encode(Publication(keys.key(PLANT, keys.SAMPLE, "mode"), sample)), 0)
-            self.published.append(self.monitor.on_rows([Row(k * SECOND_NS, tuple(values), False)]))
+            self.published.append(feed_row(self.monitor, k, k * SECOND_NS, values))
         return self
 
     def resume(self) -> None:
