@@ -1,7 +1,6 @@
 """Monitor of one plant or of a fleet, with its stored states, liveliness tokens, commands and logs."""
 
 from collections.abc import Iterator
-from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from monitor_node.fleet.config import ONE_PLANT, FleetConfig, parse_shard
 from monitor_node.fleet.monitor import FleetMonitor, load_kinds
 from monitor_node.health import NODE, OtherMonitors
 from monitor_node.learn.training_diagnosis import read_equations
-from monitor_node.storage.state_files import StateFile, StateFolder
+from monitor_node.storage.state_files import RESUMED, StateStore
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import state_word
 from reactorwatch.contract.codec import Encoded, Publication
@@ -91,8 +90,7 @@ class MonitorNode(FleetMonitor):
         self._worker = DiagnosisWorker()
         self._others = OtherMonitors(self.token, lambda: self._monitors)
         self._rate = CommandRateLimiter()
-        self._file: StateFile | None = None
-        self._states: StateFolder | None = None
+        self._states: StateStore | None = None
         self._every_ns = int(config.state_every_s * 1e9)
         self._changed: set[str] = set()  # plants with a changed alarm or a command since their state was stored
         self._round: list[str] = []  # plants to check for new messages
@@ -111,16 +109,22 @@ class MonitorNode(FleetMonitor):
             on_watch=self._on_watched,
             diagnose=self._worker.submit,
         )
-        if self._is_single:
-            self.register(config.plant, start_ns, verified=True, restore=partial(self._restore_file, config))
+        if self._is_single and config.state_file is not None:
+            self._states = StateStore(Path(config.state_file), config.plant)
         elif fleet.state is not None:
-            self._states = StateFolder(make_folder(Path(fleet.state), "--state"))
-            self._log_claim(self._states.claim.failure)
-            for plant in self._states.plants:
-                if keys.matches(self.expression, f"{keys.ROOT}/{plant}"):
-                    self.register(plant, start_ns, verified=True, restore=partial(self._restore, plant))
+            self._states = StateStore(make_folder(Path(fleet.state), "--state"))
+        for plant in self._plants_at_start(config):
+            self.register(plant, start_ns, verified=True, restore=self._restore)
+        if self._states is not None and self._states.claim.failure:
+            log.warning(self._states.claim.failure)
 
     # --- plants ----------------------------------------------------------------------------------------------
+
+    def _plants_at_start(self, config: MonitorConfig) -> list[str]:
+        if self._is_single:
+            return [config.plant]
+        stored = [] if self._states is None else self._states.plants
+        return [plant for plant in stored if keys.matches(self.expression, f"{keys.ROOT}/{plant}")]
 
     @property
     def tokens(self) -> tuple[str, ...]:
@@ -212,53 +216,40 @@ class MonitorNode(FleetMonitor):
 
     def next_tick_ns(self) -> int:
         """See `FleetMonitor`; or the next look for findings, for states to store or for a step of the preparation."""
-        stored_ns = None if self._file is None else self._file.due_ns()
-        due_ns = super().next_tick_ns() if stored_ns is None else min(super().next_tick_ns(), stored_ns)
+        due_ns = super().next_tick_ns()
         polls = self.preparation is not None or self._states is not None or self._worker.is_busy
         return min(due_ns, self._poll_ns) if polls else due_ns
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; states are stored for the last time."""
         self._worker.close()
-        if self._file is not None:
-            self._file.monitor.unconfirmed = []
-            self._store_file(self._file)
-            self._file.claim.close()
         if self._states is not None:
-            for plant in filter(self.is_worth_storing, self.plants):
-                self._states.put(plant, self._monitors[plant].to_bytes())
+            for monitor in self._monitors.values():
+                monitor.unconfirmed = []
+            self._store(self._states, self.plants)
             self._states.close()
             self._count_failures(self._states)
         return super().on_stop(now_ns)
 
     # --- states ----------------------------------------------------------------------------------------------
 
-    def _restore_file(self, config: MonitorConfig, monitor: Monitor) -> None:
-        if config.state_file is not None:
-            self._file = StateFile(Path(config.state_file), monitor, config.state_every_s)
-            log.info(self._file.load())
-            self._log_claim(self._file.claim.failure)
-        self.resumed = monitor.rows > 0
-        self._repeated = monitor.unconfirmed if self.resumed else []
-
-    def _restore(self, plant: str, monitor: Monitor) -> None:
-        assert self._states is not None, "only its plants are restored"
-        if line := self._states.load(plant, monitor):
-            log.warning(line, plant=plant)
-
-    def _log_claim(self, failure: str) -> None:
-        if failure:
-            log.warning(failure)
-
-    def _store_file(self, file: StateFile) -> None:
-        """Store a state; log a failure once. A full disk must not stop the monitor: the next call retries."""
-        plant = file.monitor.config.plant
+    def _restore(self, monitor: Monitor) -> None:
+        """Restore a monitor from its stored state; a fleet's plant is watched without one that cannot be read."""
+        if self._states is None:
+            return
         try:
-            file.store()
+            line = self._states.load(monitor)
         except InputError as error:
-            self._log_failure(plant, str(error))
-        else:
-            self._logged.pop(plant, None)
+            if self._is_single:
+                self._states.close()
+                raise
+            line = str(error)
+        if self._is_single:
+            log.info(line)
+            self.resumed = monitor.rows > 0
+            self._repeated = monitor.unconfirmed if self.resumed else []
+        elif not line.endswith(RESUMED):
+            log.warning(line, plant=monitor.config.plant)
 
     def _store_due(self, now_ns: int) -> None:
         """Store plants with a changed alarm, which is published by now, and some of those with new messages."""
@@ -274,23 +265,29 @@ class MonitorNode(FleetMonitor):
             monitor = self._monitors.get(plant)
             if monitor is not None and monitor.memory.received != self._stored_at.get(plant):
                 due.append(plant)
-        for plant in filter(self.is_worth_storing, due):
-            monitor = self._monitors[plant]
-            self._states.put(plant, monitor.to_bytes())
-            self._stored_at[plant] = monitor.memory.received
+        self._store(self._states, due)
 
-    def _count_failures(self, states: StateFolder) -> None:
-        """Count failures to store states, and log each reason once."""
-        for plant, why in states.pop_failures():
+    def _store(self, states: StateStore, plants: list[str]) -> None:
+        """Store the states of plants; that of one plant is on the disk when this returns, or could not be written."""
+        for plant in plants:
+            if self._is_single or self.is_worth_storing(plant):
+                monitor = self._monitors[plant]
+                states.put(plant, monitor.to_bytes())
+                self._stored_at[plant] = monitor.memory.received
+        if self._is_single and plants and not self._count_failures(states):
+            self._logged.clear()
+
+    def _count_failures(self, states: StateStore) -> int:
+        """Count failures to store states, and log each reason once. A full disk must not stop the monitor."""
+        failures = states.pop_failures()
+        for plant, why in failures:
             self._stored_at.pop(plant, None)
             if plant in self._monitors:
                 self._monitors[plant].stats.not_stored += 1
-            self._log_failure(plant, why)
-
-    def _log_failure(self, plant: str, why: str) -> None:
-        if self._logged.get(plant) != why:
-            self._logged[plant] = why
-            log.warning(why, plant=plant)
+            if self._logged.get(plant) != why:
+                self._logged[plant] = why
+                log.warning(why, plant=plant)
+        return len(failures)
 
     # --- publications and logs -------------------------------------------------------------------------------
 
@@ -306,17 +303,18 @@ class MonitorNode(FleetMonitor):
             publications = self._log(publications)
         if self._is_single:
             self._log_notes()
-        if self._file is not None:
-            monitor = self._file.monitor
+        if self._is_single and self._states is not None:
+            (monitor,) = self._monitors.values()
             repeatable = [item for item in publications if not isinstance(item.message, Health)]
             monitor.unconfirmed = repeatable or monitor.unconfirmed
-            if self._file.is_due(now_ns):
-                self._store_file(self._file)
+            if self._changed:
+                self._changed.clear()
+                self._store(self._states, self.plants)
         return publications
 
     def _log(self, publications: list[Publication]) -> list[Publication]:
         """Log alarms and incidents, and mark plants with changes; returns publications without a fleet's empty KPIs."""
-        kept, claims_checked = list[Publication](), False
+        kept, is_checked = list[Publication](), False
         for publication in publications:
             message = publication.message
             if isinstance(message, AlarmKpis) and not self._is_single and publication.key not in self._kpi_keys:
@@ -328,13 +326,13 @@ class MonitorNode(FleetMonitor):
                 message.waiting_for = next(iter(self._logged.values()), "")
             topic = keys.parse(publication.key) if isinstance(message, Alarm | Baseline | Incident) else None
             plant = topic.plant if topic is not None else ""
-            if isinstance(message, Alarm | Baseline):
+            if topic is not None:
                 self._changed.add(plant)
                 self._poll_ns = 0  # as soon as it is published
             if isinstance(message, Alarm):
-                if not claims_checked:
-                    self._check_claims()
-                    claims_checked = True
+                if self._states is not None and not is_checked:
+                    self._states.claim.check()
+                    is_checked = True
                 log.info(
                     "alarm", plant=plant, alarm=message.alarm, change=message.event, by=message.by, text=message.text
                 )
@@ -343,11 +341,6 @@ class MonitorNode(FleetMonitor):
                 state, text = state_word(message.state), message.text
                 log.info("incident", plant=plant, number=message.number, state=state, suspects=suspects, text=text)
         return kept
-
-    def _check_claims(self) -> None:
-        for store in (self._file, self._states):
-            if store is not None:
-                store.claim.check()
 
     def _log_notes(self) -> None:
         for plant, monitor in self._monitors.items():

@@ -73,11 +73,6 @@ class ReceivedMessage(NamedTuple):
     channel: Channel
     sequence: int = 0
 
-    @property
-    def is_readable(self) -> bool:
-        """True if the payload was decoded."""
-        return self.message is not None
-
 
 def fingerprint(key: str, payload: bytes) -> int:
     """Hash of a message; differs between processes."""

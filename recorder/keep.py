@@ -16,13 +16,13 @@ is bounded. Keys with messages of the product have nearly all channels. Other ke
 their own, so that they take no channel from the product. The next file starts with all channels free: where a file is
 full and part of its keys are inactive, the next file is started early.
 
-Models, alarms, baselines, promises and faults are published when they change. A file in which none changes would not
-contain them. So the last message of each is repeated at the start of a file, marked as `RecordedMessage.latched`, with
-the time of its sample and with the start time of the file as its time of receipt.
+Models, alarms, incidents, baselines, promises and faults are published when they change. A file in which none changes
+would not contain them. So the last message of each is repeated at the start of a file, marked as
+`RecordedMessage.latched`, with the time of its sample and with the start time of the file as its time of receipt.
 """
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from math import inf
@@ -31,6 +31,7 @@ from typing import Literal, NamedTuple
 
 from google.protobuf.message import Message
 
+from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.records.record import NEVER_NS
 from recorder import RecordedMessage
@@ -414,12 +415,20 @@ class ChannelBudget:
         return len(self._received_ns) + self._latched >= self._most_keys
 
 
-STATES = frozenset({messages.ModelSnapshot, messages.Alarm, messages.Baseline, messages.Promise, messages.Fault})
-"""Types of messages that are latched."""
+LATCHED_KINDS: Mapping[str, type[Message]] = {
+    keys.MODEL: messages.ModelSnapshot,
+    keys.ALARM: messages.Alarm,
+    keys.INCIDENT: messages.Incident,
+    keys.BASELINE: messages.Baseline,
+    keys.PROMISE: messages.Promise,
+    keys.FAULT: messages.Fault,
+}
+"""Kinds of messages that are latched, with their types."""
+STATES = frozenset(LATCHED_KINDS.values())
 
 
 class LatchedMessages:
-    """Last message of each model, alarm, baseline, promise and fault.
+    """Last message of each model, alarm, incident that is not over, baseline, promise and fault.
 
     Args:
         capacity: largest number of messages; beyond it the oldest is dropped.
@@ -439,6 +448,8 @@ class LatchedMessages:
         else:
             return
         self._last.pop(name, None)
+        if isinstance(message, messages.Incident) and message.until_ns:
+            return  # each is a key of its own, and a plant goes on for years
         self._last[name] = recorded
         if len(self._last) > self._capacity:
             del self._last[next(iter(self._last))]

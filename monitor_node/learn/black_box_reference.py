@@ -190,7 +190,7 @@ class BlackBoxReference(FilterReference):
 
     @property
     def weakness(self) -> str:
-        """Reason why the promise may not hold at set points that the training has not seen; empty if it does."""
+        """See `Reference`."""
         if self.model.dynamics_sd <= UNCERTAIN:
             return ""
         return (

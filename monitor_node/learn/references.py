@@ -123,6 +123,11 @@ class Reference(ABC):
     def set_learning(self, learning: bool) -> None:  # noqa: B027 # without memory of the plant there is nothing to do
         """Learn from the rows to come, or not: while nothing is wrong, or a fault would be learned as ordinary."""
 
+    @property
+    def weakness(self) -> str:
+        """Reason why the promise may not hold at set points that the training has not seen; empty if it does."""
+        return ""
+
     def obstacles(self, inputs: Sequence[str]) -> Iterator[tuple[str, str]]:
         """Reasons why rows are not judged now, each with what it is about.
 

@@ -10,7 +10,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.learn.arx import arx_structure, fewest_rows
-from monitor_node.learn.training import FEWEST_ROWS
+from monitor_node.learn.baseline import FEWEST_ROWS
 from monitor_node.watch.pipeline_memory import PipelineMemory
 from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys

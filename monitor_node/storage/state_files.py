@@ -1,4 +1,4 @@
-"""Files of stored states: one for a monitor, a folder of them for a fleet.
+"""Stored states: the file of one plant, or a fleet's folder of them.
 
 A file is written under a temporary name and renamed, so that a kill leaves the file before or this one, intact. An
 unusable state is kept aside under another name, never overwritten, and used again when it fits: one learned over months
@@ -103,155 +103,75 @@ def restore(path: Path, monitor: Monitor, asides: Iterable[Path]) -> str:
     return f"{status}{joint} the monitor learns again"
 
 
-def write_state(path: Path, state: bytes, claim: Claim, kind: str) -> None:
-    """Write a state to the disk; `kind` names its file in messages.
+class StateStore:
+    """States of plants, each in a file of its own.
 
-    Raises:
-        InputError: the file cannot be written, or another monitor has claimed it; it is unchanged.
-    """
-    try:
-        write_durably(path, state, claim.check)  # just before the file is replaced: a slow disk comes before
-    except OSError as error:
-        raise InputError(f"{kind} {path}: cannot be written: {error.strerror}") from error
-
-
-class StateFile:
-    """Stores a monitor's state in a file; it is on the disk when `store` returns.
+    The state of one plant is on the disk when `put` returns. Those of a fleet are written by a thread, so that a slow
+    disk delays no alarm.
 
     Args:
-        path: the file.
-        monitor: the monitor.
-        every_s: storage interval in seconds.
+        path: folder of the states, `PLANT.state`; or the file of one plant.
+        plant: the one plant; None: the path is a folder.
 
     Raises:
-        InputError: another monitor uses the file.
+        InputError: the folder cannot be read or made, is no folder, or another monitor uses the file or the folder. One
+            that cannot be written to at the moment is no error.
     """
 
-    def __init__(self, path: Path, monitor: Monitor, every_s: float) -> None:
-        self._path, self.monitor, self._every_ns = path, monitor, int(every_s * 1e9)
-        self.claim = Claim(path.with_name(f".{path.name}{CLAIM}"), f"state_file {path}")
-        self._changes_stored: int | None = None
-        self._received_stored: int | None = None
-        self._due_ns: int | None = None
-
-    def load(self) -> str:
-        """Restore the monitor from the file, or from a kept one that fits; returns a line for the log.
-
-        Raises:
-            InputError: the file cannot be read, or is no state. One that cannot be written at the moment is no error.
-        """
-        try:
-            return self._load()
-        except InputError:
-            self.claim.close()
-            raise
-
-    def _load(self) -> str:
-        try:
-            asides = find_kept_aside(self._path.parent).get(self._path.name, [])
-            restored = restore(self._path, self.monitor, asides)
-        except ForeignFileError as error:
-            raise InputError(f"state_file {self._path}: {error}; it is left as it is: name another file") from error
-        except InputError as error:
-            raise InputError(f"state_file {self._path}: {error}") from error
-        except OSError as error:
-            raise InputError(f"state_file {self._path}: cannot be read or renamed: {error.strerror}") from error
-        line = f"state_file {self._path}: {restored}"
-        try:
-            self._write()
-        except InputError as error:
-            if not is_passing(error):
-                raise
-            line = f"{line}; {error}"
-        return line
-
-    def due_ns(self) -> int | None:
-        """Time of the next storage; None: nothing has changed."""
-        return None if self.monitor.memory.received == self._received_stored else self._due_ns
-
-    def is_due(self, now_ns: int) -> bool:
-        """True if an alarm or the baseline has changed, or messages were received and the interval is over."""
-        if self._due_ns is None or now_ns < self._due_ns - self._every_ns:  # the first time, or the clock was set back
-            self._due_ns = now_ns + self._every_ns
-        if self.monitor.changes == self._changes_stored and now_ns < self._due_ns:
-            return False
-        self._due_ns = now_ns + self._every_ns
-        return self.monitor.changes != self._changes_stored or self.monitor.memory.received != self._received_stored
-
-    def store(self) -> None:
-        """Write the present state.
-
-        Raises:
-            InputError: the file cannot be written; it is unchanged. The next try is after the interval.
-        """
-        self._changes_stored, self._received_stored = self.monitor.changes, None
-        self._write()
-        self._received_stored = self.monitor.memory.received
-
-    def _write(self) -> None:
-        try:
-            write_state(self._path, self.monitor.to_bytes(), self.claim, "state_file")
-        except InputError:
-            self.monitor.stats.not_stored += 1
-            raise
-
-
-class StateFolder:
-    """States of a fleet's plants, `PLANT.state`, written by a thread of its own: a slow disk delays no alarm.
-
-    Args:
-        folder: the folder.
-
-    Raises:
-        InputError: the folder cannot be read or made, is no folder, or another monitor uses it. One that cannot be
-            written to at the moment is no error.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, path: Path, plant: str | None = None) -> None:
+        self._path, self._only = path, plant
+        folder = path if plant is None else path.parent
+        self._name = f"state folder {path}" if plant is None else f"state_file {path}"
         self._queued: dict[str, bytes] = {}
         self._failed: list[tuple[str, str]] = []
         self._protected: set[str] = set()  # plants whose file is no state, or unreadable
         self._changed = threading.Condition()
         self._closed = False
+        self._thread: threading.Thread | None = None
+        if plant is None:
+            self._prepare_folder()
         try:
-            list(folder.iterdir())
-            with atomic_write(folder / f".{ENDING}") as probe:
-                probe.write_bytes(b"")
-            (folder / f".{ENDING}").unlink()
+            self._aside = find_kept_aside(folder)
         except OSError as error:
-            raise InputError(f"state folder {folder}: cannot be read or written to: {error.strerror}") from error
-        except InputError as error:
-            if not is_passing(error):
-                raise InputError(f"state folder {folder}: {error}") from error
-        self._remove_leftovers()
-        self._aside = find_kept_aside(folder)
-        self.claim = Claim(folder / CLAIM, f"state folder {folder}")
-        # A daemon: without `close` there is nothing to write.
-        self._thread = threading.Thread(target=self._write_pending, name="states", daemon=True)
-        self._thread.start()
+            raise InputError(f"{self._name}: cannot be read or renamed: {error.strerror}") from error
+        self.claim = Claim(folder / CLAIM if plant is None else path.with_name(f".{path.name}{CLAIM}"), self._name)
 
     @property
     def plants(self) -> list[str]:
-        """Plants with a stored state, in use or kept aside."""
-        names = {path.name for path in self._folder.glob(f"[!.]*{ENDING}")} | set(self._aside)
+        """Plants with a stored state in the folder, in use or kept aside."""
+        names = {path.name for path in self._path.glob(f"[!.]*{ENDING}")} | set(self._aside)
         return sorted(name.removesuffix(ENDING) for name in names if name.endswith(ENDING))
 
-    def load(self, plant: str, monitor: Monitor) -> str:
-        """Restore a plant's monitor; returns a line for the log, or nothing if it resumes from its file.
+    def load(self, monitor: Monitor) -> str:
+        """Restore a plant's monitor; returns a line for the log.
 
-        A file that is no state, or cannot be read, stays as it is, and nothing is stored of its plant.
+        The file of one plant is then written, so that a file that cannot be is refused at the start.
+
+        Raises:
+            InputError: the file is no state, or cannot be read. It stays as it is, and nothing is stored of the plant.
         """
-        path = self._path(plant)
+        plant = monitor.config.plant
+        path = self._path_of(plant)
+        name = f"state {path}" if self._only is None else self._name
         try:
-            restored = restore(path, monitor, self._aside.get(path.name, []))
+            line = f"{name}: {restore(path, monitor, self._aside.get(path.name, []))}"
         except (InputError, OSError) as error:
             self._protected.add(plant)
-            why = f"cannot be read or renamed: {error.strerror}" if isinstance(error, OSError) else str(error)
-            return (
-                f"state {path}: {why}; it is left as it is, and nothing is stored of the plant until it is moved away"
-            )
-        return "" if restored == RESUMED else f"state {path}: {restored}"
+            why = str(error) if isinstance(error, InputError) else f"cannot be read or renamed: {error.strerror}"
+            if self._only is None:
+                why += "; it is left as it is, and nothing is stored of the plant until it is moved away"
+            elif isinstance(error, ForeignFileError):
+                why += "; it is left as it is: name another file"
+            raise InputError(f"{name}: {why}") from error
+        if self._only is not None:
+            try:
+                self._write(plant, monitor.to_bytes())
+            except InputError as error:
+                if not is_passing(error):
+                    raise
+                monitor.stats.not_stored += 1
+                return f"{line}; {error}"
+        return line
 
     @property
     def has_room(self) -> bool:
@@ -259,10 +179,16 @@ class StateFolder:
         return len(self._queued) < MOST_PENDING
 
     def put(self, plant: str, state: bytes) -> None:
-        """Queue a state for writing; it replaces a queued one of the plant."""
+        """Write a state, or queue it in place of a queued one of the plant; see `pop_failures`."""
+        if self._only is not None:
+            self._try_write(plant, state)
+            return
         with self._changed:
             self._queued[plant] = state
             self._changed.notify()
+        if self._thread is None:  # a daemon: without `close` there is nothing to write
+            self._thread = threading.Thread(target=self._write_pending, name="states", daemon=True)
+            self._thread.start()
 
     def pop_failures(self) -> list[tuple[str, str]]:
         """Remove and return the failed writes: plant and reason."""
@@ -274,16 +200,27 @@ class StateFolder:
         with self._changed:
             self._closed = True
             self._changed.notify()
-        self._thread.join()
+        if self._thread is not None:
+            self._thread.join()
         self.claim.close()
 
-    def _path(self, plant: str) -> Path:
-        return self._folder / f"{plant}{ENDING}"
+    def _path_of(self, plant: str) -> Path:
+        return self._path / f"{plant}{ENDING}" if self._only is None else self._path
 
-    def _remove_leftovers(self) -> None:
-        """Remove temporary files of killed writers."""
+    def _prepare_folder(self) -> None:
+        """Check the folder, and remove temporary files of killed writers."""
+        try:
+            list(self._path.iterdir())
+            with atomic_write(self._path / f".{ENDING}") as probe:
+                probe.write_bytes(b"")
+            (self._path / f".{ENDING}").unlink()
+        except OSError as error:
+            raise InputError(f"{self._name}: cannot be read or written to: {error.strerror}") from error
+        except InputError as error:
+            if not is_passing(error):
+                raise InputError(f"{self._name}: {error}") from error
         oldest_s = time.time() - LEFT_S
-        for path in self._folder.glob(f".*{ENDING}.*.tmp"):
+        for path in self._path.glob(f".*{ENDING}.*.tmp"):
             with contextlib.suppress(OSError):
                 if path.stat().st_mtime < oldest_s:
                     path.unlink()
@@ -295,22 +232,29 @@ class StateFolder:
                 if not self._queued:
                     return
                 plant, state = next(iter(self._queued.items()))
-            why = self._write(plant, state)
+            self._try_write(plant, state)
             with self._changed:
                 if self._queued.get(plant) is state:
                     del self._queued[plant]
-            if why is not None:
-                self._failed.append((plant, why))
 
-    def _write(self, plant: str, state: bytes) -> str | None:
-        """Write a state; returns the reason if it cannot be written."""
-        path = self._path(plant)
+    def _try_write(self, plant: str, state: bytes) -> None:
+        try:
+            self._write(plant, state)
+        except InputError as error:
+            self._failed.append((plant, str(error)))
+
+    def _write(self, plant: str, state: bytes) -> None:
+        """Write a state to the disk.
+
+        Raises:
+            InputError: it cannot be written, or another monitor has claimed it; the file is unchanged.
+        """
+        path = self._path_of(plant)
         if plant in self._protected:
             if path.exists():
-                return f"state {path}: cannot be used and is not overwritten; move it away"
+                raise InputError(f"state {path}: cannot be used and is not overwritten; move it away")
             self._protected.discard(plant)
         try:
-            write_state(path, state, self.claim, "state")
-        except InputError as error:
-            return str(error)
-        return None
+            write_durably(path, state, self.claim.check)  # just before the file is replaced: a slow disk comes before
+        except OSError as error:
+            raise InputError(f"state {path}: cannot be written: {error.strerror}") from error

@@ -9,22 +9,21 @@ from collections.abc import Callable, Mapping, Sequence
 
 from monitor_node.config import MonitorConfig
 from monitor_node.health import NODE, Failures
+from monitor_node.learn.baseline import TrainingResult
 from monitor_node.learn.model_update import (
     ACCEPT,
     RESTORE,
     TRAINED,
     ModelUpdate,
-    ScheduledChange,
     check_command,
     is_command,
 )
-from monitor_node.learn.training import TrainingResult
+from monitor_node.learn.training import Training
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding, equations_text, read_equations
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.evaluation import Evaluation
 from monitor_node.watch.operation import Operation
 from monitor_node.watch.pipeline_memory import EvaluationMemory, ModesMemory
-from monitor_node.watch.training_stage import TrainingStage
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import copy_of
@@ -59,17 +58,13 @@ class Baselines:
         evaluation: Evaluation,
         operation: Operation,
         failures: Failures,
-        changes: deque[ScheduledChange],
+        changes: deque[Baseline],
         diagnose: Callable[[DiagnosisJob], Finding] | None,
     ) -> None:
         self._config, self._model, self._operation = config, model, operation
-        self._evaluation, self._models, self._failures, self._diagnose = (
-            evaluation,
-            evaluation.models,
-            failures,
-            diagnose,
-        )
-        self.training, self.update = TrainingStage(config, model, self._models), ModelUpdate(config, changes)
+        self._evaluation, self._models = evaluation, evaluation.models
+        self._failures, self._diagnose = failures, diagnose
+        self.training, self.update = Training(config, model, self._models), ModelUpdate(config, changes)
         self.kept: list[EvaluationMemory] = []
         self.modes = ModesMemory([float("nan")] * len(config.modes))
 
@@ -94,25 +89,24 @@ class Baselines:
     # --- training --------------------------------------------------------------------------------------------
 
     def end_training(
-        self, time_ns: int, rows: TrainingRows, trained: TrainingResult, period_ns: float, units: Sequence[str]
+        self, time_ns: int, trained: TrainingResult, period_ns: float, units: Sequence[str]
     ) -> Baseline | None:
         """Judge by what was learned from now on; returns the change of the model by the diagnosis of the training.
 
         Args:
             time_ns: time of the last row.
-            rows: rows of the training.
             trained: result of the training.
             period_ns: sampling period.
             units: units of the outputs.
         """
         self.start(trained, period_ns, units)
         if self._config.diagnose_training and equations_text(self._model):
-            self.update.rows = rows
+            self.update.rows = trained.rows
         if self._diagnose is not None and (job := self.diagnosis_job) is not None:
             self.on_finding(self._diagnose(job))
         change = self._change_model(time_ns, period_ns, units)
         if change is None:
-            self._check_training(rows)
+            self._check_training(trained.rows)
         return change
 
     def start(self, trained: TrainingResult, period_ns: float, units: Sequence[str]) -> None:
@@ -132,7 +126,7 @@ class Baselines:
     @property
     def diagnosis_job(self) -> DiagnosisJob | None:
         """The diagnosis of the training, while it is pending."""
-        return self.update.job(equations_text(self._model)) if self.update.is_pending else None
+        return self.update.job(self._model)
 
     def on_finding(self, finding: Finding) -> None:
         """Process the result of a diagnosis; a change holds from the next row on."""
@@ -144,7 +138,7 @@ class Baselines:
 
     def change(self, time_ns: int, period_ns: float, units: Sequence[str]) -> Baseline | None:
         """Execute the change that holds from a row on, and return it; None: there is none."""
-        if not is_command(self.update.changes[0].baseline):
+        if not is_command(self.update.changes[0]):
             return self._change_model(time_ns, period_ns, units)
         change = self.update.pop_due(time_ns)
         if change is not None:
@@ -155,10 +149,10 @@ class Baselines:
     def _change_model(self, time_ns: int, period_ns: float, units: Sequence[str]) -> Baseline | None:
         """Learn the baseline again with the model of a change, if one holds from this row on; returns it if so."""
         update, evaluation = self.update, self._evaluation
-        if update.changes and is_command(update.changes[0].baseline):
+        if update.changes and is_command(update.changes[0]):
             return None
-        rows, change = update.rows, update.pop_due(time_ns)
-        if change is None or rows is None:
+        change = update.pop_due(time_ns)
+        if change is None or update.rows is None:
             return None
         evaluation.leave_ordinary()
         try:
@@ -171,7 +165,7 @@ class Baselines:
             return None
         self.modes.reference = trained.reference.kind
         evaluation.start(trained, period_ns, units, again=True)
-        self._check_training(rows)
+        self._check_training(trained.rows)
         if evaluation.memory.rows_watched:  # the filter stands at the end of the training, and rows have come since
             trained.reference.restart()
             evaluation.release_values()
@@ -201,7 +195,7 @@ class Baselines:
         kept = [item.id for item in self.all[:-1]]
         has_rows, has_alarm = self.training.memory.began_ns is not None, self._evaluation.memory.incident is not None
         change = check_command(command, kept, has_rows=has_rows, has_alarm=has_alarm)
-        self.update.changes.append(ScheduledChange(None, change))
+        self.update.changes.append(change)
         return change
 
     def _execute(self, change: Baseline) -> None:

@@ -21,9 +21,9 @@ from monitor_node.health import NODE, Failures
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.learn.arx_reference import ArxReference
-from monitor_node.learn.model_update import ScheduledChange, is_command
+from monitor_node.learn.baseline import NO_VALUE, TrainingResult
+from monitor_node.learn.model_update import is_command
 from monitor_node.learn.signal_range import input_bounds
-from monitor_node.learn.training import NO_VALUE, TrainingResult
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.baselines import Baselines
@@ -36,7 +36,7 @@ from monitor_node.watch.promise import PromiseStage
 from monitor_node.watch.row_step import EVENT, VIOLATING
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -77,7 +77,7 @@ class PlantPipeline:
         points: bool = True,
         model: ProcessModel | None = None,
         failures: Failures | None = None,
-        changes: deque[ScheduledChange] | None = None,
+        changes: deque[Baseline] | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
         promises: PromiseStage | None = None,
     ) -> None:
@@ -152,7 +152,7 @@ class PlantPipeline:
             memory.training,
         )
         baselines.modes, baselines.kept, update.baseline = memory.modes, memory.kept, memory.change
-        update.changes.extend(ScheduledChange(None, change) for change in memory.commands)
+        update.changes.extend(memory.commands)
         update.rows = memory.undiagnosed if self._config.diagnose_training else None
         self.evaluation.resume(memory.evaluation, baselines.equations, now_ns, follows=True)
 
@@ -396,16 +396,14 @@ class PlantPipeline:
         is_over = training.share(period_ns, self.baselines.rows_in_other_modes) >= 1.0 or modes.is_resumed
         timed_out = self.evaluation.signals.silence.silent[self._inputs :]
         if is_over and not training.is_open and training.is_enough(timed_out):
-            rows, trained = training.finish()
+            trained = training.finish()
             if not trained.refused:
-                self._end_training(time_ns, rows, trained, row.publications)
+                self._end_training(time_ns, trained, row.publications)
                 self._evaluate(row, [])
                 row.publications.extend(self.snapshots(time_ns))
                 row.publications.extend(self._promise_messages(time_ns))
                 return
-            training.memory.refusals, training.refused = training.memory.refusals + 1, trained.refused
-            self.evaluation.notes.append(f"the training starts again: {trained.refused}")
-            training.restart(time_ns)
+            self.evaluation.notes.append(training.refuse(trained.refused, time_ns))
         if predictions := training.add(row):
             row.publications.extend(estimates(row, self._paths, predictions))
 
@@ -422,12 +420,10 @@ class PlantPipeline:
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
-        self._end_training(time_ns, *self.training.finish_early(), [])
+        self._end_training(time_ns, self.training.finish_early(), [])
 
-    def _end_training(
-        self, time_ns: int, rows: TrainingRows, trained: TrainingResult, publications: list[Publication]
-    ) -> None:
-        change = self.baselines.end_training(time_ns, rows, trained, self._sampling.period_ns, self._units)
+    def _end_training(self, time_ns: int, trained: TrainingResult, publications: list[Publication]) -> None:
+        change = self.baselines.end_training(time_ns, trained, self._sampling.period_ns, self._units)
         if change is not None:
             publications.append(Publication(self._baseline_key, change))
 

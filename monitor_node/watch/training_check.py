@@ -14,6 +14,7 @@ import msgspec
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import LARGEST_FALSE_ALARMS, MonitorConfig
 from monitor_node.ingest.alignment import Row
+from monitor_node.learn.training import TIMES_FEWEST
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.pipeline import PlantPipeline
 from monitor_node.watch.promise import (
@@ -23,7 +24,6 @@ from monitor_node.watch.promise import (
     extrapolate_count,
     probability_of,
 )
-from monitor_node.watch.training_stage import TIMES_FEWEST
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
@@ -84,7 +84,7 @@ def check_training(
     for row in aligned[:half]:
         learner.update(row, units, [])
     try:
-        _, trained = learner.training.finish_early(times=TIMES_FEWEST)
+        trained = learner.training.finish_early(times=TIMES_FEWEST)
         memory, learned = copy_of(learner.memory), copy_of(trained.reference.memory)
 
         def start(config: MonitorConfig) -> PlantPipeline:

@@ -35,9 +35,9 @@ from reactorwatch.records.output import check_folder_name
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import stop_on_signals
 from reactorwatch.runtime.logs import configure
-from recorder.__main__ import first_file
 from recorder.config import RecorderConfig
 from recorder.keep import ENDING
+from recorder.recording_files import file_names
 
 log = structlog.get_logger()
 
@@ -162,7 +162,7 @@ def _write_settings(
     """Write the settings beside the recordings, under the same name; returns each node's file."""
     out = Path(recorder.out)
     make_folder(out.parent if out.suffix == ENDING and not out.is_dir() else out, "--out")
-    recording = first_file(recorder, datetime.now(UTC))
+    recording = file_names(recorder).first(datetime.now(UTC))
     if recording.exists():
         raise InputError(f"--out {out}: a recording of that name exists; choose another name, or a folder")
     recorder = msgspec.structs.replace(recorder, about={**about, **recorder.about})

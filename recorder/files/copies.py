@@ -27,7 +27,7 @@ from recorder.files.part_file import PART, is_locked, lock_orphan
 from recorder.files.reader import Damage, Reader, StoredMessage, read_start
 from recorder.files.recording import SourceFile, merge_messages, open_sources
 from recorder.files.writer import RecordingWriter
-from recorder.keep import FileNames, LatchedMessages
+from recorder.keep import LATCHED_KINDS, FileNames, LatchedMessages
 
 log = structlog.get_logger()
 
@@ -176,10 +176,6 @@ def _is_recovered_from(path: Path, part: Path) -> bool:
         return own_metadata(read_start(path).metadata) == origin != {}
     except InputError:
         return False
-
-
-LATCHED_KINDS = frozenset({keys.MODEL, keys.ALARM, keys.INCIDENT, keys.BASELINE, keys.PROMISE, keys.FAULT})
-"""Kinds of messages that are latched."""
 
 
 class Window(NamedTuple):

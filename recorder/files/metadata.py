@@ -46,29 +46,18 @@ def own_metadata(records: Iterable[Metadata]) -> dict[str, str]:
 
 def gap_metadata(gap: Gap) -> dict[str, str]:
     """Metadata record of a gap."""
-    return {
-        "stream": gap.stream,
-        "publisher": f"{gap.publisher:016x}",
-        "first": str(gap.first),
-        "last": str(gap.last),
-        "messages": str(gap.messages),
-        "noticed_ns": str(gap.noticed_ns),
-        "noticed": datetime.fromtimestamp(gap.noticed_ns / 1e9, UTC).isoformat(timespec="milliseconds"),
-    }
+    noticed = datetime.fromtimestamp(gap.noticed_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+    values = {name: str(value) for name, value in gap._asdict().items()}
+    return {**values, "publisher": f"{gap.publisher:016x}", "noticed": noticed}
 
 
 def parse_gap(record: Metadata) -> Gap | None:
     """Gap of a metadata record; None if it is not one of a gap."""
-    metadata = record.metadata if record.name == GAP else {}
+    if record.name != GAP:
+        return None
     try:
-        return Gap(
-            metadata["stream"],
-            int(metadata["publisher"], 16),
-            int(metadata["first"]),
-            int(metadata["last"]),
-            int(metadata["messages"]),
-            int(metadata["noticed_ns"]),
-        )
+        stream, publisher, *numbers = (record.metadata[name] for name in Gap._fields)
+        return Gap(stream, int(publisher, 16), *map(int, numbers))
     except (KeyError, ValueError):
         return None
 

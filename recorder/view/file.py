@@ -8,7 +8,7 @@ import re
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,15 +51,12 @@ def write_rrd(
         InputError: the folder does not exist or cannot be written to, or the diagnosis cannot be read.
     """
     plots = read_time_plots(diagnosis) if diagnosis is not None else []
-
-    def onto(drawing: Renderer) -> None:
-        zero_ns = 0
+    zero_ns = 0
+    with _drawing(path) as drawing:
         for segment in (run,) if isinstance(run, RunColumns) else run:
             drawing.draw(segment, panels)
             zero_ns = segment.zero_ns
         drawing.add(DIAGNOSIS, "grid", plots, zero_ns)
-
-    _write(path, onto)
 
 
 def write_views(views_by_tab: Mapping[str, Sequence[View]], path: Path, zero_ns: int) -> None:
@@ -73,21 +70,20 @@ def write_views(views_by_tab: Mapping[str, Sequence[View]], path: Path, zero_ns:
     Raises:
         InputError: the folder does not exist or cannot be written to.
     """
-
-    def onto(drawing: Renderer) -> None:
+    with _drawing(path) as drawing:
         for title, views in views_by_tab.items():
             drawing.add(title, "grid", views, zero_ns)
 
-    _write(path, onto)
 
-
-def _write(path: Path, onto: Callable[[Renderer], None]) -> None:
+@contextmanager
+def _drawing(path: Path) -> Iterator[Renderer]:
+    """Renderer onto a file, which ends with its layout."""
     recording = rr.RecordingStream(APPLICATION)
     with atomic_write(path) as temporary, _pipe_to(temporary) as pipe:
         recording.save(pipe)
         try:
             drawing = Renderer(recording)
-            onto(drawing)
+            yield drawing
             recording.send_blueprint(drawing.layout.blueprint())
         finally:
             recording.flush()

@@ -10,8 +10,9 @@ import pytest
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import section
 from reactorwatch.runtime.node_main import main
-from recorder.__main__ import first_file, run
+from recorder.__main__ import run
 from recorder.config import RecorderConfig, ReplayConfig
+from recorder.recording_files import file_names
 
 NOON_IN_BERLIN = datetime(2026, 7, 1, 12, 0, 5, tzinfo=timezone(timedelta(hours=2)))
 
@@ -55,12 +56,12 @@ def test_a_replay_may_be_as_fast_as_it_goes_but_not_stand_still() -> None:
 
 def test_a_file_is_named_after_the_plant_and_the_time_in_utc(tmp_path: Path) -> None:
     config = RecorderConfig(plant="cstr", out=str(tmp_path))
-    assert first_file(config, NOON_IN_BERLIN) == tmp_path / "cstr-20260701T100005Z.mcap"
+    assert file_names(config).first(NOON_IN_BERLIN) == tmp_path / "cstr-20260701T100005Z.mcap"
 
 
 def test_out_may_name_the_file(tmp_path: Path) -> None:
     config = RecorderConfig(out=str(tmp_path / "run.mcap"))
-    assert first_file(config, NOON_IN_BERLIN) == tmp_path / "run.mcap"
+    assert file_names(config).first(NOON_IN_BERLIN) == tmp_path / "run.mcap"
 
 
 def test_the_process_ends_with_2_and_one_line_before_it_looks_for_a_router(

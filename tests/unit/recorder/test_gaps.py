@@ -9,10 +9,10 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.__main__ import open_files
 from recorder.config import RecorderConfig
 from recorder.files.copies import cut, receipt_window, recover
 from recorder.files.metadata import GAP, gap_metadata, parse_gap
+from recorder.recording_files import RecordingFiles
 from recorder.tools.inspect import inspect
 
 from .recording import SECOND, Fed, recorder
@@ -74,7 +74,7 @@ def test_what_the_files_before_hold_is_not_written_again_once(tmp_path: Path) ->
     first = recorder(tmp_path, 10 * SECOND, black_box_min=0.0)
     first.receive([sample(0), sample(1)], SECOND)
     first.stop()
-    fingerprints = open_files(RecorderConfig(out=str(tmp_path))).fingerprints_since(0)
+    fingerprints = RecordingFiles(RecorderConfig(out=str(tmp_path))).fingerprints_since(0)
     assert len(fingerprints) == 3  # with its last report of health
     again = recorder(
         tmp_path, 30 * SECOND, fingerprints=fingerprints, fingerprints_until_ns=90 * SECOND, black_box_min=0.0

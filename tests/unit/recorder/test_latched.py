@@ -32,6 +32,15 @@ def test_the_last_message_of_each_model_alarm_and_fault_is_repeated_and_nothing_
     assert {(entry.log_time_ns, entry.latched) for entry in entries} == {(1000, True)}
 
 
+def test_an_incident_is_repeated_until_it_is_over() -> None:
+    first, over = messages.Incident(number=1, alarms=["a"]), messages.Incident(number=1, alarms=["a"], until_ns=5)
+    second = messages.Incident(number=2, alarms=["b"])
+    active = remembered(("incident/1", first), ("incident/2", second)).messages(1000)
+    assert [entry.key for entry in active] == ["incident/1", "incident/2"]
+    later = remembered(("incident/1", first), ("incident/2", second), ("incident/1", over)).messages(1000)
+    assert [entry.key for entry in later] == ["incident/2"]
+
+
 def test_of_more_than_it_may_hold_the_oldest_are_forgotten() -> None:
     head = remembered(*((f"alarm/{number % 5}", messages.Alarm()) for number in range(20)), most=3)
     assert [entry.key for entry in head.messages(1000)] == ["alarm/2", "alarm/3", "alarm/4"]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from monitor_node.config import MonitorConfig
 from monitor_node.node import MonitorNode
-from monitor_node.storage.state_files import StateFolder
+from monitor_node.storage.state_files import StateStore
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError, UnavailableError, is_passing
@@ -25,8 +25,9 @@ from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import LOOPBACK
 from reactorwatch.runtime.retry import retry
 from reactorwatch.runtime.start import GONE_WITHIN_S, claim_name, instance_name, wait_ready
-from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
+from recorder.node import RecorderNode
+from recorder.recording_files import RecordingFiles
 from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S
 
@@ -44,8 +45,8 @@ def write_atomically(folder: Path) -> None:
 
 def start_recorder(out: Path) -> None:
     config = RecorderConfig(out=str(out))
-    with open_files(config) as files:
-        start_node(config, files, 0)
+    with RecordingFiles(config) as files:
+        RecorderNode(config, files, 0)
 
 
 STARTS: dict[str, tuple[str, Callable[[Path], object]]] = {
@@ -55,8 +56,8 @@ STARTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "a recorder's folder to list": ("iterdir", start_recorder),
     "a recorder's first file": ("open", start_recorder),
     "a recorder's only file": ("open", lambda folder: start_recorder(folder / "run.mcap")),
-    "a fleet's folder to make": ("mkdir", lambda folder: StateFolder(make_folder(folder / "new"))),
-    "a fleet's folder to list": ("iterdir", StateFolder),
+    "a fleet's folder to make": ("mkdir", lambda folder: StateStore(make_folder(folder / "new"))),
+    "a fleet's folder to list": ("iterdir", StateStore),
     "a monitor's state": ("read_bytes", lambda path: MonitorNode(MonitorConfig(state_file=str(path / "state")), 0)),
 }
 """What nodes need of a folder at their start: the call of the system that is refused, and who makes it."""

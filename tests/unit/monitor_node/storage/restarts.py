@@ -10,9 +10,9 @@ _running: list[MonitorNode] = []
 def start_node(config: MonitorConfig, start_ns: int) -> MonitorNode:
     """Start a monitor; those before are killed, with which their claims end."""
     while _running:
-        file = _running.pop()._file
-        if file is not None:
-            file.claim.close()
+        states = _running.pop()._states
+        if states is not None:
+            states.claim.close()
     _running.append(MonitorNode(config, start_ns))
     return _running[-1]
 

@@ -14,7 +14,7 @@ from monitor_node.fleet.config import FleetConfig
 from monitor_node.node import MonitorNode
 from monitor_node.storage import claims
 from monitor_node.storage.claims import Claim, is_local
-from monitor_node.storage.state_files import CLAIM, StateFolder
+from monitor_node.storage.state_files import CLAIM, StateStore
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.errors import InputError, is_passing
@@ -46,8 +46,8 @@ def local(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("local")
 def test_a_state_in_use_is_refused_in_one_line_for_a_monitor_and_for_a_fleet(tmp_path: Path) -> None:
     config = MonitorConfig(state_file=str(tmp_path / "monitor.state"))
-    node, states = MonitorNode(config, 0), StateFolder(tmp_path)
-    for start, thing in ((lambda: MonitorNode(config, 0), "state_file"), (lambda: StateFolder(tmp_path), "folder")):
+    node, states = MonitorNode(config, 0), StateStore(tmp_path)
+    for start, thing in ((lambda: MonitorNode(config, 0), "state_file"), (lambda: StateStore(tmp_path), "folder")):
         with pytest.raises(InputError, match=rf"{thing} \S+ is in use by another monitor; stop that") as refused:
             start()
         assert "\n" not in str(refused.value)
@@ -55,7 +55,7 @@ def test_a_state_in_use_is_refused_in_one_line_for_a_monitor_and_for_a_fleet(tmp
     node.on_stop(0)
     states.close()
     MonitorNode(config, 0).on_stop(0)
-    StateFolder(tmp_path).close()
+    StateStore(tmp_path).close()
 
 
 @pytest.mark.usefixtures("local")
@@ -111,7 +111,7 @@ def test_a_stalled_monitor_that_was_replaced_publishes_no_alarm_and_writes_no_st
     assert any(isinstance(item.message, Alarm) for message in run for item in own.on_message(message, 0))
     node = fleet_node(tmp_path)
     node.on_messages(run[: 3 * 250], 0)
-    second = StateFolder(tmp_path)
+    second = StateStore(tmp_path)
     with pytest.raises(InputError, match="was claimed by another monitor"):
         node.on_messages(run[3 * 250 :], 0)
     node.on_stop(0)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.node import MonitorNode
-from monitor_node.storage.state_files import CLAIM, StateFolder, find_kept_aside, keep_aside
+from monitor_node.storage.state_files import CLAIM, StateStore, find_kept_aside, keep_aside
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
 from reactorwatch.errors import InputError
@@ -254,7 +254,7 @@ def test_alarms_are_not_older_than_those_of_other_settings_after_a_state_was_asi
     standing = next(alarm.alarm for alarm in own(node).alarms.all_alarms() if stands(alarm))
     other = start_node(msgspec.structs.replace(both, order=2), 0)
     own(other).alarms.act(standing, "comment", "Anna", "the valve is being repaired")
-    other.on_tick(0)
+    other.on_stop(0)
     again = start_node(both, 0)
     assert own(again).rows == own(node).rows
     assert own(again).alarms.alarm(standing).comment == "the valve is being repaired"
@@ -268,7 +268,7 @@ def test_a_silence_that_stood_ends_with_the_next_sample(tmp_path: Path, rows: li
         node.on_message(message, 0)
     signals = own(node).pipeline.evaluation.signals
     signals.publish(signals.silence, 0, signals.silence.declare_timeout())
-    node.on_tick(0)
+    node.on_stop(0)
     again = start_node(config(tmp_path, order=2), 0)
     assert stands(own(again).alarms.alarm("silence/plant"))
     for message in rows[150:]:
@@ -311,7 +311,7 @@ def test_a_fleet_s_unusable_state_is_reported_before_its_plant_publishes_anythin
         assert "it is kept as a.state.damaged" in (line := capsys.readouterr().out)
         assert "the monitor learns again" in line
     assert sorted(files(tmp_path)) == ["a.state.damaged", "a.state.damaged.2"]
-    assert StateFolder(tmp_path).plants == ["a"]
+    assert StateStore(tmp_path).plants == ["a"]
 
 
 def test_a_plant_whose_state_could_only_be_kept_aside_is_watched_at_the_next_start(tmp_path: Path) -> None:

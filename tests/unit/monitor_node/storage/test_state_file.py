@@ -51,6 +51,7 @@ def test_it_is_stored_when_it_is_due_and_something_was_received(config: MonitorC
     path = Path(str(config.state_file))
     for number, message in enumerate(leak[:60]):
         node.on_message(message, number * SECOND // 10)
+        node.on_tick(number * SECOND // 10)
         assert node.next_tick_ns() <= 2 * SECOND + (number * SECOND // 10)
     assert 13 <= stored_rows(config) <= 20
     node.on_tick(60 * SECOND)
@@ -148,6 +149,7 @@ def test_a_full_disk_is_reported_once_counted_and_stops_no_monitor(
     node = start_node(config, 0)
     for number, message in enumerate(leak[:300]):
         node.on_message(message, number * SECOND)
+        node.on_tick(number * SECOND)
     count = health(node, 300 * SECOND).not_stored
     assert count > 50
     assert own(node).rows == 100
@@ -159,7 +161,7 @@ def test_a_full_disk_is_reported_once_counted_and_stops_no_monitor(
     node.on_message(leak[300], 310 * SECOND)
     node.on_tick(320 * SECOND)
     assert stored_rows(config) == 100
-    assert health(node, 330 * SECOND).not_stored == count + 1
+    assert health(node, 330 * SECOND).not_stored == count
 
 
 def test_an_accepted_command_on_the_baseline_is_stored_before_the_reply(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from monitor_node.storage.state_files import CLAIM, StateFolder
+from monitor_node.storage.state_files import CLAIM, StateStore
 from reactorwatch.errors import InputError
 
 
@@ -14,14 +14,14 @@ def names(folder: Path) -> list[str]:
 
 
 def test_the_newest_state_of_each_plant_is_there_when_the_folder_is_closed(tmp_path: Path) -> None:
-    states = StateFolder(tmp_path)
+    states = StateStore(tmp_path)
     for number in range(100):
         states.put("a", b"%d" % number)
         states.put("b", b"of b")
     states.close()
     assert names(tmp_path) == ["a.state", "b.state"]
     assert [(tmp_path / f"{plant}.state").read_bytes() for plant in "ab"] == [b"99", b"of b"]
-    again = StateFolder(tmp_path)
+    again = StateStore(tmp_path)
     assert again.plants == ["a", "b"]
     again.close()
 
@@ -29,7 +29,7 @@ def test_the_newest_state_of_each_plant_is_there_when_the_folder_is_closed(tmp_p
 def test_a_failed_write_is_reported_and_leaves_the_state_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = StateFolder(tmp_path)
+    before = StateStore(tmp_path)
     before.put("a", b"before")
     before.close()
 
@@ -37,7 +37,7 @@ def test_a_failed_write_is_reported_and_leaves_the_state_before(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    states = StateFolder(tmp_path)
+    states = StateStore(tmp_path)
     states.put("a", b"now")
     states.close()
     ((plant, why),) = states.pop_failures()
@@ -48,7 +48,7 @@ def test_a_failed_write_is_reported_and_leaves_the_state_before(
 
 def test_a_state_that_was_removed_by_a_person_is_written_again(tmp_path: Path) -> None:
     (tmp_path / "a.state").write_bytes(b"before")
-    states = StateFolder(tmp_path)
+    states = StateStore(tmp_path)
     (tmp_path / "a.state").unlink()
     states.put("a", b"now")
     states.close()
@@ -60,7 +60,7 @@ def test_temporary_files_of_a_killed_writer_are_removed_at_the_next_start(tmp_pa
     for path in (left, fresh):
         path.write_bytes(b"half")
     os.utime(left, (0.0, 0.0))
-    StateFolder(tmp_path).close()
+    StateStore(tmp_path).close()
     assert names(tmp_path) == [fresh.name]
 
 
@@ -68,4 +68,4 @@ def test_temporary_files_of_a_killed_writer_are_removed_at_the_next_start(tmp_pa
 def test_a_folder_that_is_none_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=f"state folder .*{name}"):
-        StateFolder(tmp_path / name)
+        StateStore(tmp_path / name)

@@ -143,14 +143,9 @@ def test_a_command_is_executed_by_a_monitor_that_resumes_before_the_next_row(
         if what == "restore":
             assert run.ask("relearn").accepted
             run.take_until(CHANGE + 13)
-        before = run.monitor.changes
         assert run.ask(what).accepted
-        assert run.monitor.changes == before + 1, "so the state is stored at once"
         if is_resumed:
             run.resume()
-        before = run.monitor.changes
-        run.take_until(CHANGE + 13 if what != "restore" else CHANGE + 14)
-        assert run.monitor.changes > before, "so is the change in force"
         run.take_until(CHANGE + 20)
     assert runs[0].changes[-1].what == what
     assert runs[0].published == runs[1].published
