@@ -29,7 +29,7 @@ from recorder.columns.samples import content_of
 from recorder.config import MB, RecorderConfig
 from recorder.core import ReceivedMessage, fingerprint
 from recorder.files.ages import Ages, BootClock, read_boot_clock
-from recorder.files.copies import cut, find_orphans, list_damaged, receipt_window, repair
+from recorder.files.copies import Window, cut, find_orphans, list_damaged, repair
 from recorder.files.index import read_summary, span_ns
 from recorder.files.metadata import FILE_INDEX, GAP, PROCESS, gap_metadata, process_metadata
 from recorder.files.part_file import PART, PartFile, is_locked
@@ -304,7 +304,7 @@ class RecordingFiles:
         path = self._black_boxes.new(interval)
         raised = datetime.fromtimestamp(interval.raised_ns / 1e9, UTC)
         metadata = {**self._metadata, "alarm": interval.alarm, "raised": raised.isoformat(timespec="milliseconds")}
-        window = receipt_window(interval.from_ns, interval.to_ns)
+        window = Window((interval.from_ns, interval.to_ns))
         while True:
             writing = self.path
             sources = [source for source in self._complete_files() if source.stat().st_mtime_ns >= interval.from_ns]

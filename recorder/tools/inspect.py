@@ -252,34 +252,25 @@ def inspect(path: Path) -> FileInfo:
     """
     if path.is_dir():
         recording = Recording(path)
-        found, start = overview(recording.messages()), read_start(recording.files[0])
-        return FileInfo(
-            overview=found,
-            metadata=recording.metadata,
-            zero_ns=zero_from(recording.metadata, found.starts_ns or 0),
-            damages=(),
-            gaps=recording.gaps,
-            processes=recording.processes,
-            profile=start.profile,
-            library=start.library,
-            attachments=tuple(attached.name for attached in start.attachments()),
-            live="" if recording.live is None else recording.live.name,
-        )
-    reader = Reader(path, tolerant=True)
-    found = overview(stored.recorded_message for stored in reader)
-    metadata, damages = own_metadata(reader.metadata), list(map(str, reader.damages))
-    if reader.orphans:
-        damages.append(f"{reader.orphans} messages of channels that are described nowhere")
+        found, reader, live = overview(recording.messages()), read_start(recording.files[0]), recording.live
+        metadata, records, damages = recording.metadata, recording.metadata_records, list[str]()
+    else:
+        reader, live = Reader(path, tolerant=True), None
+        found = overview(stored.recorded_message for stored in reader)
+        metadata, records, damages = own_metadata(reader.metadata), reader.metadata, list(map(str, reader.damages))
+        if reader.orphans:
+            damages.append(f"{reader.orphans} messages of channels that are described nowhere")
     return FileInfo(
         overview=found,
         metadata=metadata,
         zero_ns=zero_from(metadata, found.starts_ns or 0),
         damages=tuple(damages),
-        gaps=gaps_of(reader.metadata),
-        processes=processes_in(reader.metadata),
+        gaps=gaps_of(records),
+        processes=processes_in(records),
         profile=reader.profile,
         library=reader.library,
         attachments=tuple(attached.name for attached in reader.attachments()),
+        live="" if live is None else live.name,
     )
 
 

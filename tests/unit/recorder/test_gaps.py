@@ -10,7 +10,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.config import RecorderConfig
-from recorder.files.copies import cut, receipt_window, recover
+from recorder.files.copies import Window, cut, recover
 from recorder.files.metadata import GAP, gap_metadata, parse_gap
 from recorder.recording_files import RecordingFiles
 from recorder.tools.inspect import inspect
@@ -63,9 +63,9 @@ def test_recovery_and_merging_keep_it_and_a_cut_keeps_those_of_its_time(fed: Fed
     run = tmp_path / "run.mcap"
     (tmp_path / "cut_off.mcap").write_bytes(run.read_bytes()[:-1])
     recover(tmp_path / "cut_off.mcap", tmp_path / "saved.mcap")
-    cut([run], tmp_path / "cut.mcap", receipt_window(0, 2**63 - 1), {})
-    cut([run], tmp_path / "with.mcap", receipt_window(11 * SECOND, 20 * SECOND), {})
-    cut([run], tmp_path / "without.mcap", receipt_window(11 * SECOND, 19 * SECOND), {})
+    cut([run], tmp_path / "cut.mcap", Window((0, 2**63 - 1)), {})
+    cut([run], tmp_path / "with.mcap", Window((11 * SECOND, 20 * SECOND)), {})
+    cut([run], tmp_path / "without.mcap", Window((11 * SECOND, 19 * SECOND)), {})
     kept = {name: inspect(tmp_path / f"{name}.mcap").gaps for name in ("saved", "cut", "with", "without")}
     assert kept == {"saved": (ALARMS,), "cut": (ALARMS,), "with": (ALARMS,), "without": ()}
 

@@ -18,7 +18,7 @@ from reactorwatch.process import MODELS
 from reactorwatch.process.fault import parse_fault
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
-from recorder.files.copies import cut, receipt_window
+from recorder.files.copies import Window, cut
 from recorder.files.metadata import PROCESS, process_metadata, processes_in
 from recorder.files.recording import Recording
 from recorder.recording_files import RecordingFiles
@@ -93,7 +93,7 @@ def test_each_file_describes_the_plants_with_samples_in_it_and_a_copy_keeps_that
     names = [{plant: item.name for plant, item in inspect(file).processes.items()} for file in written]
     assert sorted(names, key=str) == [{"north": "three_tanks"}, {"south": "cstr"}]
     copy = tmp_path / "cut.mcap"
-    cut(written, copy, receipt_window(0, 2**62), {})
+    cut(written, copy, Window((0, 2**62)), {})
     assert {plant: item.name for plant, item in inspect(copy).processes.items()} == names[0] | names[1]
 
 
