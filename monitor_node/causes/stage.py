@@ -17,6 +17,7 @@ The result depends on the samples alone. While the most likely cause is a sensor
 
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from math import nan
 
 import msgspec
@@ -96,7 +97,7 @@ class RecentRows(Memory):
     n_inputs: int
     columns: int
     most: int
-    numbers: array = msgspec.field(default_factory=lambda: array("d"))  # type: ignore[type-arg] # none before Python 3.12
+    numbers: array = msgspec.field(default_factory=partial(array, "d"))  # type: ignore[type-arg] # none before Python 3.12
 
     def __len__(self) -> int:
         return min(len(self.numbers) // self.columns, self.most)
