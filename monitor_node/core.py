@@ -359,7 +359,7 @@ class Monitor:
     @property
     def baseline(self) -> Baseline | None:
         """Change of the baseline in force; None: rows are evaluated by the equations as given."""
-        return self.pipeline.model_update.baseline
+        return self.pipeline.baselines.update.baseline
 
     # --- status ----------------------------------------------------------------------------------------------
 

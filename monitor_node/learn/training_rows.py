@@ -18,6 +18,7 @@ residuals.
 
 from array import array
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from math import isfinite
 from typing import NamedTuple
@@ -61,8 +62,8 @@ class TrainingRows(Memory):
     """
 
     counts: list[int]
-    times: array = msgspec.field(default_factory=lambda: array("q"))  # type: ignore[type-arg] # none before Python 3.12
-    numbers: array = msgspec.field(default_factory=lambda: array("d"))  # type: ignore[type-arg]
+    times: array = msgspec.field(default_factory=partial(array, "q"))  # type: ignore[type-arg] # none before Python 3.12
+    numbers: array = msgspec.field(default_factory=partial(array, "d"))  # type: ignore[type-arg]
     dropped: int = 0
     keeps_all: bool = False
 

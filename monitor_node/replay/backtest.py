@@ -194,7 +194,7 @@ def train(
             monitor.on_message(message, message.received_ns)
     monitor.finish()
     monitor.pipeline.end_training(monitor.memory.last_ns or 0)
-    return TrainedPlant(monitor.pipeline.training_rows, copy_of(monitor.pipeline.memory), [*monitor.notes])
+    return TrainedPlant(monitor.pipeline.training.trained_rows, copy_of(monitor.pipeline.memory), [*monitor.notes])
 
 
 def run(
@@ -262,7 +262,7 @@ def run(
         reference=monitor.pipeline.newest_reference or None,
         noise_levels=monitor.pipeline.noise_levels,
         baseline=monitor.baseline,
-        training_rows=monitor.pipeline.training_rows if trained is None else trained.rows,
+        training_rows=monitor.pipeline.training.trained_rows if trained is None else trained.rows,
         promise=monitor.promise,
         not_watched=_describe_obstacle(monitor),
     )
@@ -271,7 +271,7 @@ def run(
 def _describe_obstacle(monitor: Monitor) -> str:
     """Reason why no row could be judged; empty if one was."""
     pipeline = monitor.pipeline
-    if pipeline.evaluation.has_judged:
+    if pipeline.has_judged:
         return ""
     if not pipeline.is_judged:
         return "the training has seen no row in the plant's mode of operation; train on rows in it"
@@ -280,7 +280,7 @@ def _describe_obstacle(monitor: Monitor) -> str:
             "no row could be predicted: rows must come one by one period, that of the training, with values of the "
             "inputs that it has seen; train on rows like these"
         )
-    if refused := pipeline.refused_training:
+    if refused := pipeline.training.refused:
         return f"no training was fit to learn from: {refused}"
     return "too short: all of it went into the training; make it shorter with --training or --training-rows"
 

@@ -108,8 +108,8 @@ def test_a_valve_lag_that_the_training_could_not_show_raises_no_alarm() -> None:
 def test_a_monitor_with_additional_states_resumes_bit_for_bit(uncertain: tuple[str, ...]) -> None:
     messages, monitor = messages_of(EXACT, 2, 12, 40.0), Monitor(QUICK, 0)
     first = publish(monitor, messages[: 3 * 202])
-    assert monitor.pipeline.diagnosis_job is not None
-    monitor.pipeline.on_finding(find(uncertain)(monitor.pipeline.diagnosis_job))
+    assert monitor.pipeline.baselines.diagnosis_job is not None
+    monitor.pipeline.baselines.on_finding(find(uncertain)(monitor.pipeline.baselines.diagnosis_job))
     first += publish(monitor, messages[3 * 202 : 3 * 300])
     (change,) = changes(first)
     assert all(item in change.model for item in uncertain)
