@@ -29,13 +29,14 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint
 from recorder import RecordedMessage
-from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
 from recorder.files.part_file import PartFile
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.keep import Fsync
+from recorder.node import RecorderNode
+from recorder.recording_files import RecordingFiles
 from recorder.tools.convert import read_record
 
 RATE_PER_S = 20_000
@@ -189,8 +190,8 @@ def fsync(folder: Path) -> None:
         config = RecorderConfig(out=str(folder / f"{policy}.mcap"), fsync=policy)
         Timed.waits_s.clear()
         start = time.perf_counter()
-        with open_files(config, Timed) as recorded:
-            node = start_node(config, recorded, 0)
+        with RecordingFiles(config, Timed) as recorded:
+            node = RecorderNode(config, recorded, 0)
             for number, message in enumerate(sent):
                 node.on_message(message, number * step_ns)
         took_ms = (time.perf_counter() - start) * 1e3 / FSYNC_SECONDS

@@ -94,10 +94,10 @@ def watch_live(record: Record) -> tuple[str, float]:
         for item in monitor.on_message(message, 0):
             if isinstance(item.message, Incident) and item.message.suspects:
                 suspect = (item.message.suspects[0].cause, item.message.suspects[0].probability)
-        if monitor.pipeline.model_update.is_pending and found < 0:
+        if monitor.pipeline.baselines.update.is_pending and found < 0:
             found = monitor.rows + LATE_ROWS
-        if monitor.rows == found and (job := monitor.pipeline.diagnosis_job) is not None:
-            monitor.pipeline.on_finding(find_deviations(job))
+        if monitor.rows == found and (job := monitor.pipeline.baselines.diagnosis_job) is not None:
+            monitor.pipeline.baselines.on_finding(find_deviations(job))
     return suspect
 
 

@@ -31,8 +31,8 @@ from monitor_node.ingest.samples import (
     reject_reason,
 )
 from monitor_node.ingest.sequence_check import HeldSample, ReplayFilter, SequenceCheck
-from monitor_node.learn.model_update import BASELINE, LIST, ScheduledChange
-from monitor_node.learn.training import NO_VALUE
+from monitor_node.learn.baseline import NO_VALUE
+from monitor_node.learn.model_update import BASELINE, LIST
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.monitor_state import (
     MonitorMemory,
@@ -103,7 +103,7 @@ class Monitor:
         self._power = points if power is None else power
         self.config = config = order_inputs(config, model)
         self._points, self._model, self._diagnose = points, model, diagnose
-        self._changes: deque[ScheduledChange] = deque()
+        self._changes: deque[Baseline] = deque()
         self._republishes_baseline = False
         self._signals = config.signals
         self.memory = MonitorMemory(
@@ -354,12 +354,12 @@ class Monitor:
 
     def schedule(self, baseline: Baseline) -> None:
         """Schedule a recorded change of the baseline for the row that it names."""
-        self._changes.append(ScheduledChange(baseline.time_ns, baseline))
+        self._changes.append(baseline)
 
     @property
     def baseline(self) -> Baseline | None:
         """Change of the baseline in force; None: rows are evaluated by the equations as given."""
-        return self.pipeline.model_update.baseline
+        return self.pipeline.baselines.update.baseline
 
     # --- status ----------------------------------------------------------------------------------------------
 
@@ -468,7 +468,7 @@ class Monitor:
         The alarms stay; an active one is cleared when its condition is found to be over.
         """
         self.failures.add(stage, error, "the plant is learned again, its alarms stay")
-        self._changes = deque(item for item in self._changes if item.at_ns is not None)  # findings on its training
+        self._changes = deque(item for item in self._changes if item.time_ns)  # findings on its training
         notes, before = self.pipeline.evaluation.notes, self.silence.of_plant
         self.pipeline = self._new_pipeline(self.alarms)
         self.pipeline.evaluation.notes, timeout = notes, self.silence.of_plant

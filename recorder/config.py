@@ -10,6 +10,7 @@ from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.runtime.setting_rules import check_bounds
 from recorder.keep import MAX_KEYS, Fsync
 
+MB = 1_000_000
 MAX_FLUSH_S = 1.0
 MIN_KEYS = 100
 

@@ -1,13 +1,15 @@
 """The recorder as a node: core, file policies and files."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Collection
 
+from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
+from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.core import ReceivedMessage, Recorder
+from recorder.config import MB, RecorderConfig
+from recorder.core import NODE, PRIORITIES, ReceivedMessage, Recorder
 from recorder.files.writer import WriteError
 from recorder.keep import STATES, AlarmInterval, BlackBox, ChannelBudget, FlushAndRotation, LatchedMessages
 from recorder.recording_files import RecordingFiles
@@ -16,48 +18,48 @@ RETRY_NS = 2_000_000_000
 """Time between two attempts to resume on a full disk."""
 
 
-@dataclass
-class Policies:
-    """Policies for the files, without I/O."""
-
-    rotation: FlushAndRotation
-    latched: LatchedMessages
-    black_box: BlackBox
-    channels: ChannelBudget
-
-
 class RecorderNode:
     """Records received messages; see `reactorwatch.runtime.event_loop.Node`.
 
-    Its health reports are published and received like any message, so they are not written here. The exception is the
-    last one, which would arrive after the subscription ends.
+    It starts with a new file, while what a killed recorder left is recovered. Its health reports are published and
+    received like any message, so they are not written here. The exception is the last one, which would arrive after the
+    subscription ends.
 
     Args:
-        core: decodes and counts messages.
-        policies: policies for the files.
-        files: the files; one was started.
-        health_period_ns: time between two health reports.
+        config: the settings.
+        files: the files, without a started one.
         start_ns: clock reading at the start.
-        has_room: returns True if a full disk has enough room to resume.
+        fingerprints: see `Recorder`.
+        fingerprints_until_ns: see `Recorder`.
     """
 
     def __init__(
         self,
-        core: Recorder,
-        policies: Policies,
+        config: RecorderConfig,
         files: RecordingFiles,
-        health_period_ns: int,
         start_ns: int,
-        has_room: Callable[[], bool] = lambda: True,
+        fingerprints: Collection[int] = (),
+        fingerprints_until_ns: int = 0,
     ) -> None:
-        self._core = core
-        self._rotation, self._latched = policies.rotation, policies.latched
-        self._black_box, self._channels = policies.black_box, policies.channels
-        self._files = files
-        self._health_period_ns = health_period_ns
-        self._next_health_ns = start_ns
-        self._next_retry_ns = start_ns
-        self._has_room = has_room
+        self._config, self._files = config, files
+        self._core = Recorder(config.plant, start_ns, fingerprints, fingerprints_until_ns)
+        self._rotation = FlushAndRotation(
+            round(config.flush_period_s * 1e9),
+            config.fsync,
+            config.rotate_min * MINUTE_NS,
+            config.rotate_mb * MB,
+            start_ns,
+        )
+        own = [keys.key(config.plant, keys.ALARM, name) for name in PRIORITIES]
+        self._channels = ChannelBudget(config.most_keys, (*own, keys.key(config.plant, keys.HEALTH, NODE)))
+        self._latched = LatchedMessages(self._channels.max_latched_messages)
+        self._black_box = build_black_box(config)
+        self._next_health_ns = self._next_retry_ns = start_ns
+        missed = files.find_missed_intervals(self._black_box, start_ns)
+        files.start_file((), start_ns)
+        files.recover_orphans()
+        for interval in missed:
+            files.save_black_box(interval)
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Write a message, and flush or rotate the file if due."""
@@ -92,7 +94,7 @@ class RecorderNode:
         published = self._retry(now_ns) if self._core.is_stopped else self._flush_if_due(now_ns)
         published += self._save_black_box(self._black_box.pop_ended(now_ns), now_ns)
         if now_ns >= self._next_health_ns:
-            self._next_health_ns = now_ns + self._health_period_ns
+            self._next_health_ns = now_ns + round(self._config.health_period_s * 1e9)
             published += self._core.clear_keys_alarm(now_ns)
             published.append(self._core.health(now_ns))
         return published
@@ -182,7 +184,7 @@ class RecorderNode:
         if now_ns < self._next_retry_ns:
             return []
         self._next_retry_ns = now_ns + RETRY_NS
-        if not self._has_room():
+        if self._files.free_bytes < self._config.resume_mb * MB:
             self._files.delete_oldest(self._black_box.protected_ns(now_ns))
             return []
         try:
@@ -191,3 +193,8 @@ class RecorderNode:
             self._files.abandon()
             return []
         return self._core.resume_recording(now_ns)
+
+
+def build_black_box(config: RecorderConfig) -> BlackBox:
+    """Black box of the settings."""
+    return BlackBox(round(config.black_box_min * MINUTE_NS), own=tuple(PRIORITIES))

@@ -7,7 +7,7 @@ import contextlib
 import os
 import shutil
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -15,23 +15,36 @@ from queue import SimpleQueue
 from types import TracebackType
 from typing import Self
 
+import msgspec
 import structlog
+import tomli_w
 
 from reactorwatch.contract import keys
-from reactorwatch.description.process import Process
+from reactorwatch.description.plants import PlantProcesses
 from reactorwatch.errors import InputError
+from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder import RecordedMessage
 from recorder.columns.samples import content_of
+from recorder.config import MB, RecorderConfig
 from recorder.core import ReceivedMessage, fingerprint
 from recorder.files.ages import Ages, BootClock, read_boot_clock
-from recorder.files.copies import cut, find_orphans, list_damaged, receipt_window, repair
+from recorder.files.copies import Window, cut, find_orphans, list_damaged, repair
 from recorder.files.index import read_summary, span_ns
 from recorder.files.metadata import FILE_INDEX, GAP, PROCESS, gap_metadata, process_metadata
 from recorder.files.part_file import PART, PartFile, is_locked
 from recorder.files.reader import Reader, StoredMessage, Wanted
 from recorder.files.writer import RecordingWriter, check_free, part_of
-from recorder.keep import ENDING, AlarmInterval, BlackBox, CompleteRecording, FileNames, Limits, select_deletions
+from recorder.keep import (
+    DAY_NS,
+    ENDING,
+    AlarmInterval,
+    BlackBox,
+    CompleteRecording,
+    FileNames,
+    Limits,
+    select_deletions,
+)
 
 log = structlog.get_logger()
 
@@ -43,37 +56,35 @@ class RecordingFiles:
     """Files that `RecorderNode` writes to; as a context manager, it is closed in every case.
 
     Args:
-        names: names of the files.
-        metadata: metadata of each file.
-        limits: limits of retention.
-        synced: True to sync each file when it is completed.
+        config: the settings; a folder that they name is made if it does not exist.
         open_part: opens the file that is written to.
         read_clock: reads the time since boot, which ages the recordings.
-        find_process: returns the process of a plant, which each file with its samples describes; None: unknown.
 
     Raises:
-        InputError: the folder does not exist, or the named file exists or is being written.
+        InputError: the folder does not exist or cannot be made, or the named file exists or is being written.
     """
 
     def __init__(
         self,
-        names: FileNames,
-        metadata: Mapping[str, str],
-        limits: Limits = Limits(),  # noqa: B008 (it is frozen)
-        *,
-        synced: bool = False,
+        config: RecorderConfig,
         open_part: Callable[[Path], PartFile] = PartFile,
         read_clock: Callable[[], BootClock] = read_boot_clock,
-        find_process: Callable[[str], Process | None] = lambda _: None,
     ) -> None:
-        self._find_process = find_process
+        names = self._names = file_names(config)
+        # run.csv is a file of another kind, not a folder's name
+        if names.dated and not names.folder.suffix[1:].isalpha():
+            make_folder(names.folder, "--out")
+        self._metadata = {
+            "plant": config.plant,
+            "key_expression": config.key_expression,
+            "configuration": tomli_w.dumps(msgspec.to_builtins(config)),
+            **config.about,
+        }
+        self._limits = Limits(config.keep_mb * MB, config.keep_days * DAY_NS, config.keep_files)
+        self._synced, self._open_part = config.fsync != "never", open_part
+        self._find_process = PlantProcesses(config.processes).find
         self._keys: set[str] = set()  # in the current file
         self._plants: set[str] = set()  # with samples in the current file
-        self._names = names
-        self._metadata = metadata
-        self._limits = limits
-        self._synced = synced
-        self._open_part = open_part
         self._writer: RecordingWriter | None = None
         self._black_boxes = BlackBoxFiles(names)
         self._tasks = BackgroundTasks()
@@ -99,6 +110,11 @@ class RecordingFiles:
     def size_bytes(self) -> int:
         """Size of the file being written; 0 if there is none."""
         return self._writer.size_bytes if self._writer is not None else 0
+
+    @property
+    def free_bytes(self) -> int:
+        """Free space on the disk of the folder."""
+        return free_bytes(self._names.folder)
 
     def recover_orphans(self) -> None:
         """Repair files of a crashed recorder in the background."""
@@ -288,7 +304,7 @@ class RecordingFiles:
         path = self._black_boxes.new(interval)
         raised = datetime.fromtimestamp(interval.raised_ns / 1e9, UTC)
         metadata = {**self._metadata, "alarm": interval.alarm, "raised": raised.isoformat(timespec="milliseconds")}
-        window = receipt_window(interval.from_ns, interval.to_ns)
+        window = Window((interval.from_ns, interval.to_ns))
         while True:
             writing = self.path
             sources = [source for source in self._complete_files() if source.stat().st_mtime_ns >= interval.from_ns]
@@ -314,6 +330,12 @@ class RecordingFiles:
             path.unlink()
             log.info("deleted", file=str(path), why="the limits of what is kept")
         self._ages.store()
+
+
+def file_names(config: RecorderConfig) -> FileNames:
+    """File names of the settings."""
+    out = Path(config.out)
+    return FileNames.of(out, config.plant, is_folder=out.is_dir())
 
 
 def free_bytes(folder: Path) -> int:

@@ -40,7 +40,20 @@ TimeNs: TypeAlias = Annotated[int, msgspec.Meta(ge=-(2**63), le=LAST_NS)]
 
 
 class SuspectedCause(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A possible cause of an alarm; the fields of a `Suspect` message."""
+    """A possible cause of an alarm; the fields of a `Suspect` message.
+
+    Attributes:
+        cause: name of the cause.
+        probability: posterior probability.
+        profile: `step` or `ramp`; empty if not known.
+        size: size in `unit`; of a ramp in the newest row.
+        size_sd: standard deviation of the size.
+        unit: unit of the size.
+        onset_ns: time of the onset.
+        onset_sd_min: standard deviation of the onset.
+        kind: `sensor` or `process`; empty if not known.
+        text: the cause in words.
+    """
 
     cause: str
     probability: float

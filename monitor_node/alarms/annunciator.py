@@ -24,7 +24,7 @@ from monitor_node.alarms.alarms import (
     SuspectedCause,
     TimeNs,
 )
-from monitor_node.alarms.incidents import Incident, KpiCounter
+from monitor_node.alarms.incidents import Activation, Incident, KpiCounter
 from monitor_node.config import MonitorConfig, PriorityName
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_states import CODES, UNACKNOWLEDGED_STATES, Event, State, is_consistent, next_state
@@ -81,6 +81,7 @@ class Annunciator:
 
     Attributes:
         memory: memory of the alarms.
+        incident: number of the latest incident; 0 before the first.
         has_unexplained: True if an alarm is active that does not name its cause itself.
     """
 
@@ -94,6 +95,7 @@ class Annunciator:
         )
         self._shelved: list[ChartAlarm] = []
         self.memory = AnnunciatorMemory()
+        self.incident = 0
         self.has_unexplained = False
         self.describe_operation: Callable[[int], str] = lambda time_ns: ""
         """Operation of the plant at a time, which the text of a raised alarm then states; empty: as usual."""
@@ -147,7 +149,7 @@ class Annunciator:
             time_ns: time of the row.
             changes: changes of alarms declared here.
         """
-        publications, activated = list[Publication](), list[tuple[int, ChartAlarm]]()
+        publications: list[Publication] = []
         operation = self.describe_operation(time_ns) if changes else ""
         for change in changes:
             alarm, memory, judgement = change.alarm, change.alarm.memory, change.judgement
@@ -165,13 +167,10 @@ class Annunciator:
             else:
                 memory.cleared_ns, memory.text = at_ns, f"{alarm.name} is back within its limits"
             event = Event.RAISED if change.is_raised else Event.CLEARED
-            if self._set_state(alarm, event, at_ns):
-                activated.append((at_ns, alarm))
+            self._set_state(alarm, event, at_ns)
             publications.append(self._publication(alarm, event, at_ns))
             if change.entries:
                 self.set_suspects(change.entries)
-        if activated:
-            self.memory.kpis.count(activated)
         return publications
 
     def end_row(self, time_ns: int) -> list[Publication]:
@@ -186,7 +185,7 @@ class Annunciator:
         for alarm in self._shelved:
             # A clock that was set back ends shelving as well; otherwise it would last as much longer.
             if not alarm.memory.shelved_ns <= time_ns < alarm.memory.shelved_until_ns:
-                self._change(alarm, Event.SHELF_TIME_OVER, time_ns)
+                self._set_state(alarm, Event.SHELF_TIME_OVER, time_ns)
                 publications.append(self._publication(alarm, Event.SHELF_TIME_OVER, time_ns))
         if memory.incidents_due:
             publications += self._publish_incidents(time_ns)
@@ -212,11 +211,6 @@ class Annunciator:
             return False
         known = {alarm.name for alarm in counting}
         return all(name in known or not alarm.memory.recent for name, alarm in self._alarms.items())
-
-    @property
-    def incident(self) -> int:
-        """Number of the latest incident; 0 before the first."""
-        return self.memory.incidents[-1].number if self.memory.incidents else 0
 
     # --- operators -------------------------------------------------------------------------------------------
 
@@ -246,7 +240,7 @@ class Annunciator:
         if action is Event.SHELVE and not 0 < minutes <= longest:
             raise InputError(f"minutes must be in (0, {longest:g}], which longest_shelf_min sets, got {minutes:g}")
         try:
-            self._change(alarm, action, time_ns)
+            self._set_state(alarm, action, time_ns)
         except InputError as error:
             raise InputError(f"alarm {name} {error}") from error
         memory.by, memory.comment = by, comment or memory.comment
@@ -305,13 +299,8 @@ class Annunciator:
             raise InputError(f"there is no alarm {name!r} (there are: {', '.join(self._alarms)})")
         return alarm
 
-    def _change(self, alarm: ChartAlarm, event: Event, time_ns: int) -> None:
-        """Apply an event that is not of a row's points."""
-        if self._set_state(alarm, event, time_ns):
-            self.memory.kpis.count([(time_ns, alarm)])
-
-    def _set_state(self, alarm: ChartAlarm, event: Event, time_ns: int) -> bool:
-        """Apply an event to the state of an alarm, and to its incident; returns True if the alarm was activated.
+    def _set_state(self, alarm: ChartAlarm, event: Event, time_ns: int) -> None:
+        """Apply an event to the state of an alarm, to its incident, and to the KPIs.
 
         Raises:
             InputError: the table of states refuses the event; nothing has changed.
@@ -324,17 +313,20 @@ class Annunciator:
             for incident in self.memory.incidents:
                 if incident.number == memory.incident:
                     incident.changed_ns = time_ns
-        is_activated = memory.state is State.UNACKNOWLEDGED and before is not State.UNACKNOWLEDGED
-        if is_activated and not memory.incident:
-            self._assign(alarm, time_ns)
+        if memory.state is State.UNACKNOWLEDGED and before is not State.UNACKNOWLEDGED:
+            kpis, priority = self.memory.kpis, alarm.priority
+            kpis.recent.append(Activation(time_ns, alarm.name))
+            kpis.raised[priority] = kpis.raised.get(priority, 0) + 1
+            if not memory.incident:
+                self._assign(alarm, time_ns)
         self._refresh()
         self.memory.kpis_due = self.memory.incidents_due = True
-        return is_activated
 
     def _refresh(self) -> None:
         """Refresh what every row reads and few rows change."""
         alarms = self._alarms.values()
         self._shelved = [alarm for alarm in alarms if alarm.memory.state is State.SHELVED]
+        self.incident = self.memory.incidents[-1].number if self.memory.incidents else 0
         self.has_unexplained = any(alarm.memory.is_active and not alarm.names_cause for alarm in alarms)
 
     def _publication(self, alarm: ChartAlarm, event: str, time_ns: int) -> Publication:

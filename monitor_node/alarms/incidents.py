@@ -8,7 +8,7 @@ than a day is *stale*: it calls for no action, so it should not be an alarm.
 An alarm is counted when it becomes unacknowledged. All times are plant time.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from typing import NamedTuple
 
 import msgspec
@@ -73,16 +73,8 @@ class Incident(msgspec.Struct, forbid_unknown_fields=True):
 
 def is_empty(kpis: AlarmKpis) -> bool:
     """True if no alarm was ever activated, and none is shelved, suppressed or out of service."""
-    return not (
-        kpis.alarms_10min
-        or kpis.standing
-        or kpis.unacknowledged
-        or kpis.shelved
-        or kpis.suppressed
-        or kpis.out_of_service
-        or kpis.incidents
-        or any(count.raised for count in kpis.priorities)
-    )
+    given = {field.name for field, _ in kpis.ListFields()} - {"time_ns", "priorities"}
+    return not (given or any(count.raised for count in kpis.priorities))
 
 
 class Activation(NamedTuple):
@@ -103,13 +95,6 @@ class KpiCounter(Memory):
     recent: list[Activation] = msgspec.field(default_factory=list)
     raised: dict[int, Count] = msgspec.field(default_factory=dict)
 
-    def count(self, activated: Iterable[tuple[int, ChartAlarm]]) -> None:
-        """Count activations: time and alarm of each."""
-        for time_ns, alarm in activated:
-            self._evict(time_ns)
-            self.recent.append(Activation(time_ns, alarm.name))
-            self.raised[alarm.priority] = self.raised.get(alarm.priority, 0) + 1
-
     def compute(self, time_ns: int, alarms: Collection[ChartAlarm], incidents: int) -> AlarmKpis:
         """Compute the KPIs.
 
@@ -118,8 +103,8 @@ class KpiCounter(Memory):
             alarms: all alarms of the plant.
             incidents: number of incidents so far.
         """
-        self._evict(time_ns)
-        recent = self.recent
+        # Those in the future are from before the clock was set back.
+        recent = self.recent = [item for item in self.recent if 0 <= time_ns - item.time_ns < RATE_WINDOW_NS]
         states = [alarm.memory.state for alarm in alarms]
         active = [alarm for alarm in alarms if alarm.memory.state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED)]
         return AlarmKpis(
@@ -143,10 +128,6 @@ class KpiCounter(Memory):
             out_of_service=states.count(State.OUT_OF_SERVICE),
             incidents=incidents,
         )
-
-    def _evict(self, time_ns: int) -> None:
-        """Evict activations older than ten minutes, and those in the future, from before the clock was set back."""
-        self.recent = [item for item in self.recent if 0 <= time_ns - item.time_ns < RATE_WINDOW_NS]
 
     def _chatters(self, alarm: str) -> bool:
         times = [item.time_ns for item in self.recent if item.alarm == alarm]

@@ -41,7 +41,11 @@ from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 
-UNKNOWN, SENSOR, PROCESS = "unknown", "sensor", "process"
+UNKNOWN = "unknown"
+"""Name of a cause that none of the causes here is; it has no size."""
+
+SENSOR, PROCESS = "sensor", "process"
+"""Kinds of causes."""
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)

@@ -9,14 +9,12 @@ Where rows are missing and the input after them differs, the time of the change 
 `kalman.input_uncertainty`): no cause may be inferred from a lost row.
 """
 
-from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite, nan
 from typing import NamedTuple, TypeAlias
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +24,6 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.ekf import LONGEST_GAP_MIN, Filter, FilterState
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.kalman.input_uncertainty import InputUncertainty
-from reactorwatch.stored_state import Memory
 
 Row: TypeAlias = tuple[float, Sequence[float], Sequence[float]]
 """Time in minutes, inputs, outputs; missing values are NaN."""
@@ -47,55 +44,6 @@ MOST_PIECES = 6_000
 apart. A filter takes some microseconds for each piece, so fewer rows are used if they are farther apart."""
 
 _CHUNK_ROWS = 16
-
-SLACK_ROWS = 64
-"""Rows by which more are stored before the oldest are removed together: that moves all others."""
-
-
-class RecentRows(Memory):
-    """The newest rows in one array of doubles: most of the memory of a plant. The object is its own state.
-
-    Attributes:
-        n_inputs: number of inputs.
-        columns: numbers of a row: time in minutes, inputs, outputs.
-        most: number of rows that are kept.
-        numbers: the rows one after the other, oldest first; up to `SLACK_ROWS` more than are kept.
-    """
-
-    n_inputs: int
-    columns: int
-    most: int
-    numbers: array = msgspec.field(default_factory=lambda: array("d"))  # type: ignore[type-arg] # none before Python 3.12
-
-    def __len__(self) -> int:
-        return min(len(self.numbers) // self.columns, self.most)
-
-    def add(self, row: Sequence[float]) -> bool:
-        """Add a row: time in minutes, inputs, outputs.
-
-        Returns:
-            False if the row is not later than the newest, and all rows before it were removed.
-        """
-        is_later = not self.numbers or row[0] > self.numbers[-self.columns]
-        if not is_later:
-            del self.numbers[:]
-        self.numbers.extend(row)
-        if len(self.numbers) > (self.most + SLACK_ROWS) * self.columns:
-            self.keep(self.most)
-        return is_later
-
-    def keep(self, most: int) -> None:
-        """Keep this many rows from now on, and of those so far."""
-        del self.numbers[: -len(self) * self.columns]
-        self.most = most
-        del self.numbers[: -most * self.columns]
-
-    def rows(self) -> list[Row]:
-        """The rows, oldest first."""
-        size, inputs = self.columns, 1 + self.n_inputs
-        values = self.numbers[-len(self) * size :].tolist()
-        parts = (values[begin : begin + size] for begin in range(0, len(self) * size, size))
-        return [(part[0], part[1:inputs], part[inputs:]) for part in parts]
 
 
 @dataclass(frozen=True, eq=False)

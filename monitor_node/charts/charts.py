@@ -7,10 +7,9 @@ cleared, so that false alarms do not come in clusters.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence, Sized
-from dataclasses import dataclass
 from itertools import compress, islice
 from math import nan
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -58,10 +57,6 @@ class ChartsMemory(Memory):
 _Judgements: TypeAlias = list[Judgement | None] | None
 
 
-def _without(known: list[bool], withheld: tuple[bool, ...]) -> list[bool]:
-    return [here and not outlier for here, outlier in zip(known, withheld, strict=True)]
-
-
 class _ChartRow(NamedTuple):
     """A row as charts take it.
 
@@ -79,12 +74,20 @@ class _ChartRow(NamedTuple):
     inputs: Sequence[float]
     values: Sequence[float]
 
+    def present(self, kind: type[Chart]) -> list[bool]:
+        """For each output, True if charts of a kind take its residual."""
+        if True not in self.withheld or not kind.has_memory:
+            return self.known
+        return [known and not withheld for known, withheld in zip(self.known, self.withheld, strict=True)]
+
 
 class _Charts(ABC):
     """Charts of one name.
 
     Attributes:
         memory: memory of these charts, see `ChartsMemory`.
+        alarms: alarm of each chart.
+        keys: key of each chart's points.
         locates: True if the first signals of an explanation are those at which a disturbance may enter.
         judges_unpredicted: True if rows that are not predicted are judged.
     """
@@ -93,6 +96,8 @@ class _Charts(ABC):
 
     def __init__(self, memory: Any) -> None:
         self.memory = memory
+        self.alarms: list[ChartAlarm] = []
+        self.keys: list[str] = []
 
     @abstractmethod
     def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
@@ -112,12 +117,10 @@ class _Banked(_Charts):
 
     def __init__(self, bank: Bank[CompiledChart], kind: type[CompiledChart]) -> None:
         super().__init__(bank.memory)
-        self._bank, self._kind, self._has_memory = bank, kind, kind.has_memory
+        self._bank, self._kind = bank, kind
 
     def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
-        known, withheld = row.known, row.withheld
-        present = _without(known, withheld) if True in withheld and self._has_memory else known
-        return self._bank.judge(row.e, present, always=always)
+        return self._bank.judge(row.e, row.present(self._kind), always=always)
 
     def restart(self, index: int) -> None:
         self._bank.restart(index)
@@ -134,14 +137,11 @@ class _OfEach(_Charts):
         self._charts = charts
 
     def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
-        known = row.known
-        if True in row.withheld and self._charts[0].has_memory:
-            known = _without(known, row.withheld)
+        present = row.present(type(self._charts[0]))
         judgements = [
-            item.update(value) if here else None for item, value, here in zip(self._charts, row.e, known, strict=True)
+            item.update(value) if here else None for item, value, here in zip(self._charts, row.e, present, strict=True)
         ]
-        is_out = any(judgement is not None and judgement.out for judgement in judgements)
-        return judgements if is_out or always else None
+        return judgements if always or any(item is not None and item.out for item in judgements) else None
 
     def restart(self, index: int) -> None:
         self._charts[index].restart()
@@ -150,7 +150,25 @@ class _OfEach(_Charts):
         return self._charts[index].explain(judgement, signals[index])
 
 
-class _OfAll(_Charts):
+Joined = TypeVar("Joined", bound=Chart)
+
+
+class _Single(_Charts, Generic[Joined]):
+    """One chart of several signals."""
+
+    def __init__(self, joined: Joined) -> None:
+        super().__init__(joined.memory)
+        self._chart = joined
+
+    def _judge(self, x: Any, *, always: bool) -> _Judgements:
+        judgement = self._chart.update(x)
+        return [judgement] if judgement.out or always else None
+
+    def restart(self, index: int) -> None:
+        self._chart.restart()
+
+
+class _OfAll(_Single[JointChart]):
     """A chart of all outputs together.
 
     Args:
@@ -159,30 +177,21 @@ class _OfAll(_Charts):
     """
 
     def __init__(self, joint: JointChart, evaluated: list[bool]) -> None:
-        super().__init__(joint.memory)
-        self._chart = joint
-        self._evaluated, self._all = evaluated, all(evaluated)
-        self._last: list[float] = []
+        super().__init__(joint)
+        self._evaluated, self._last = evaluated, list[float]()
 
     def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
         """Update with a row; a row with a missing output is skipped."""
-        e, known, withheld = row.e, row.known, row.withheld
-        if not self._all:
-            e, known = list(compress(e, self._evaluated)), list(compress(known, self._evaluated))
-        if False in known or True in withheld:
+        if True in row.withheld or False in compress(row.known, self._evaluated):
             return None
-        self._last = e
-        judgement = self._chart.update(e)
-        return [judgement] if judgement.out or always else None
-
-    def restart(self, index: int) -> None:
-        self._chart.restart()
+        self._last = list(compress(row.e, self._evaluated))
+        return self._judge(self._last, always=always)
 
     def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
         return self._chart.explain(self._last, list(compress(signals, self._evaluated)))
 
 
-class _OfValues(_Charts):
+class _OfValues(_Single[ValueChart]):
     """A chart of the measured values of all signals.
 
     Args:
@@ -191,38 +200,20 @@ class _OfValues(_Charts):
     """
 
     def __init__(self, values: ValueChart, config: MonitorConfig) -> None:
-        super().__init__(values.memory)
-        self._chart, self.locates, self.judges_unpredicted = values, values.locates, not config.inputs
+        super().__init__(values)
+        self.locates, self.judges_unpredicted = values.locates, not config.inputs
         self._indices = [config.signals.index(name) for name in values.names]
 
     def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
         """Update with a row; one that is not predicted at all is skipped, since inputs may be beyond the training."""
         if True not in row.known and not self.judges_unpredicted:
             return None
-        outputs: Sequence[float] = row.values
-        if True in row.withheld:
-            outputs = [nan if is_withheld else y for y, is_withheld in zip(outputs, row.withheld, strict=True)]
+        outputs = [nan if withheld else y for y, withheld in zip(row.values, row.withheld, strict=True)]
         x = self._chart.fill(np.array([*row.inputs, *outputs])[self._indices])
-        if x is None:
-            return None
-        judgement = self._chart.update(x)
-        return [judgement] if judgement.out or always else None
-
-    def restart(self, index: int) -> None:
-        self._chart.restart()
+        return None if x is None else self._judge(x, always=always)
 
     def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
         return self._chart.explain()
-
-
-@dataclass
-class _Watched:
-    """Charts, with the alarm and the key of each."""
-
-    charts: _Charts
-    alarms: list[ChartAlarm]
-    keys: list[str]
-    at_rest: bool = True
 
 
 class ChartWatch:
@@ -243,7 +234,7 @@ class ChartWatch:
             pair: board.declare(*pair, without_on_delay=chart(pair[0]).has_memory, priority=self._priority(pair[1]))
             for pair in alarm_names(config)
         }
-        self._watched: dict[str, _Watched] = {}
+        self._watched: dict[str, _Charts] = {}
         self.memory = ChartsMemory()
 
     def _priority(self, signal: str) -> PriorityName | None:
@@ -260,7 +251,7 @@ class ChartWatch:
     @property
     def reads_values(self) -> bool:
         """True if a chart judges the values of rows that are not predicted."""
-        return any(item.charts.judges_unpredicted for item in self._watched.values())
+        return any(charts.judges_unpredicted for charts in self._watched.values())
 
     def load(self, p: np.void) -> None:
         """Fill the numbers of a plant, see `row_frame.FrameTypes`, from the charts and their alarms."""
@@ -279,8 +270,6 @@ class ChartWatch:
         """Take over into the alarms what compiled steps have written into the numbers of a plant."""
         for (recent, in_a_row, _), alarm in zip(p["delays"].tolist(), self._alarms.values(), strict=False):
             alarm.memory.recent, alarm.memory.in_a_row = recent, in_a_row
-        for watched in self._watched.values():
-            watched.at_rest = all(alarm.is_idle for alarm in watched.alarms)
 
     def points(self, time_ns: int, points: Array) -> list[Publication]:
         """Publications of points of all charts.
@@ -289,7 +278,7 @@ class ChartWatch:
             time_ns: time of the row.
             points: numbers of a `Judgement` in each row, one row an alarm; shape (at least the number of alarms, 5).
         """
-        paths = [path for watched in self._watched.values() for path in watched.keys]
+        paths = [path for charts in self._watched.values() for path in charts.keys]
         judgements = [
             Judgement(statistic, centre, lower, upper, out > 0.0)
             for statistic, centre, lower, upper, out in points.tolist()
@@ -364,19 +353,18 @@ class ChartWatch:
 
     def restart(self) -> None:
         """Forget the rows seen, in all charts."""
-        for watched in self._watched.values():
-            for index in range(len(watched.alarms)):
-                watched.charts.restart(index)
+        for charts in self._watched.values():
+            for index in range(len(charts.alarms)):
+                charts.restart(index)
 
     def _watch(self, made: Callable[[type[Chart]], _Charts]) -> None:
         """Give the charts of each name their alarms and keys."""
-        self._watched, self.memory.charts = {}, {}
-        for name in self.design.chosen:
+        self._watched = {name: made(chart(name)) for name in self.design.chosen}
+        self.memory.charts = {name: charts.memory for name, charts in self._watched.items()}
+        for name, charts in self._watched.items():
             pairs = [pair for pair in self._alarms if pair[0] == name]
-            alarms = [self._alarms[pair] for pair in pairs]
-            paths = [keys.key(self._config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
-            self._watched[name] = _Watched(made(chart(name)), alarms, paths, all(alarm.is_idle for alarm in alarms))
-            self.memory.charts[name] = self._watched[name].charts.memory
+            charts.alarms = [self._alarms[pair] for pair in pairs]
+            charts.keys = [keys.key(self._config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
 
     def update(
         self, row: MeasuredRow, e: list[float], withheld: tuple[bool, ...], scales: list[float], *, points: bool
@@ -392,36 +380,32 @@ class ChartWatch:
         """
         known = [size == size for size in e]  # NaN is not equal to itself
         seen = _ChartRow(e, known, withheld, row.inputs, row.values)
-        judged = list[tuple[_Watched, int, ChartAlarm, Judgement]]()
-        for watched in self._watched.values():
-            judgements = watched.charts.update(seen, always=points or not watched.at_rest)
-            if judgements is None:
-                continue
-            for index, (alarm, judgement) in enumerate(zip(watched.alarms, judgements, strict=True)):
+        judged = list[tuple[_Charts, int, ChartAlarm, Judgement]]()
+        for charts in self._watched.values():
+            always = points or any(alarm.memory.standing or alarm.memory.recent for alarm in charts.alarms)
+            judgements = charts.update(seen, always=always)
+            for index, judgement in enumerate(judgements or ()):
                 if judgement is None:
                     continue
                 if points:
-                    row.publications.append(Publication(watched.keys[index], chart_point(row.time_ns, judgement)))
-                judged.append((watched, index, alarm, judgement))
+                    row.publications.append(Publication(charts.keys[index], chart_point(row.time_ns, judgement)))
+                judged.append((charts, index, charts.alarms[index], judgement))
         if not judged:
             return []
         changes: list[AlarmChange] = []
         found = update_alarms([(alarm, judgement) for _, _, alarm, judgement in judged], SD)
-        for (watched, index, _, judgement), change in zip(judged, found, strict=True):
+        for (charts, index, _, judgement), change in zip(judged, found, strict=True):
             if change is None:
                 continue
             if change.is_raised:
                 columns = self._config.outputs, row.units, scales, self.memory.passed
                 signals = [Shown(*item) for item in zip(*columns, strict=True)]
-                change.text, change.contributions = watched.charts.explain(index, judgement, signals)
-                if watched.charts.locates:
+                change.text, change.contributions = charts.explain(index, judgement, signals)
+                if charts.locates:
                     change.entries = _entries(change.contributions)
             else:
-                watched.charts.restart(index)
+                charts.restart(index)
             changes.append(change)
-        for watched in self._watched.values():
-            memories = [alarm.memory for alarm in watched.alarms]
-            watched.at_rest = not any(memory.standing or memory.recent for memory in memories)
         return changes
 
 

@@ -13,8 +13,7 @@ from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Judgement, format_quantity
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.spike import FEWEST_ROWS, Spike, Spikes, spike_limit
-from reactorwatch.spc.spike_rate import SpikeRate
+from reactorwatch.spc.spike import FEWEST_ROWS, Spike, SpikeRate, Spikes, spike_limit
 from reactorwatch.spc.training_errors import TrainingErrors, two_sided_tail
 
 

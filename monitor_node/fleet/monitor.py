@@ -223,12 +223,12 @@ class FleetMonitor:
         """Process the diagnosis of a plant's training; the plant may have been removed."""
         self._submitted.discard(plant)
         if plant in self._monitors:
-            self._monitors[plant].pipeline.on_finding(finding)
+            self._monitors[plant].pipeline.baselines.on_finding(finding)
 
     def _schedule(self, plant: str, monitor: Monitor) -> None:
         """Submit a training for diagnosis, once, and schedule the deadline if it is earlier than the present one."""
-        if monitor.pipeline.model_update.is_pending and plant not in self._submitted:
-            job = monitor.pipeline.diagnosis_job
+        if monitor.pipeline.baselines.update.is_pending and plant not in self._submitted:
+            job = monitor.pipeline.baselines.diagnosis_job
             if job is not None:
                 self._submitted.add(plant)
                 self._diagnose(plant, job)

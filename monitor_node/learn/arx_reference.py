@@ -19,6 +19,7 @@ from monitor_node.ingest.alignment import MeasuredRow
 from monitor_node.ingest.sampling import regular_intervals
 from monitor_node.learn.arx import ROWS_A_PARAMETER, ArxPredictor, arx_structure, simpler_structures
 from monitor_node.learn.references import Reference, RowPrediction
+from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.errors import InputError
@@ -237,29 +238,21 @@ class ArxReference(Reference):
 
     # --- training --------------------------------------------------------------------------------------------
 
-    def learn_again(self, time_min: Array, inputs: Array, outputs: Array) -> None:
-        """Update new adaptive models with the rows of a training; arguments as for `fit`."""
-        for predictor, column in zip(self.predictors, outputs.T, strict=True):
-            predictor.learn_again(predictor.structure, time_min, inputs, column)
+    def learn_again(self, rows: RowArrays) -> None:
+        """Update new adaptive models with the rows of a training."""
+        for predictor, column in zip(self.predictors, rows.outputs.T, strict=True):
+            predictor.learn_again(predictor.structure, rows.time_min, rows.inputs, column)
 
-    def fit(self, time_min: Array, inputs: Array, outputs: Array) -> Array:
-        """Fit the reference of each model to a training.
-
-        Args:
-            time_min: times in minutes, shape (n,).
-            inputs: input values, shape (n, inputs); NaN if missing.
-            outputs: output values, shape (n, outputs); NaN if missing or left out.
-
-        Returns:
-            Residuals, shape (n, outputs), see `fit_model`.
-        """
-        pairs = zip(self.predictors, outputs.T, strict=True)
+    def fit(self, rows: RowArrays) -> Array:
+        """Fit the reference of each model to a training; returns residuals, shape (n, outputs), see `fit_model`."""
+        pairs = zip(self.predictors, rows.outputs.T, strict=True)
         return np.column_stack(
-            [fit_model(item, time_min, inputs, column, with_snapshot=self.points) for item, column in pairs]
+            [fit_model(item, rows.time_min, rows.inputs, column, with_snapshot=self.points) for item, column in pairs]
         )
 
-    def start_judging(self, time_min: Array, inputs: Array, outputs: Array) -> None:
-        """Judge the rows after a training; arguments as for `fit`, with values of each input."""
+    def start_judging(self, rows: RowArrays) -> None:
+        """Judge the rows after a training; each input must have values."""
+        time_min, inputs, outputs = rows
         low, high = np.nanmin(inputs, axis=0), np.nanmax(inputs, axis=0)
         margin = MARGIN * (high - low)
         if inputs.shape[1] > 1:  # an input that did not move has no coefficient

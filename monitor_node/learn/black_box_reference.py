@@ -13,6 +13,7 @@ import numpy as np
 
 from monitor_node.ingest.sampling import TOLERANCE, regular_intervals
 from monitor_node.learn.references import GATE, FilterReference, Reference, RowFilter, RowPrediction
+from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
@@ -100,15 +101,13 @@ class BlackBoxReference(FilterReference):
 
     @classmethod
     def learn(
-        cls, time_min: Array, inputs: Array, measured: Array, evaluated: Array, smallest_sd: list[float], delay: int
+        cls, rows: RowArrays, evaluated: Array, smallest_sd: list[float], delay: int
     ) -> tuple["BlackBoxReference", Array]:
         """Learn a black box from a training.
 
         Args:
-            time_min: times of the rows in minutes, shape (n,).
-            inputs: shape (n, inputs).
-            measured: outputs that are fitted, shape (n, outputs); NaN if missing, disturbed or left out.
-            evaluated: outputs that are predicted; same shape as `measured`.
+            rows: rows that are fitted; outputs are NaN where missing, disturbed or left out.
+            evaluated: outputs that are predicted, shape (n, outputs).
             smallest_sd: smallest standard deviation of each output.
             delay: delay of the inputs in rows.
 
@@ -118,6 +117,7 @@ class BlackBoxReference(FilterReference):
         Raises:
             InputError: there are too few rows or too many signals, or no output varies.
         """
+        time_min, inputs, measured = rows
         outputs = np.flatnonzero(np.isfinite(measured).any(axis=0)).tolist()
         if not outputs:
             raise InputError("outputs must vary in the training, none does")
@@ -141,23 +141,12 @@ class BlackBoxReference(FilterReference):
         return self._memory
 
     @property
-    def unfamiliar_rows(self) -> int:
-        """Number of rows in which the model knew too little of the point of operation."""
-        return self._memory.unfamiliar_rows
-
-    @property
     def parameters(self) -> tuple[Array, Array]:
         """Copies of the parameters and their covariance, of scaled signals."""
         return self._filter.parameters
 
     def snapshot(self, output: int, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> ModelSnapshot | None:
-        """Snapshot of the model of an output, of scaled signals; None if the output is not predicted.
-
-        Args:
-            output: index of the output among the monitored ones.
-            inputs: names of the inputs.
-            outputs: names of the monitored outputs.
-        """
+        """See `Reference`; of scaled signals, and None if the output is not predicted."""
         if output not in self._outputs:
             return None
         shape, (theta, covariance) = self.model.shape, self._filter.parameters
@@ -180,8 +169,9 @@ class BlackBoxReference(FilterReference):
             held=not self._filter.learning,
         )
 
-    def normalised_residuals(self, time_min: Array, inputs: Array, outputs: Array) -> Array:
+    def normalised_residuals(self, rows: RowArrays) -> Array:
         """See `Reference`; by the model as fitted."""
+        time_min, inputs, outputs = rows
         follows = np.concatenate([[False], regular_intervals(time_min)])
         residuals, sds = BlackBoxFilter(self.model).run(inputs, outputs[:, self._outputs], follows)
         z = np.full(outputs.shape, nan)
@@ -190,7 +180,7 @@ class BlackBoxReference(FilterReference):
 
     @property
     def weakness(self) -> str:
-        """Reason why the promise may not hold at set points that the training has not seen; empty if it does."""
+        """See `Reference`."""
         if self.model.dynamics_sd <= UNCERTAIN:
             return ""
         return (
@@ -200,7 +190,7 @@ class BlackBoxReference(FilterReference):
 
     def obstacles(self, inputs: Sequence[str]) -> Iterator[tuple[str, str]]:
         """See `Reference`."""
-        if self.unfamiliar_rows:
+        if self._memory.unfamiliar_rows:
             text = "rows are not judged while inputs have values that the black box has not learned, and teach it"
             yield self.kind, text
 
@@ -249,13 +239,9 @@ class BlackBoxReference(FilterReference):
         return RowPrediction([nan] * self._count, sd, (prediction, sd))
 
     def step_responses(self, rows: int) -> Array:
-        """Response of each output's normalised residual to a lasting step of one unit, shape (outputs, rows).
+        """See `Reference`; the difference of two runs of the filter from its present state, with means of the signals.
 
-        The difference of two runs of the filter from its present state, with the inputs and outputs at their means.
         NaN for an output that is not predicted.
-
-        Args:
-            rows: number of rows from the onset on.
         """
         responses = np.full((self._count, rows), nan)
         centres = np.array(self.model.centres)

@@ -7,29 +7,17 @@ replay does the same there. After a diagnosis the baseline is learned again from
 
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.arx_reference import ArxReference
-from monitor_node.learn.training import Training, TrainingResult
-from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding, read_equations
+from monitor_node.learn.baseline import TrainingResult, learn_baseline
+from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding, equations_text, read_equations
 from monitor_node.learn.training_rows import TrainingRows
 from reactorwatch.contract.commands import check_signature
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.errors import InputError
-
-
-class ScheduledChange(NamedTuple):
-    """A change of the baseline to come.
-
-    Attributes:
-        at_ns: time of the first row that is judged by it; None: the next row.
-        baseline: the change.
-    """
-
-    at_ns: int | None
-    baseline: Baseline
+from reactorwatch.process.model import ProcessModel
 
 
 class ModelUpdate:
@@ -37,7 +25,8 @@ class ModelUpdate:
 
     Args:
         config: settings of the monitor.
-        changes: changes to come, in order; the caller may append those of a recording.
+        changes: changes to come, in order, each with the time of the first row that is judged by it, 0 for the next
+            row; the caller may append those of a recording.
 
     Attributes:
         changes: changes to come.
@@ -45,22 +34,22 @@ class ModelUpdate:
         baseline: the change in force; None: the plant is judged by the model as given.
     """
 
-    def __init__(self, config: MonitorConfig, changes: deque[ScheduledChange]) -> None:
+    def __init__(self, config: MonitorConfig, changes: deque[Baseline]) -> None:
         self._config = config
         self._last_ns: int | None = None
         self.changes = changes
         self.rows: TrainingRows | None = None
         self.baseline: Baseline | None = None
 
-    def job(self, equations: str) -> DiagnosisJob | None:
+    def job(self, model: ProcessModel | None) -> DiagnosisJob | None:
         """The pending diagnosis; None: there is none.
 
         Args:
-            equations: see `DiagnosisJob`.
+            model: process model of the plant as given.
         """
         if self.rows is None or self.changes:
             return None
-        return DiagnosisJob(self.rows, self._config.signals, equations)
+        return DiagnosisJob(self.rows, self._config.signals, equations_text(model))
 
     @property
     def is_pending(self) -> bool:
@@ -72,11 +61,10 @@ class ModelUpdate:
 
         A finding of another training is ignored.
         """
-        job = self.job("")
-        if job is None or finding.first_ns != job.first_ns:
+        if self.rows is None or self.changes or finding.first_ns != self.rows.times_ns[0]:
             return ""
         if finding.equations:
-            self.changes.append(ScheduledChange(None, finding.baseline))
+            self.changes.append(finding.baseline)
             return f"{finding.why}; from then on the plant is judged by the equations with it"
         self.rows = None
         if finding.verdict == FAILED:
@@ -86,7 +74,7 @@ class ModelUpdate:
     @property
     def commands(self) -> list[Baseline]:
         """Changes by accepted commands that hold from the next row on, in order."""
-        return [item.baseline for item in self.changes if item.at_ns is None and is_command(item.baseline)]
+        return [change for change in self.changes if not change.time_ns and is_command(change)]
 
     def pop_due(self, time_ns: int) -> Baseline | None:
         """The change that holds from a row on, with its time and number; None: there is none.
@@ -97,17 +85,16 @@ class ModelUpdate:
         last_ns, self._last_ns = self._last_ns, time_ns
         if not self.changes:
             return None
-        at_ns, baseline = self.changes[0]
-        is_skipped = at_ns is not None and last_ns is not None and last_ns < at_ns < time_ns
-        if at_ns not in (None, time_ns) and not is_skipped:
+        at_ns = self.changes[0].time_ns
+        is_skipped = last_ns is not None and last_ns < at_ns < time_ns
+        if at_ns not in (0, time_ns) and not is_skipped:
             return None
-        if self.rows is None and not is_command(baseline):
-            if at_ns is None:  # of a training that a command has ended since
+        if self.rows is None and not is_command(self.changes[0]):
+            if not at_ns:  # of a training that a command has ended since
                 self.changes.popleft()
             return None
-        self.changes.popleft()
         change = Baseline()
-        change.CopyFrom(baseline)
+        change.CopyFrom(self.changes.popleft())
         change.time_ns, change.id = time_ns, 1 + (self.baseline.id if self.baseline is not None else 0)
         return change
 
@@ -123,8 +110,7 @@ class ModelUpdate:
         """
         assert self.rows is not None
         rows, self.rows = self.rows, None
-        training = Training(self._config, read_equations(change.model), models.copy())
-        trained = training.learn(rows, last_chance=True)
+        trained = learn_baseline(self._config, read_equations(change.model), models.copy(), rows, last_chance=True)
         if trained.refused or not trained.reference.follows_equations:
             return None
         self.baseline = change

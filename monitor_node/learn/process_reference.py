@@ -12,6 +12,7 @@ import numpy as np
 
 from monitor_node.ingest.sampling import missing_in_intervals
 from monitor_node.learn.references import GATE, FilterReference, PlantEquations, Reference, RowFilter, RowPrediction
+from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
@@ -111,17 +112,15 @@ class ProcessReference(FilterReference):
         cls,
         model: ProcessModel,
         outputs: tuple[str, ...],
-        time_min: Array,
-        inputs: Array,
-        measured: Array,
+        rows: RowArrays,
         smallest_sd: list[float],
     ) -> "ProcessReference":
         """Make a reference with the noise that is fitted to a training, see `fit_training_noise`."""
-        found = fit_training_noise(model, outputs, time_min, inputs, measured, smallest_sd, model.uncertain)
+        found = fit_training_noise(model, outputs, rows, smallest_sd, model.uncertain)
         learned = tuple(found.parameters[name] for name in learned_parameters(model.uncertain))
         if not any(map(is_disturbance, model.uncertain)):
             return cls(model, outputs, ProcessMemory(found.levels, learned))
-        alone = fit_training_noise(model, outputs, time_min, inputs, measured, smallest_sd, ())
+        alone = fit_training_noise(model, outputs, rows, smallest_sd, ())
         return cls(model, outputs, ProcessMemory(found.levels, learned, alone.levels))
 
     @property
@@ -157,11 +156,11 @@ class ProcessReference(FilterReference):
         states = [Parameter(name=f"{name}_sd", value=value) for name, value in levels["states"].items()]
         return ModelSnapshot(structure=self.kind, parameters=[sensor, *states], reference=True, held=True)
 
-    def normalised_residuals(self, time_min: Array, inputs: Array, outputs: Array) -> Array:
+    def normalised_residuals(self, rows: RowArrays) -> Array:
         """See `Reference`."""
         fresh = ProcessReference(self.equations, self._outputs, copy_of(self.memory))
         fresh.restart()
-        return fresh.run(time_min, inputs, outputs)[1]
+        return fresh.run(rows)
 
     @property
     def noise_levels(self) -> dict[str, dict[str, float]]:
@@ -207,15 +206,14 @@ class ProcessReference(FilterReference):
             pairs = zip(inputs, memory.last_inputs, strict=True)
             memory.guessed = tuple(not isfinite(value) for value in inputs)
             memory.last_inputs = tuple(value if isfinite(value) else last for value, last in pairs)
+        measured, accepted = values, list(accept)
+        if not self._accept_all:
+            measured, accepted = [nan] * self._count, [False] * self._count
+            for i, value, is_accepted in zip(self._indices, values, accept, strict=True):
+                measured[i], accepted[i] = value, is_accepted
+        step = self._filter.update(time_min, memory.last_inputs, measured, gate=GATE, accept=accepted, changes=changes)
         if self._accept_all:
-            step = self._filter.update(time_min, memory.last_inputs, values, gate=GATE, accept=accept, changes=changes)
             return RowPrediction(step.prediction, step.sd)
-        measured, accepted = [nan] * self._count, [False] * self._count
-        for i, value, is_accepted in zip(self._indices, values, accept, strict=True):
-            measured[i], accepted[i] = value, is_accepted
-        step = self._filter.update(
-            time_min, memory.last_inputs, measured, gate=GATE, accept=tuple(accepted), changes=changes
-        )
         return RowPrediction([step.prediction[i] for i in self._indices], [step.sd[i] for i in self._indices])
 
     def is_ordinary(self, time_min: float) -> bool:
@@ -269,17 +267,12 @@ class ProcessReference(FilterReference):
         self._filter.interrupt()
         self._memory.guessed, self._memory.held_rows = self._all_known, 0
 
-    def run(self, time_min: Array, inputs: Array, measured: Array) -> tuple[Array, Array]:
-        """Run over many rows; returns residuals and normalised residuals, each of shape (n, outputs).
+    def run(self, rows: RowArrays) -> Array:
+        """Run over many rows; returns the normalised residuals, shape (n, outputs).
 
         The reach of the inputs is learned (`input_reach`). The filter restarts after missing rows.
-
-        Args:
-            time_min: times in minutes, shape (n,).
-            inputs: input values, shape (n, inputs).
-            measured: output values, shape (n, outputs).
         """
-        memory = self._memory
+        memory, (time_min, inputs, measured) = self._memory, rows
         memory.reach = [input_reach(time_min, column) for column in inputs.T]
         if self._accept_all and np.isfinite(inputs).all():
             times = np.round(time_min * MINUTE_NS) / MINUTE_NS
@@ -288,21 +281,20 @@ class ProcessReference(FilterReference):
             if not np.any(np.abs(z) > GATE):  # no acceptance depended on the row before
                 memory.last_inputs, memory.guessed, memory.held_rows = tuple(inputs[-1].tolist()), self._all_known, 0
                 memory.typical_sd = _median_sds(steps.sd)
-                return steps.residual, z
+                return z
             self._filter.restart()
-        residuals, z = np.full(measured.shape, np.nan), np.full(measured.shape, np.nan)
-        sds = np.full(measured.shape, np.nan)
+        z, sds = np.full(measured.shape, np.nan), np.full(measured.shape, np.nan)
         accept, missing = (False,) * measured.shape[1], [0, *missing_in_intervals(time_min).tolist()]
         for row, values in enumerate(measured.tolist()):
             if missing[row]:
                 self.restart()
             predicted = self.update(round(time_min[row] * MINUTE_NS), inputs[row].tolist(), values, accept)
             residual = [value - prediction for value, prediction in zip(values, predicted.prediction, strict=True)]
-            residuals[row], sds[row] = residual, predicted.sd
+            sds[row] = predicted.sd
             z[row] = [size / sd for size, sd in zip(residual, predicted.sd, strict=True)]
             accept = tuple(abs(size) > GATE for size in z[row].tolist())
         memory.typical_sd = _median_sds(sds)
-        return residuals, z
+        return z
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
@@ -347,6 +339,13 @@ def output_indices(model: ProcessModel, outputs: tuple[str, ...]) -> list[int]:
     return [model.output_names.index(output) for output in outputs]
 
 
+def model_outputs(model: ProcessModel, outputs: tuple[str, ...], measured: Array) -> Array:
+    """Columns of all outputs of the model; NaN for those that are not monitored."""
+    columns = np.full((len(measured), len(model.outputs)), nan)
+    columns[:, output_indices(model, outputs)] = measured
+    return columns
+
+
 def input_reach(time_min: Array, inputs: Array) -> float:
     """Largest pulse of an input that lasts one row: distance from the nearer of the rows before and after.
 
@@ -369,9 +368,7 @@ def _mask_before_missing(time_min: Array, inputs: Array) -> Array:
 def fit_training_noise(
     model: ProcessModel,
     outputs: tuple[str, ...],
-    time_min: Array,
-    inputs: Array,
-    measured: Array,
+    rows: RowArrays,
     smallest_sd: list[float],
     uncertain: tuple[str, ...],
 ) -> NoiseFit:
@@ -380,20 +377,16 @@ def fit_training_noise(
     Args:
         model: process model.
         outputs: names of the monitored outputs.
-        time_min: times in minutes, shape (n,).
-        inputs: input values, shape (n, inputs).
-        measured: output values, shape (n, outputs); NaN if missing or left out.
+        rows: rows of the training.
         smallest_sd: least standard deviation of each sensor.
         uncertain: what the filter estimates beside the states of the model, see `kalman.uncertain_model`.
     """
-    columns = np.full((time_min.size, len(model.outputs)), np.nan)
-    smallest = [1e-6] * len(model.outputs)
-    for i, column, sd in zip(output_indices(model, outputs), measured.T, smallest_sd, strict=True):
-        columns[:, i], smallest[i] = column, sd
-    inputs = _mask_before_missing(time_min, inputs)
+    columns, smallest = model_outputs(model, outputs, rows.outputs), [1e-6] * len(model.outputs)
+    for i, sd in zip(output_indices(model, outputs), smallest_sd, strict=True):
+        smallest[i] = sd
     return fit_noise(
         widen_model(model, uncertain),
-        FilterRecord(time_min, inputs, columns),
+        FilterRecord(rows.time_min, _mask_before_missing(rows.time_min, rows.inputs), columns),
         smallest,
         learned_parameters(uncertain),
         nearby=noise_starts(model, uncertain, columns, smallest),

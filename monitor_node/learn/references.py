@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, NamedTuple
 
+from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.contract.messages_pb2 import ModelSnapshot
@@ -87,11 +88,6 @@ class Reference(ABC):
         """The reference itself, if it is a filter whose rows the compiled step can take."""
         return None
 
-    @property
-    def unfamiliar_rows(self) -> int:
-        """Number of rows in which the reference knew too little of the point of operation."""
-        return 0
-
     # --- rows ------------------------------------------------------------------------------------------------
 
     @abstractmethod
@@ -122,6 +118,11 @@ class Reference(ABC):
 
     def set_learning(self, learning: bool) -> None:  # noqa: B027 # without memory of the plant there is nothing to do
         """Learn from the rows to come, or not: while nothing is wrong, or a fault would be learned as ordinary."""
+
+    @property
+    def weakness(self) -> str:
+        """Reason why the promise may not hold at set points that the training has not seen; empty if it does."""
+        return ""
 
     def obstacles(self, inputs: Sequence[str]) -> Iterator[tuple[str, str]]:
         """Reasons why rows are not judged now, each with what it is about.
@@ -173,14 +174,8 @@ class Reference(ABC):
         """
         return None
 
-    def normalised_residuals(self, time_min: Array, inputs: Array, outputs: Array) -> Array | None:
-        """Normalised residuals of other rows, shape (n, outputs); None: `step_responses` states them for a bias.
-
-        Args:
-            time_min: times in minutes, shape (n,).
-            inputs: shape (n, inputs).
-            outputs: monitored outputs, shape (n, outputs).
-        """
+    def normalised_residuals(self, rows: RowArrays) -> Array | None:
+        """Normalised residuals of other rows, shape (n, outputs); None: `step_responses` states them for a bias."""
         return None
 
 

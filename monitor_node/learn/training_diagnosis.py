@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from monitor_node.learn.process_reference import fit_training_noise, output_indices
+from monitor_node.learn.process_reference import fit_training_noise, model_outputs, output_indices
 from monitor_node.learn.references import GATE
-from monitor_node.learn.training_rows import TrainingRows, screen_baseline
+from monitor_node.learn.training_rows import RowArrays, TrainingRows, screen_baseline
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Baseline
 from reactorwatch.diagnosis.extended import extended_model
@@ -124,19 +124,18 @@ def diagnose_training(job: DiagnosisJob) -> Finding:
     Raises:
         InputError: the rows cannot be diagnosed: too few, or without movement of the input.
     """
-    times_ns, columns = np.array(job.rows.times_ns), np.column_stack([job.rows.inputs, job.rows.outputs]).T
+    times_ns, columns = np.array(job.rows.times_ns), np.column_stack(job.rows.arrays[1:]).T
     time_min = _shorten_gaps((times_ns - job.first_ns) / MINUTE_NS)
     record = Record(time_min, dict(zip(job.signals, columns, strict=True)), "training", zero_ns=job.first_ns)
     given = parse_extended_model(job.equations)
     effects = tuple(item.shift(-job.first_ns / MINUTE_NS) for item in given.effects)
     model = replace(given, effects=effects).build()
     outputs = job.signals[len(model.inputs) :]
-    measured = columns[len(model.inputs) :].T
-    rows = time_min, columns[: len(model.inputs)].T, measured
-    uncertain = find_uncertain(model, outputs, *rows)
+    rows = RowArrays(time_min, columns[: len(model.inputs)].T, columns[len(model.inputs) :].T)
+    uncertain = find_uncertain(model, outputs, rows)
     verdict, why, extended = _diagnose(record, model, uncertain)
     if extended is not None:
-        uncertain = find_uncertain(extended.build(), outputs, *rows)
+        uncertain = find_uncertain(extended.build(), outputs, rows)
     if uncertain.names:
         why = f"{why}; {describe_uncertain(uncertain.names)}"
     result = replace(extended or given, uncertain=uncertain.names)
@@ -245,31 +244,27 @@ UNCERTAIN = 1.25
 the plant follows."""
 
 
-def find_uncertain(
-    model: ProcessModel, outputs: tuple[str, ...], time_min: Array, inputs: Array, measured: Array
-) -> Uncertain:
+def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArrays) -> Uncertain:
     """Find additional states that a filter of the model needs; empty: none.
 
     Args:
         model: equations of the plant.
         outputs: names of the outputs.
-        time_min: times of the training in minutes, shape (n,).
-        inputs: input values, shape (n, inputs).
-        measured: output values, shape (n, outputs); NaN if missing or left out.
+        rows: rows of the training.
     """
-    if np.min(np.count_nonzero(np.isfinite(measured), axis=0), initial=LEAST_ROWS) < LEAST_ROWS:
+    if np.min(np.count_nonzero(np.isfinite(rows.outputs), axis=0), initial=LEAST_ROWS) < LEAST_ROWS:
         return Uncertain()
-    rows = _Rows(model, outputs, time_min, inputs, measured)
-    plain = rows.fit(())
-    if rows.drop_disturbances(plain):
-        plain = rows.fit(())
-    x = np.nanmedian(rows.filter(plain).x, axis=0)
-    constants = tuple(f"{CONSTANT} {name}" for name in select_effects(model, x, np.nanmedian(inputs, axis=0)))
-    best = rows.fit(constants)
+    fitter = _NoiseFitter(model, outputs, rows)
+    plain = fitter.fit(())
+    if fitter.drop_disturbances(plain):
+        plain = fitter.fit(())
+    x = np.nanmedian(fitter.filter(plain).x, axis=0)
+    constants = tuple(f"{CONSTANT} {name}" for name in select_effects(model, x, np.nanmedian(rows.inputs, axis=0)))
+    best = fitter.fit(constants)
     candidates = [f"{WANDER} {item.name}" for item in model.states if item.name not in model.at_rest]
     candidates += [f"{NOISE} {name}" for name in outputs]
-    while len(best.uncertain) < len(constants) + MOST_DISTURBANCES and rows.are_coloured(best):
-        fits = (rows.fit((*best.uncertain, item)) for item in candidates if item not in best.uncertain)
+    while len(best.uncertain) < len(constants) + MOST_DISTURBANCES and fitter.are_coloured(best):
+        fits = (fitter.fit((*best.uncertain, item)) for item in candidates if item not in best.uncertain)
         found = min(fits, key=lambda item: item.noise.loss)
         if found.noise.loss > best.noise.loss - LEAST_GAIN:
             break
@@ -277,7 +272,7 @@ def find_uncertain(
     if best.uncertain != constants or plain.noise.loss - best.noise.loss > LEAST_GAIN:
         learned = (best.noise.parameters[name] for name in learned_parameters(best.uncertain))
         return Uncertain(best.uncertain, tuple(learned))
-    certain, uncertain = rows.sds_after_moves(plain), rows.sds_after_moves(best)
+    certain, uncertain = fitter.sds_after_moves(plain), fitter.sds_after_moves(best)
     return Uncertain(constants) if np.any(uncertain > UNCERTAIN * certain) else Uncertain()
 
 
@@ -302,20 +297,16 @@ class _Fit(NamedTuple):
     filter: Filter
 
 
-class _Rows:
-    """Rows of a training; arguments as for `find_uncertain`."""
+class _NoiseFitter:
+    """Fits the noise of a model to a training; arguments as for `find_uncertain`."""
 
-    def __init__(
-        self, model: ProcessModel, outputs: tuple[str, ...], time_min: Array, inputs: Array, measured: Array
-    ) -> None:
-        self._model, self._outputs = model, outputs
-        self._time_min, self._inputs, self._measured = time_min, inputs, measured
+    def __init__(self, model: ProcessModel, outputs: tuple[str, ...], rows: RowArrays) -> None:
+        self._model, self._outputs, self._rows = model, outputs, rows
 
     def fit(self, uncertain: tuple[str, ...]) -> _Fit:
         """Fit the noise of the model with uncertain parts."""
         model, smallest = self._model, [SMALLEST_SD] * len(self._outputs)
-        rows = (self._time_min, self._inputs, self._measured)
-        found = fit_training_noise(model, self._outputs, *rows, smallest, uncertain)
+        found = fit_training_noise(model, self._outputs, self._rows, smallest, uncertain)
         return _Fit(uncertain, found, Filter(widen_model(model, uncertain), found.levels, found.parameters))
 
     def drop_disturbances(self, item: _Fit) -> bool:
@@ -325,25 +316,24 @@ class _Rows:
         if any(item.refused for item in screenings):
             return False
         usable = np.column_stack([item.usable for item in screenings]) | ~np.isfinite(run.residual[:, indices])
-        self._measured = np.where(usable, self._measured, nan)
+        self._rows = self._rows._replace(outputs=np.where(usable, self._rows.outputs, nan))
         return not usable.all()
 
     def filter(self, item: _Fit) -> FilterResult:
         """Filter the rows; the filter then stands at the last."""
-        columns = np.full((self._time_min.size, len(self._model.outputs)), nan)
-        columns[:, output_indices(self._model, self._outputs)] = self._measured
-        return item.filter.run(FilterRecord(self._time_min, self._inputs, columns, GATE))
+        columns = model_outputs(self._model, self._outputs, self._rows.outputs)
+        return item.filter.run(FilterRecord(self._rows.time_min, self._rows.inputs, columns, GATE))
 
     def are_coloured(self, item: _Fit) -> bool:
         """True if the innovations are not white."""
         w = np.where(item.noise.w != 0.0, item.noise.w, nan)
-        return bool(np.max(minus_log10_p(w, self._inputs[len(self._inputs) - len(w) :])) >= COLOURED)
+        return bool(np.max(minus_log10_p(w, self._rows.inputs[len(self._rows.inputs) - len(w) :])) >= COLOURED)
 
     def sds_after_moves(self, item: _Fit) -> Array:
         """Standard deviations of predictions after a move of each input up and down, shape (moves, rows, n_y)."""
         self.filter(item)
-        start, middle = item.filter.state, np.nanmedian(self._inputs, axis=0)
-        period_min = float(np.median(np.diff(self._time_min)))
+        start, middle = item.filter.state, np.nanmedian(self._rows.inputs, axis=0)
+        period_min = float(np.median(np.diff(self._rows.time_min)))
         result = []
         for index, variable in enumerate(self._model.inputs):
             for step in (-variable.scale, variable.scale):

@@ -18,6 +18,7 @@ residuals.
 
 from array import array
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from math import isfinite
 from typing import NamedTuple
@@ -35,6 +36,20 @@ MOST_ROWS = 10_000
 """The newest rows used of a longer training; memory stays bounded."""
 
 
+class RowArrays(NamedTuple):
+    """Rows of one plant as arrays.
+
+    Attributes:
+        time_min: times in minutes, shape (n,).
+        inputs: shape (n, inputs); NaN if missing.
+        outputs: shape (n, outputs); NaN if missing or left out.
+    """
+
+    time_min: Array
+    inputs: Array
+    outputs: Array
+
+
 class TrainingRows(Memory):
     """The newest rows of one plant, in two arrays. The object is its own state.
 
@@ -47,8 +62,8 @@ class TrainingRows(Memory):
     """
 
     counts: list[int]
-    times: array = msgspec.field(default_factory=lambda: array("q"))  # type: ignore[type-arg] # none before Python 3.12
-    numbers: array = msgspec.field(default_factory=lambda: array("d"))  # type: ignore[type-arg]
+    times: array = msgspec.field(default_factory=partial(array, "q"))  # type: ignore[type-arg] # none before Python 3.12
+    numbers: array = msgspec.field(default_factory=partial(array, "d"))  # type: ignore[type-arg]
     dropped: int = 0
     keeps_all: bool = False
 
@@ -77,19 +92,12 @@ class TrainingRows(Memory):
         return self.times.tolist()
 
     @property
-    def time_min(self) -> Array:
-        """Times of the rows in minutes, shape (n,)."""
-        return np.array(self.times_ns) / MINUTE_NS
-
-    @property
-    def inputs(self) -> Array:
-        """Inputs of the rows, shape (n, inputs)."""
-        return np.ascontiguousarray(self._matrix()[:, : -len(self.counts)])
-
-    @property
-    def outputs(self) -> Array:
-        """Outputs of the rows, shape (n, outputs)."""
-        return np.ascontiguousarray(self._matrix()[:, -len(self.counts) :])
+    def arrays(self) -> RowArrays:
+        """A copy of the rows as arrays."""
+        inputs, outputs = np.hsplit(self._matrix(), [-len(self.counts)])
+        return RowArrays(
+            np.array(self.times_ns) / MINUTE_NS, np.ascontiguousarray(inputs), np.ascontiguousarray(outputs)
+        )
 
     def values(self) -> list[list[float]]:
         """Inputs and outputs of each row."""

@@ -11,7 +11,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.learn.arx import arx_structure, fewest_rows
-from monitor_node.learn.training import FEWEST_ROWS
+from monitor_node.learn.baseline import FEWEST_ROWS
 from monitor_node.monitor_state import MonitorMemory
 from monitor_node.watch.pipeline_memory import PipelineMemory
 from monitor_node.watched_process import load_process
@@ -23,7 +23,6 @@ from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Incident, Promis
 from reactorwatch.errors import UnfitRecordError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
-from reactorwatch.stored_state import copy_of
 
 RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
 
@@ -96,12 +95,12 @@ class TrainedPlant(NamedTuple):
 
     Attributes:
         rows: number of rows of the training.
-        memory: memory of the trained pipeline.
+        memory: memory of the trained pipeline as stored, so that other processes can be given it.
         notes: notes on the training.
     """
 
     rows: int
-    memory: PipelineMemory
+    memory: bytes
     notes: list[str]
 
 
@@ -192,7 +191,7 @@ def train(
     for _ in _publications(monitor, messages):
         pass
     monitor.pipeline.end_training(monitor.memory.last_ns or 0)
-    return TrainedPlant(monitor.pipeline.training_rows, copy_of(monitor.pipeline.memory), [*monitor.notes])
+    return TrainedPlant(monitor.pipeline.training.trained_rows, monitor.pipeline.memory.to_bytes(), [*monitor.notes])
 
 
 def run(
@@ -219,7 +218,7 @@ def run(
     """
     monitor = _make_monitor(config, zero_ns, model)
     if trained is not None:
-        monitor.pipeline.resume(copy_of(trained.memory), 0)
+        monitor.pipeline.resume(PipelineMemory.from_bytes(trained.memory), 0)
         monitor.pipeline.start_run()
     if log is not None:
         monitor.on_row_end = partial(log.add, monitor.memory)
@@ -248,7 +247,7 @@ def run(
         reference=monitor.pipeline.newest_reference or None,
         noise_levels=monitor.pipeline.noise_levels,
         baseline=monitor.baseline,
-        training_rows=monitor.pipeline.training_rows if trained is None else trained.rows,
+        training_rows=monitor.pipeline.training.trained_rows if trained is None else trained.rows,
         promise=monitor.promise,
         not_watched=_describe_obstacle(monitor),
     )
@@ -266,7 +265,7 @@ def _publications(monitor: Monitor, messages: Iterable[Encoded]) -> Iterator[lis
 def _describe_obstacle(monitor: Monitor) -> str:
     """Reason why no row could be judged; empty if one was."""
     pipeline = monitor.pipeline
-    if pipeline.evaluation.has_judged:
+    if pipeline.has_judged:
         return ""
     if not pipeline.is_judged:
         return "the training has seen no row in the plant's mode of operation; train on rows in it"
@@ -275,7 +274,7 @@ def _describe_obstacle(monitor: Monitor) -> str:
             "no row could be predicted: rows must come one by one period, that of the training, with values of the "
             "inputs that it has seen; train on rows like these"
         )
-    if refused := pipeline.refused_training:
+    if refused := pipeline.training.refused:
         return f"no training was fit to learn from: {refused}"
     return "too short: all of it went into the training; make it shorter with --training or --training-rows"
 

@@ -4,16 +4,26 @@ The modes that the training has seen, with rows enough, are judged by what was l
 plant starts up or shuts down, or one that the training has not seen, is watched by the signal checks only.
 """
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 
 from monitor_node.config import MonitorConfig
-from monitor_node.health import NODE
-from monitor_node.learn.arx_reference import ArxReference
-from monitor_node.learn.model_update import ACCEPT, RESTORE, TRAINED, ModelUpdate, ScheduledChange, check_command
-from monitor_node.learn.training_diagnosis import read_equations
+from monitor_node.health import NODE, Failures
+from monitor_node.learn.baseline import TrainingResult
+from monitor_node.learn.model_update import (
+    ACCEPT,
+    RESTORE,
+    TRAINED,
+    ModelUpdate,
+    check_command,
+    is_command,
+)
+from monitor_node.learn.training import Training
+from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding, equations_text, read_equations
+from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.evaluation import Evaluation
+from monitor_node.watch.operation import Operation
 from monitor_node.watch.pipeline_memory import EvaluationMemory, ModesMemory
-from monitor_node.watch.training_stage import TrainingStage
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import copy_of
@@ -28,12 +38,15 @@ class Baselines:
     Args:
         config: settings of the monitor.
         model: process model of the plant as given; None if there is none.
-        models: identified models.
-        training: training of the plant.
-        evaluation: evaluation of its rows.
-        update: changes of the baseline to come, and the one in force.
+        evaluation: stages of the evaluation of its rows.
+        operation: operation of the plant.
+        failures: counter of errors in the change of the model.
+        changes: changes of the baseline to come.
+        diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`.
 
     Attributes:
+        training: training of the plant.
+        update: changes of the baseline to come, and the one in force.
         kept: baselines that can be restored, the oldest first.
         modes: memory of the modes.
     """
@@ -42,21 +55,23 @@ class Baselines:
         self,
         config: MonitorConfig,
         model: ProcessModel | None,
-        models: ArxReference,
-        training: TrainingStage,
         evaluation: Evaluation,
-        update: ModelUpdate,
+        operation: Operation,
+        failures: Failures,
+        changes: deque[Baseline],
+        diagnose: Callable[[DiagnosisJob], Finding] | None,
     ) -> None:
-        self._names, self._startup = config.modes, config.startup_modes
-        self._model, self._models, self._training = model, models, training
-        self._evaluation, self._update = evaluation, update
+        self._config, self._model, self._operation = config, model, operation
+        self._evaluation, self._models = evaluation, evaluation.models
+        self._failures, self._diagnose = failures, diagnose
+        self.training, self.update = Training(config, model, self._models), ModelUpdate(config, changes)
         self.kept: list[EvaluationMemory] = []
         self.modes = ModesMemory([float("nan")] * len(config.modes))
 
     def _keep(self) -> EvaluationMemory:
         """The baseline in force, as it is kept."""
-        kept = copy_of(self._evaluation.memory)
-        kept.change = self._update.baseline
+        kept = copy_of(self._evaluation.collect_memory())
+        kept.change = self.update.baseline
         return kept
 
     def _judge_by(self, kept: EvaluationMemory) -> None:
@@ -69,19 +84,104 @@ class Baselines:
     def _stop_judging(self) -> None:
         """Judge no rows."""
         self._evaluation.stop()
-        self._training.memory.refusals = 0
+        self.training.memory.refusals = 0
+
+    # --- training --------------------------------------------------------------------------------------------
+
+    def end_training(
+        self, time_ns: int, trained: TrainingResult, period_ns: float, units: Sequence[str]
+    ) -> Baseline | None:
+        """Judge by what was learned from now on; returns the change of the model by the diagnosis of the training.
+
+        Args:
+            time_ns: time of the last row.
+            trained: result of the training.
+            period_ns: sampling period.
+            units: units of the outputs.
+        """
+        self.start(trained, period_ns, units)
+        if self._config.diagnose_training and equations_text(self._model):
+            self.update.rows = trained.rows
+        if self._diagnose is not None and (job := self.diagnosis_job) is not None:
+            self.on_finding(self._diagnose(job))
+        change = self._change_model(time_ns, period_ns, units)
+        if change is None:
+            self._check_training(trained.rows)
+        return change
+
+    def start(self, trained: TrainingResult, period_ns: float, units: Sequence[str]) -> None:
+        """Start to judge by what was learned."""
+        self.modes.is_learned, self.modes.reference = True, trained.reference.kind
+        self._evaluation.start(trained, period_ns, units, again=False)
+        self._operation.end_training()
+
+    def _check_training(self, rows: TrainingRows) -> None:
+        """Judge the training by itself."""
+        evaluation, reference = self._evaluation, self._evaluation.reference
+        if reference is not None:
+            model = self.equations if reference.follows_equations else None
+            note = evaluation.promises.check(rows, model, reference.kind, evaluation.memory.rows_watched)
+            evaluation.notes += [note] if note else []
+
+    @property
+    def diagnosis_job(self) -> DiagnosisJob | None:
+        """The diagnosis of the training, while it is pending."""
+        return self.update.job(self._model)
+
+    def on_finding(self, finding: Finding) -> None:
+        """Process the result of a diagnosis; a change holds from the next row on."""
+        note, reference = self.update.resolve(finding), self._evaluation.reference
+        if note and (finding.equations or (reference is not None and reference.follows_equations)):
+            self._evaluation.notes.append(note)
+
+    # --- changes ---------------------------------------------------------------------------------------------
+
+    def change(self, time_ns: int, period_ns: float, units: Sequence[str]) -> Baseline | None:
+        """Execute the change that holds from a row on, and return it; None: there is none."""
+        if not is_command(self.update.changes[0]):
+            return self._change_model(time_ns, period_ns, units)
+        change = self.update.pop_due(time_ns)
+        if change is not None:
+            self._evaluation.leave_ordinary()
+            self._execute(change)
+        return change
+
+    def _change_model(self, time_ns: int, period_ns: float, units: Sequence[str]) -> Baseline | None:
+        """Learn the baseline again with the model of a change, if one holds from this row on; returns it if so."""
+        update, evaluation = self.update, self._evaluation
+        if update.changes and is_command(update.changes[0]):
+            return None
+        change = update.pop_due(time_ns)
+        if change is None or update.rows is None:
+            return None
+        evaluation.leave_ordinary()
+        try:
+            trained = update.relearn(change, self._models)
+        except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
+            self._failures.add("baseline", error, "the plant is judged by the equations as given")
+            return None
+        if trained is None:
+            evaluation.notes.append("the identified models predict the training better; the baseline stays as it is")
+            return None
+        self.modes.reference = trained.reference.kind
+        evaluation.start(trained, period_ns, units, again=True)
+        self._check_training(trained.rows)
+        if evaluation.memory.rows_watched:  # the filter stands at the end of the training, and rows have come since
+            trained.reference.restart()
+            evaluation.release_values()
+        return change
 
     # --- commands --------------------------------------------------------------------------------------------
 
     @property
     def all(self) -> list[Baseline]:
         """Baselines that can be restored, the oldest first, then the one in force."""
-        return [_change_of(change) for change in (*(item.change for item in self.kept), self._update.baseline)]
+        return [_change_of(change) for change in (*(item.change for item in self.kept), self.update.baseline)]
 
     @property
     def equations(self) -> ProcessModel | None:
         """Process model in force: as given, or as the change of the baseline has it; None: there is none."""
-        return self._equations(self._update.baseline)
+        return self._equations(self.update.baseline)
 
     def _equations(self, change: Baseline | None) -> ProcessModel | None:
         return self._model if change is None or not change.model else read_equations(change.model)
@@ -93,89 +193,83 @@ class Baselines:
             InputError: the command is refused.
         """
         kept = [item.id for item in self.all[:-1]]
-        has_rows, has_alarm = self._training.memory.began_ns is not None, self._evaluation.memory.incident is not None
+        has_rows, has_alarm = self.training.memory.began_ns is not None, self._evaluation.memory.incident is not None
         change = check_command(command, kept, has_rows=has_rows, has_alarm=has_alarm)
-        self._update.changes.append(ScheduledChange(None, change))
+        self.update.changes.append(change)
         return change
 
-    def execute(self, change: Baseline) -> None:
+    def _execute(self, change: Baseline) -> None:
         """Execute a command: keep the baseline in force, and train again or restore another."""
         kept = {_change_of(item.change).id: item for item in self.kept}
         restored = kept.get(change.restored) if change.what == RESTORE else None
         memory = self._evaluation.memory
         accepted = memory.incident if change.what == ACCEPT else None
-        memory.incident = self._update.rows = None
-        if memory.reference is not None:
-            kept[_change_of(self._update.baseline).id] = self._keep()
+        memory.incident = self.update.rows = None
+        if self._evaluation.reference is not None:
+            kept[_change_of(self.update.baseline).id] = self._keep()
         self.kept = list(kept.values())[-MOST_KEPT:]
         if restored is not None:
             change.model = _change_of(restored.change).model
             self._judge_by(restored)
         else:
             self._stop_judging()
-            self._training.restart(change.time_ns)
+            self.training.restart(change.time_ns)
             if accepted is not None:
-                self._training.take_over(accepted)
-        self._update.baseline = change
+                self.training.take_over(accepted)
+        self.update.baseline = change
         if self._evaluation.reference is None:
             self.modes.is_judged, self.modes.is_resumed = True, False
 
     # --- modes -----------------------------------------------------------------------------------------------
 
-    def is_mode_change(self, values: Mapping[str, float]) -> bool:
-        """Take over the newest values of the modes; returns True if the plant has changed its mode.
+    def follow_mode(self, values: Mapping[str, float]) -> None:
+        """Take over the newest values of the modes, and change the baseline if the plant has changed its mode.
 
         A first value is no change: rows before it are of the same mode.
         """
-        new, old = [values[name] for name in self._names], self.modes.mode
-        if new == old:
-            return False
+        new, old = [values[name] for name in self._config.modes], self.modes.mode
         is_first = all(before != before or before == value for before, value in zip(old, new, strict=True))
         if is_first and not self._is_startup(new):
             self.modes.mode = new
-            return False
-        return True
+        elif new != old:
+            self._change_mode(new)
 
     def _is_startup(self, mode: list[float]) -> bool:
         """True if the plant starts up or shuts down in a mode."""
-        return any(value in self._startup.get(name, ()) for name, value in zip(self._names, mode, strict=True))
+        return any(
+            value in self._config.startup_modes.get(name, ())
+            for name, value in zip(self._config.modes, mode, strict=True)
+        )
 
-    def change_mode(self, values: Mapping[str, float]) -> str:
-        """Leave the present mode, and judge by what was learned in the next, or go on to learn it.
-
-        Args:
-            values: newest values of the modes.
-
-        Returns:
-            A note if the mode is new and its rows are not judged, else empty.
-        """
-        modes, training, evaluation = self.modes, self._training, self._evaluation
+    def _change_mode(self, mode: list[float]) -> None:
+        """Leave the present mode, and judge by what was learned in the next, or go on to learn it."""
+        modes, training, evaluation = self.modes, self.training, self._evaluation
         evaluation.leave_ordinary()
         evaluation.memory.incident, began_ns = None, training.memory.began_ns
         is_watched = evaluation.reference is not None
         if modes.is_judged and (is_watched or training.memory.rows.times):
             left = modes.others[_key_of(modes.mode)] = self._keep()
             left.training = None if is_watched else training.memory.rows
-        modes.mode, modes.expected = [values[name] for name in self._names], self.expected_false_alarms
+        modes.mode, modes.expected = mode, self.expected_false_alarms
         self._stop_judging()
         modes.is_judged = not self._is_startup(modes.mode)
         if not modes.is_judged:
-            return ""
+            return
         known = modes.others.pop(_key_of(modes.mode), None)
         if known is not None and known.training is None:
             self._judge_by(known)
             modes.expected = 2.0 * modes.expected - self.expected_false_alarms
-            return ""
+            return
         modes.is_resumed = known is not None and modes.is_learned
         training.restart(began_ns)
         if known is not None and known.training is not None:
             training.memory.rows = known.training
             self._models.resume(known.predictors, follows=False)
         if not modes.is_learned or (known is not None and training.is_enough()):
-            return ""
+            return
         modes.is_judged = False
-        name = ", ".join(f"{name} {value:.6g}" for name, value in zip(self._names, modes.mode, strict=True))
-        return (
+        name = ", ".join(f"{name} {value:.6g}" for name, value in zip(self._config.modes, modes.mode, strict=True))
+        self._evaluation.notes.append(
             f"{name} was not seen in the training: its rows are watched by signal checks only; "
             "`baseline relearn` learns them"
         )

@@ -8,7 +8,7 @@ from monitor_node.charts.shift import NAME as SHIFT
 from monitor_node.charts.shift import ShiftWatch
 from monitor_node.checks.stage import SignalChecks
 from monitor_node.config import MonitorConfig
-from monitor_node.learn.training import TrainingResult
+from monitor_node.learn.baseline import TrainingResult
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.errors import InputError

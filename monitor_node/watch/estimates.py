@@ -10,7 +10,7 @@ from monitor_node.learn.arx import ArxPredictor
 from monitor_node.learn.references import Reference
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Check, Estimate, ModelSnapshot
+from reactorwatch.contract.messages_pb2 import Check, Estimate
 
 NO_LIMITS = 0.0, nan, nan
 
@@ -74,19 +74,24 @@ def chart_limits(
 
 
 def model_snapshots(
-    config: MonitorConfig, predictors: Sequence[ArxPredictor], reference: Reference | None, checks: Sequence[Check]
-) -> Iterator[list[ModelSnapshot]]:
+    time_ns: int,
+    config: MonitorConfig,
+    predictors: Sequence[ArxPredictor],
+    reference: Reference | None,
+    checks: Sequence[Check],
+) -> Iterator[Publication]:
     """Snapshots of each output's models: adaptive, fitted to the training, and the reference.
 
     The fitted model is only compared with the adaptive one, which is the reference if that is `arx`.
 
     Args:
+        time_ns: time of the row.
         config: settings of the monitor.
         predictors: identified models, one an output.
         reference: the reference; None during the training.
         checks: checks of the training.
     """
-    for index, predictor in enumerate(predictors):
+    for index, (signal, predictor) in enumerate(zip(config.outputs, predictors, strict=True)):
         adaptive, fitted = predictor.adaptive_snapshot(), predictor.reference_snapshot()
         judging = None if reference is None else reference.snapshot(index, config.inputs, config.outputs)
         if fitted is not None:
@@ -96,4 +101,7 @@ def model_snapshots(
         for snapshot in (adaptive if predictor.judges else fitted, judging):
             if snapshot is not None:
                 snapshot.checks.extend(checks)
-        yield [snapshot for snapshot in (adaptive, fitted, judging) if snapshot is not None]
+        for snapshot in (adaptive, fitted, judging):
+            if snapshot is not None:
+                snapshot.time_ns = time_ns
+                yield Publication(keys.key(config.plant, keys.MODEL, signal), snapshot)

@@ -1,41 +1,46 @@
 """Pipeline of a plant's rows: training, then evaluation.
 
 During training rows are kept, and the identified models are updated with them. Afterwards the reference predicts each
-row, and the charts evaluate its prewhitened residuals (`evaluation`). Commands and diagnoses change the baseline by
-which rows are judged, and so does a change of the operating mode.
+row, and the charts evaluate its prewhitened residuals. An ordinary row is taken by the compiled step. Any other row
+passes the stages (`evaluation`) one by one, with the same numbers. A reference that learns does so while nothing is
+wrong: otherwise it would learn a fault as normal.
+
+Commands and diagnoses change the baseline by which rows are judged, and so does a change of the operating mode
+(`baselines`).
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from math import isfinite, nan
 
 from monitor_node.alarms.alarms import AlarmChange
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.causes.stage import Suspicion
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.health import NODE, Failures
 from monitor_node.ingest.alignment import MeasuredRow, Row
-from monitor_node.ingest.sampling import Interval, SamplingPeriod
+from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.learn.arx_reference import ArxReference
-from monitor_node.learn.model_update import ModelUpdate, ScheduledChange, is_command
+from monitor_node.learn.baseline import NO_VALUE, TrainingResult
+from monitor_node.learn.model_update import is_command
 from monitor_node.learn.signal_range import input_bounds
-from monitor_node.learn.training import TrainingResult
-from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding, equations_text
+from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.baselines import Baselines
 from monitor_node.watch.budget import check_promise
-from monitor_node.watch.estimates import model_snapshots
+from monitor_node.watch.estimates import chart_limits, estimate_keys, estimates, model_snapshots
 from monitor_node.watch.evaluation import Evaluation
 from monitor_node.watch.operation import Operation
 from monitor_node.watch.pipeline_memory import PipelineMemory
 from monitor_node.watch.promise import PromiseStage
-from monitor_node.watch.row_frame import Records
-from monitor_node.watch.row_step import FilterNumbers
-from monitor_node.watch.training_stage import TIMES_FEWEST, TrainingStage
+from monitor_node.watch.row_step import EVENT, VIOLATING
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.stored_state import copy_of
+from reactorwatch.spc.prewhitening import expected_values, innovations
 
 
 class PlantPipeline:
@@ -56,11 +61,12 @@ class PlantPipeline:
 
     Attributes:
         model: process model of the plant; None if there is none.
-        evaluation: evaluation of the plant's rows.
+        evaluation: stages by which the plant's rows are evaluated.
         models: identified models.
         operation: operation of the plant, for the texts of alarms.
+        training: training of the plant.
         baselines: the baseline in force, and those that can be restored.
-        model_update: changes of the baseline to come, and the one in force.
+        has_judged: True if a chart could judge a row since this object was made.
     """
 
     def __init__(
@@ -71,13 +77,12 @@ class PlantPipeline:
         points: bool = True,
         model: ProcessModel | None = None,
         failures: Failures | None = None,
-        changes: deque[ScheduledChange] | None = None,
+        changes: deque[Baseline] | None = None,
         diagnose: Callable[[DiagnosisJob], Finding] | None = None,
         promises: PromiseStage | None = None,
     ) -> None:
         self._config, self._board = config, board
         self._units = [config.units.get(name, "") for name in config.outputs]
-        self._diagnose = diagnose
         self._failures = Failures() if failures is None else failures
         self._points = points
         self._inputs = len(config.inputs)
@@ -88,7 +93,7 @@ class PlantPipeline:
         self._sampling = SamplingPeriod()
         self._promise_checked = False
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
-        self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
+        self._paths, self._paths_beside = estimate_keys(config), estimate_keys(config, ArxReference.kind)
         self.models = ArxReference(config, points=points)
         self.evaluation = Evaluation(
             config,
@@ -96,12 +101,20 @@ class PlantPipeline:
             self.models,
             model=self.model,
             is_process=model is not None or config.reference == "equations",
-            failures=self._failures,
             promises=promises or PromiseStage(config, board, self._failures, points=points),
         )
-        self._training = TrainingStage(config, self.model, self.models)
-        self.model_update = ModelUpdate(config, deque() if changes is None else changes)
-        self.baselines = Baselines(config, self.model, self.models, self._training, self.evaluation, self.model_update)
+        self.baselines = Baselines(
+            config,
+            self.model,
+            self.evaluation,
+            self.operation,
+            self._failures,
+            deque() if changes is None else changes,
+            diagnose,
+        )
+        self.training = self.baselines.training
+        self._noted: set[str] = set()
+        self.has_judged = False
 
     # --- memory ----------------------------------------------------------------------------------------------
 
@@ -111,13 +124,13 @@ class PlantPipeline:
         return PipelineMemory(
             self._sampling,
             self.operation.memory,
-            self._training.memory,
-            self.evaluation.memory,
+            self.training.memory,
+            self.evaluation.collect_memory(),
             self.baselines.modes,
             self.baselines.kept,
-            self.model_update.baseline,
-            self.model_update.rows,
-            self.model_update.commands,
+            self.baselines.update.baseline,
+            self.baselines.update.rows,
+            self.baselines.update.commands,
         )
 
     def resume(self, memory: PipelineMemory, now_ns: int) -> None:
@@ -130,16 +143,16 @@ class PlantPipeline:
         Raises:
             ValueError: the memory is damaged.
         """
-        update, baselines = self.model_update, self.baselines
+        update, baselines = self.baselines.update, self.baselines
         if set(memory.operation) != set(self.operation.memory):
             raise ValueError(f"the state must be of {sorted(self.operation.memory)}, got {sorted(memory.operation)}")
-        self._sampling, self.operation.memory, self._training.memory = (
+        self._sampling, self.operation.memory, self.training.memory = (
             memory.sampling,
             memory.operation,
             memory.training,
         )
         baselines.modes, baselines.kept, update.baseline = memory.modes, memory.kept, memory.change
-        update.changes.extend(ScheduledChange(None, change) for change in memory.commands)
+        update.changes.extend(memory.commands)
         update.rows = memory.undiagnosed if self._config.diagnose_training else None
         self.evaluation.resume(memory.evaluation, baselines.equations, now_ns, follows=True)
 
@@ -147,13 +160,6 @@ class PlantPipeline:
         """Follow alarms that were set from outside."""
         self.evaluation.leave_ordinary()
         self.evaluation.signals.silence.follow_alarms()
-
-    @property
-    def numbers(self) -> tuple[Records, FilterNumbers]:
-        """Numbers of the stages and of the filter, each with a first axis of one; of a plant in its normal state."""
-        ordinary = self.evaluation.ordinary
-        assert ordinary.kalman is not None
-        return ordinary.numbers, ordinary.kalman
 
     @property
     def is_ordinary(self) -> bool:
@@ -187,19 +193,9 @@ class PlantPipeline:
         return None if reference is None else reference.noise_levels
 
     @property
-    def refused_training(self) -> str:
-        """Reason why the last refused training was; empty if none was."""
-        return self._training.refused
-
-    @property
-    def training_rows(self) -> int:
-        """Number of rows of the training, after its end."""
-        return self._training.trained_rows
-
-    @property
     def trained_share(self) -> float:
         """Share of the training that is done, 0 to 1."""
-        return 1.0 if self.watching else self._training.share(self._sampling.period_ns)
+        return 1.0 if self.watching else self.training.share(self._sampling.period_ns)
 
     @property
     def expected_false_alarms(self) -> float:
@@ -216,93 +212,204 @@ class PlantPipeline:
             units: units of the outputs.
             publications: list to which publications are added; those before an error are published nevertheless.
         """
-        evaluation, time_ns = self.evaluation, row.time_ns
-        if self.model_update.changes:
-            self._change_baseline(time_ns, publications)
-        if self._config.modes and self.baselines.is_mode_change(self.operation.values):
-            self._note(self.baselines.change_mode(self.operation.values))
-        interval = self._sampling.update(time_ns)
-        if evaluation.is_ordinary:
-            if not row.restarted and evaluation.step(row):
-                if evaluation.needs_rows:
-                    evaluation.publish_step(self._split(row, units, interval, publications))
-                return
+        baselines, evaluation = self.baselines, self.evaluation
+        if baselines.update.changes:
+            self._change_baseline(row.time_ns, publications)
+        if self._config.modes:
+            baselines.follow_mode(self.operation.values)
+        interval = self._sampling.update(row.time_ns)
+        inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
+        follows = interval.follows and not row.restarted
+        measured = MeasuredRow(row.time_ns, inputs, values, units, interval, follows, publications)
+        if not (evaluation.is_ordinary and not row.restarted and self._take_ordinary(row.values, measured)):
+            self._take_event(row, measured)
+
+    def _take_ordinary(self, signals: tuple[float, ...], row: MeasuredRow) -> bool:
+        """Evaluate a row by the compiled step; returns False if it is an event, for which nothing has changed."""
+        evaluation, memory, time_ns = self.evaluation, self.evaluation.memory, row.time_ns
+        ordinary, charts, shift = evaluation.ordinary, evaluation.charts, evaluation.shift
+        verdict = ordinary.take(time_ns, signals)
+        if verdict == EVENT:
+            return False
+        if verdict == VIOLATING:
+            charts.store_delays(ordinary.numbers[0])
+        assert ordinary.reference is not None
+        ordinary.reference.accept_row(time_ns / MINUTE_NS, row.inputs)
+        memory.rows_watched += 1
+        self.has_judged = True
+        if evaluation.suspicion is not None:
+            evaluation.suspicion.add(time_ns / MINUTE_NS, row.inputs, row.values)
+        if not (self._points or evaluation.drift.wanted or shift.is_active):
+            return True
+        before = len(row.publications)
+        predictions, sds, z, expected, points = ordinary.results
+        if self._points:
+            scales = [sd * whitened for sd, whitened in zip(sds, evaluation.whitened_sds, strict=True)]
+            limits = chart_limits(predictions, sds, scales, expected, charts.memory.widths)
+            row.publications.extend(estimates(row, self._paths, predictions, limits))
+            row.publications.extend(charts.points(time_ns, points))
+        changes = shift.update(row, z, points=self._points) if shift.is_active else []
+        self._end_row(row, changes, before)
+        if self._board.has_unexplained:  # a lasting step
             evaluation.leave_ordinary()
-        self._units = units
+        return True
+
+    def _take_event(self, row: Row, measured: MeasuredRow) -> None:
+        """Pass a row that is not ordinary through the stages, one by one, and apply its changes of alarms once."""
+        evaluation, modes, time_ns = self.evaluation, self.baselines.modes, row.time_ns
+        evaluation.leave_ordinary()
+        self._units = measured.units
         if row.restarted:
             self.operation.on_restart()
-        measured = self._split(row, units, interval, publications)
         self.operation.inputs = measured.inputs
         changes: list[AlarmChange] = []
         usable = evaluation.signals.check_row(time_ns, row.values, changes)
         measured.inputs, measured.values = usable[: self._inputs], list(usable[self._inputs :])
-        if not self.is_judged:
-            if self.baselines.modes.is_learned:
-                evaluation.signals.check_values(time_ns, measured.values, units, changes)
-            publications.extend(self._board.apply(time_ns, changes))
-        elif evaluation.reference is None:
-            publications.extend(self._board.apply(time_ns, changes))
-            self._train(measured)
-        else:
+        if evaluation.reference is not None and modes.is_judged:
             if row.restarted:
                 evaluation.signals.on_restart()
-            evaluation.update(measured, self._sampling, changes)
+            self._evaluate(measured, changes)
+            evaluation.is_ordinary = evaluation.find_ordinary(time_ns, self._sampling)
+        else:
+            if not modes.is_judged and modes.is_learned:
+                evaluation.signals.check_values(time_ns, measured.values, measured.units, changes)
+            measured.publications.extend(self._board.apply(time_ns, changes))
+            if modes.is_judged:
+                self._train(measured)
         self.operation.inputs = ()
 
-    def _split(self, row: Row, units: list[str], interval: Interval, publications: list[Publication]) -> MeasuredRow:
-        """A row for the stages, with inputs and outputs apart."""
-        inputs, values = row.values[: self._inputs], list(row.values[self._inputs :])
-        follows = interval.follows and not row.restarted
-        return MeasuredRow(row.time_ns, inputs, values, units, interval, follows, publications)
+    def _evaluate(self, row: MeasuredRow, changes: list[AlarmChange]) -> None:
+        """Evaluate a row by the stages after its first checks, which have found some changes of alarms."""
+        evaluation, memory, time_ns, units = self.evaluation, self.evaluation.memory, row.time_ns, row.units
+        reference, signals = evaluation.reference, evaluation.signals
+        charts, shift = evaluation.charts, evaluation.shift
+        assert reference is not None
+        before = len(row.publications)
+        if memory.left_out:
+            self._mask_signals(row, memory.left_out)
+        stuck = signals.check_values(time_ns, row.values, units, changes)
+        if True in stuck:
+            row.values = [nan if still else value for value, still in zip(row.values, stuck, strict=True)]
+        values = row.values
+        if row.interval.is_gap:  # the input in it is unknown
+            evaluation.restart()
+        predictions, sds, extrapolation = reference.update(
+            time_ns, row.inputs, values, memory.quarantined, row.interval.missing, follows=row.follows
+        )
+        z = [(value - prediction) / sd for value, prediction, sd in zip(values, predictions, sds, strict=True)]
+        tested = z
+        if extrapolation is not None:
+            tested = [(value - known) / sd for value, known, sd in zip(values, *extrapolation, strict=True)]
+        scales = [sd * whitened for sd, whitened in zip(sds, evaluation.whitened_sds, strict=True)]
+        if self._points:
+            expected = expected_values(evaluation.whitener_numbers)
+            limits = chart_limits(predictions, sds, scales, expected, charts.memory.widths)
+            row.publications.extend(estimates(row, self._paths, predictions, limits))
+        e = innovations(evaluation.whitener_numbers, z)
+        memory.rows_watched += 1
+        if not self.has_judged:
+            judged = (*e, *(tested if shift.is_active else ()), *(values if charts.reads_values else ()))
+            self.has_judged = any(map(isfinite, judged))
+        memory.quarantined = quarantined = tuple(signals.check_residuals(time_ns, e, scales, units, changes))
+        if True in quarantined:
+            for whitener, outlier in zip(evaluation.whiteners, quarantined, strict=True):
+                if outlier:
+                    whitener.reject_last()
+        changes += charts.update(row, e, quarantined, scales, points=self._points)
+        if shift.is_active:
+            changes += shift.update(row, tested, points=self._points)
+        self._end_row(row, changes, before, stuck)
+        for about, text in reference.obstacles(self._config.inputs):
+            if about not in self._noted:
+                self._noted.add(about)
+                evaluation.notes.append(text)
+
+    def _end_row(
+        self, row: MeasuredRow, changes: list[AlarmChange], before: int, stuck: Sequence[bool] | None = None
+    ) -> None:
+        """Compare the models, apply the changes of alarms, and let what follows from alarms follow.
+
+        Args:
+            row: the row.
+            changes: changes of alarms so far.
+            before: number of publications before the row.
+            stuck: flags of the outputs whose sensors are stuck; None: an ordinary row, of which the causes are not
+                searched and nothing is learned.
+        """
+        evaluation, memory, board = self.evaluation, self.evaluation.memory, self._board
+        reference, publications = evaluation.reference, row.publications
+        assert reference is not None
+        if evaluation.drift.wanted:
+            is_beside = reference is not self.models
+            predictions = self.models.adapt(row) if is_beside or self.models.stays_as_fitted else []
+            if is_beside and predictions:
+                publications.extend(estimates(row, self._paths_beside, predictions))
+            changes += evaluation.drift.update(row, self.models.predictors)
+        if changes:
+            publications.extend(board.apply(row.time_ns, changes))
+        if stuck is not None and evaluation.suspicion is not None:
+            publications.extend(self._search_causes(evaluation.suspicion, row, stuck))
+        if stuck is not None or board.has_unexplained:
+            reference.set_learning(not board.has_unexplained)
+            if not board.has_unexplained:
+                memory.incident = None
+            else:
+                if memory.incident is None:
+                    memory.incident = TrainingRows([0] * len(self._config.outputs))
+                memory.incident.add(row.time_ns, row.inputs, row.values)
+        alarms = [item.message for item in publications[before:] if isinstance(item.message, Alarm)]
+        if alarms:
+            note = evaluation.promises.count_alarms(row.time_ns, memory.rows_watched, alarms, publications)
+            evaluation.notes += [note] if note else []
+
+    def _search_causes(self, suspicion: Suspicion, row: MeasuredRow, stuck: Sequence[bool]) -> list[Publication]:
+        """Search the causes of alarms; an error there costs the state of the search, and no alarm."""
+        try:
+            return suspicion.update(row.time_ns, row.inputs, row.values, row.units, list(stuck))
+        except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
+            self._failures.add("isolation", error, "the search for the cause of this alarm starts again")
+            assert self.evaluation.reference is not None
+            self.evaluation.start_search(self.evaluation.reference)
+            return []
+
+    def _mask_signals(self, row: MeasuredRow, left_out: dict[str, str]) -> None:
+        """Mask the signals that are left out, as in the training; note once each that comes after it."""
+        for name, value in zip(self._config.signals, (*row.inputs, *row.values), strict=True):
+            if left_out.get(name) == NO_VALUE and isfinite(value):
+                left_out[name] = "its first value came after the training"
+                self.evaluation.notes.append(
+                    f"{name} comes now, and is not watched: start the monitor without its state to learn it"
+                )
+        inputs, outputs = self._config.inputs, self._config.outputs
+        row.inputs = tuple(0.0 if name in left_out else x for name, x in zip(inputs, row.inputs, strict=True))
+        row.values = [nan if name in left_out else y for name, y in zip(outputs, row.values, strict=True)]
+
+    # --- training and baselines ------------------------------------------------------------------------------
 
     def _train(self, row: MeasuredRow) -> None:
-        config, training, time_ns, publications = self._config, self._training, row.time_ns, row.publications
+        """Train with a row, or end the training before it and evaluate it."""
+        training, modes, time_ns, period_ns = self.training, self.baselines.modes, row.time_ns, self._sampling.period_ns
         if not self._promise_checked and self._sampling.learned_ns is not None:
-            check_promise(config, self._sampling.period_ns / MINUTE_NS)
+            check_promise(self._config, period_ns / MINUTE_NS)
             self._promise_checked = True
         training.start_clock(time_ns)
-        share = training.share(self._sampling.period_ns, self.baselines.rows_in_other_modes)
-        is_over = share >= 1.0 or self.baselines.modes.is_resumed
+        is_over = training.share(period_ns, self.baselines.rows_in_other_modes) >= 1.0 or modes.is_resumed
         timed_out = self.evaluation.signals.silence.silent[self._inputs :]
         if is_over and not training.is_open and training.is_enough(timed_out):
-            rows, trained = training.finish()
+            trained = training.finish()
             if not trained.refused:
-                self._end_training(time_ns, rows, trained, publications)
-                self.evaluation.evaluate(row, [])
-                publications.extend(self.snapshots(time_ns))
-                publications.extend(self._promise_messages(time_ns))
+                self._end_training(time_ns, trained, row.publications)
+                self._evaluate(row, [])
+                row.publications.extend(self.snapshots(time_ns))
+                row.publications.extend(self._promise_messages(time_ns))
                 return
-            training.memory.refusals, training.refused = training.memory.refusals + 1, trained.refused
-            self._note(f"the training starts again: {trained.refused}")
-            training.restart(time_ns)
-        training.add(row)
-
-    def _note(self, text: str) -> None:
-        if text:
-            self.evaluation.notes.append(text)
-
-    def snapshots(self, time_ns: int) -> list[Publication]:
-        """Snapshots of the promise and of each output's models, see `model_snapshots`."""
-        if not self._points:
-            return []
-        publications, evaluation = self._promise_messages(time_ns), self.evaluation
-        snapshots = model_snapshots(
-            self._config, self.models.predictors, evaluation.reference, evaluation.memory.checks
-        )
-        for key, of_output in zip(self._model_keys, snapshots, strict=True):
-            for snapshot in of_output:
-                snapshot.time_ns = time_ns
-                publications.append(Publication(key, snapshot))
-        return publications
-
-    def _promise_messages(self, time_ns: int) -> list[Publication]:
-        return self.evaluation.promises.messages(time_ns, self.evaluation.memory.rows_watched)
-
-    # --- training --------------------------------------------------------------------------------------------
+            self.evaluation.notes.append(training.refuse(trained.refused, time_ns))
+        if predictions := training.add(row):
+            row.publications.extend(estimates(row, self._paths, predictions))
 
     def open_training(self) -> None:
         """Train until `end_training`, on all rows until then."""
-        self._training.open()
+        self.training.open()
 
     def end_training(self, time_ns: int) -> None:
         """End the training with the rows so far; the next row is the first of another run of the plant.
@@ -313,39 +420,16 @@ class PlantPipeline:
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
-        rows, trained = self._training.finish_early()
-        self._end_training(time_ns, rows, trained, [])
+        self._end_training(time_ns, self.training.finish_early(), [])
 
-    def _end_training(
-        self, time_ns: int, rows: TrainingRows, trained: TrainingResult, publications: list[Publication]
-    ) -> None:
-        self._start(trained)
-        if self._config.diagnose_training and equations_text(self.model):
-            self.model_update.rows = rows
-        if self._diagnose is not None and (job := self.diagnosis_job) is not None:
-            self.on_finding(self._diagnose(job))
-        if not self._change_model(time_ns, publications):
-            self._check_training(rows)
+    def _end_training(self, time_ns: int, trained: TrainingResult, publications: list[Publication]) -> None:
+        change = self.baselines.end_training(time_ns, trained, self._sampling.period_ns, self._units)
+        if change is not None:
+            publications.append(Publication(self._baseline_key, change))
 
-    def new_trials(self) -> Callable[[MonitorConfig], "PlantPipeline"]:
-        """Learn from the rows so far; returns a function that makes pipelines which start with what was learned.
-
-        Their settings may differ in the false alarms.
-
-        Raises:
-            InputError: there are too few rows to learn from, or no output can be watched.
-        """
-        _, trained = self._training.finish_early(times=TIMES_FEWEST)
-        memory, reference = copy_of(self.memory), copy_of(trained.reference.memory)
-
-        def start(config: MonitorConfig) -> "PlantPipeline":
-            pipeline = PlantPipeline(config, Annunciator(config), points=False, model=self.model)
-            pipeline.resume(copy_of(memory), 0)
-            of_pipeline = reference.reference(pipeline.baselines.equations, config.outputs, pipeline.models)
-            pipeline._start(trained._replace(reference=of_pipeline, checks=list(trained.checks)))
-            return pipeline
-
-        return start
+    def start(self, trained: TrainingResult) -> None:
+        """Start to judge by what was learned elsewhere from the rows so far."""
+        self.baselines.start(trained, self._sampling.period_ns, self._units)
 
     def start_run(self) -> None:
         """Expect the first row of another run of the plant, whose times are unrelated to those of the training."""
@@ -354,71 +438,26 @@ class PlantPipeline:
         self.evaluation.release_values()
         self.evaluation.signals.on_restart()
 
-    def _start(self, trained: TrainingResult, *, again: bool = False) -> None:
-        """Start to evaluate rows, see `Evaluation.start`."""
-        modes = self.baselines.modes
-        modes.is_learned, modes.reference = True, trained.reference.kind
-        self.evaluation.start(trained, self._sampling.period_ns, self._units, again=again)
-        if not again:
-            self.operation.end_training()
-
-    def _check_training(self, rows: TrainingRows) -> None:
-        """Judge the training by itself."""
-        evaluation, reference = self.evaluation, self.evaluation.reference
-        if reference is not None:
-            model = self.baselines.equations if reference.follows_equations else None
-            self._note(evaluation.promises.check(rows, model, reference.kind, evaluation.memory.rows_watched))
-
-    # --- changes of the baseline -----------------------------------------------------------------------------
-
-    @property
-    def diagnosis_job(self) -> DiagnosisJob | None:
-        """The diagnosis of the training, while it is pending."""
-        return self.model_update.job(equations_text(self.model)) if self.model_update.is_pending else None
-
-    def on_finding(self, finding: Finding) -> None:
-        """Process the result of a diagnosis; a change holds from the next row on."""
-        note = self.model_update.resolve(finding)
-        reference = self.evaluation.reference
-        if finding.equations or (reference is not None and reference.follows_equations):
-            self._note(note)
-
     def _change_baseline(self, time_ns: int, publications: list[Publication]) -> None:
         """Execute the change that holds from a row on, if there is one."""
-        if not is_command(self.model_update.changes[0].baseline):
-            self._change_model(time_ns, publications)
-        elif (change := self.model_update.pop_due(time_ns)) is not None:
-            self.evaluation.leave_ordinary()
-            self.baselines.execute(change)
-            publications.append(Publication(self._baseline_key, change))
-
-    def _change_model(self, time_ns: int, publications: list[Publication]) -> bool:
-        """Learn the baseline again with the model of a change, if one holds from this row on; returns True if so."""
-        if self.model_update.changes and is_command(self.model_update.changes[0].baseline):
-            return False
-        rows, change = self.model_update.rows, self.model_update.pop_due(time_ns)
-        if change is None or rows is None:
-            return False
-        self.evaluation.leave_ordinary()
-        try:
-            trained = self.model_update.relearn(change, self.models)
-        except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
-            self._failures.add("baseline", error, "the plant is judged by the equations as given")
-            return False
-        if trained is None:
-            self._note("the identified models predict the training better; the baseline stays as it is")
-            return False
-        self._start(trained, again=True)
-        self._check_training(rows)
+        change = self.baselines.change(time_ns, self._sampling.period_ns, self._units)
+        if change is None:
+            return
         publications.append(Publication(self._baseline_key, change))
-        if (
-            self.evaluation.memory.rows_watched
-        ):  # the filter stands at the end of the training, and rows have come since
-            trained.reference.restart()
-            self.evaluation.release_values()
+        if not is_command(change) and self.evaluation.memory.rows_watched:
             publications.extend(self.snapshots(time_ns))
             publications.extend(self._promise_messages(time_ns))
-        return True
+
+    def snapshots(self, time_ns: int) -> list[Publication]:
+        """Snapshots of the promise and of each output's models, see `model_snapshots`."""
+        if not self._points:
+            return []
+        reference, checks = self.evaluation.reference, self.evaluation.memory.checks
+        snapshots = model_snapshots(time_ns, self._config, self.models.predictors, reference, checks)
+        return [*self._promise_messages(time_ns), *snapshots]
+
+    def _promise_messages(self, time_ns: int) -> list[Publication]:
+        return self.evaluation.promises.messages(time_ns, self.evaluation.memory.rows_watched)
 
 
 def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:

@@ -11,6 +11,7 @@ from monitor_node.learn.arx import ArxPredictor
 from monitor_node.learn.arx_reference import ArxMemory
 from monitor_node.learn.black_box_reference import BlackBoxMemory
 from monitor_node.learn.process_reference import ProcessMemory
+from monitor_node.learn.training import TrainingMemory
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.operation import CarriedState
 from monitor_node.watch.promise import PlantPromise
@@ -58,20 +59,6 @@ class EvaluationMemory(Memory, kw_only=True):
     incident: TrainingRows | None = None
     change: Baseline | None = None
     training: TrainingRows | None = None
-
-
-class TrainingMemory(Memory):
-    """Memory of the training of a plant.
-
-    Attributes:
-        rows: rows of the present training.
-        began_ns: start of the present or last training; None before its first row.
-        refusals: number of refused trainings.
-    """
-
-    rows: TrainingRows
-    began_ns: int | None = None
-    refusals: int = 0
 
 
 class ModesMemory(Memory):

@@ -22,9 +22,9 @@ from monitor_node.causes.scan import GlrScan
 from monitor_node.causes.stage import has_causes
 from monitor_node.causes.window import window_of
 from monitor_node.config import MonitorConfig
-from monitor_node.learn.process_reference import output_indices
+from monitor_node.learn.process_reference import model_outputs, output_indices
 from monitor_node.learn.references import Reference
-from monitor_node.learn.training_rows import TrainingRows
+from monitor_node.learn.training_rows import RowArrays, TrainingRows
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Power
 from reactorwatch.diagnosis.fitting.signatures import forward_signatures
@@ -139,25 +139,24 @@ def _message(deviation: Deviation, profile: str, sizes: Sequence[float]) -> Powe
 
 
 def _deviations(watch: Watch, rows: TrainingRows) -> list[Deviation]:
-    time_min, inputs, measured = rows.time_min, rows.inputs, rows.outputs
-    if len(time_min) < 2 * FEWEST_ROWS:
+    arrays = rows.arrays
+    if len(arrays.time_min) < 2 * FEWEST_ROWS:
         return []
     plant = watch.reference.plant
     if plant is not None and has_causes(watch.config, plant.equations):
-        return _causes(watch, time_min, inputs, measured)
-    return _biases(watch, time_min, inputs, measured)
+        return _causes(watch, arrays)
+    return _biases(watch, arrays)
 
 
-def _causes(watch: Watch, time_min: Array, inputs: Array, measured: Array) -> list[Deviation]:
+def _causes(watch: Watch, arrays: RowArrays) -> list[Deviation]:
     """Causes of the catalogue, to first order about the filter's run over the training."""
     plant, known_plant = watch.reference.plant, watch.reference.known_plant
     assert plant is not None
     assert known_plant is not None
     (model, noise), effects = known_plant, causes_of(plant.equations)
     indices = output_indices(model, watch.config.outputs)
-    outputs = np.full((len(time_min), len(model.outputs)), np.nan)
-    outputs[:, indices] = measured
-    newest = list(zip(time_min.tolist(), inputs.tolist(), outputs.tolist(), strict=True))
+    outputs = model_outputs(model, watch.config.outputs, arrays.outputs)
+    newest = list(zip(arrays.time_min.tolist(), arrays.inputs.tolist(), outputs.tolist(), strict=True))
     window = window_of(newest[-2 * MOST_ROWS :], Filter(model, noise))
     if window is None or window.time_min.size < 2 * FEWEST_ROWS:
         return []
@@ -179,11 +178,12 @@ def _causes(watch: Watch, time_min: Array, inputs: Array, measured: Array) -> li
     return found
 
 
-def _biases(watch: Watch, time_min: Array, inputs: Array, measured: Array) -> list[Deviation]:
+def _biases(watch: Watch, arrays: RowArrays) -> list[Deviation]:
     """Biases of the outputs, by the difference that they make to normalised residuals."""
-    reference, rows = watch.reference, min(MOST_ROWS, len(measured) // 2)
+    reference, measured = watch.reference, arrays.outputs
+    rows = min(MOST_ROWS, len(measured) // 2)
     onsets = np.linspace(FEWEST_ROWS // 2, len(measured) - rows, RUNS).astype(int).tolist()
-    usual, found = reference.normalised_residuals(time_min, inputs, measured), []
+    usual, found = reference.normalised_residuals(arrays), []
     responses = reference.step_responses(rows) if usual is None else None
     for index, name in enumerate(watch.config.outputs):
         if not watch.evaluated[index]:
@@ -196,7 +196,8 @@ def _biases(watch: Watch, time_min: Array, inputs: Array, measured: Array) -> li
             for onset in onsets:
                 shifted = measured.copy()
                 shifted[onset:, index] += size
-                change = (np.asarray(reference.normalised_residuals(time_min, inputs, shifted)) - usual) / size
+                found_shifted = reference.normalised_residuals(arrays._replace(outputs=shifted))
+                change = (np.asarray(found_shifted) - usual) / size
                 runs.append(np.nan_to_num(change[onset : onset + rows]))
             paths = np.stack(runs)
         found.append(_bias(watch, name, paths))

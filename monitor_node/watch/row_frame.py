@@ -169,8 +169,8 @@ def frame_of(sizes: tuple[int, int, int], scratch: Records, work: Records, setti
 
 
 def words_of(numbers: Records) -> Words:
-    """Numbers of plants as words, shape (plants, words): a view."""
-    words: Words = numbers.view(np.int64).reshape(len(numbers), -1)
+    """Numbers of a plant as words, shape (words,): a view."""
+    words: Words = numbers.view(np.int64).reshape(-1)
     return words
 
 

@@ -1,9 +1,8 @@
-"""A row through all stages of a monitor in one compiled step, for one plant as for ten thousand.
+"""A row through all stages of a monitor in one compiled step.
 
 Most rows of most plants are alike: every signal has a value, the filter predicts it, no alarm changes. All that the
-stages then update are numbers: one record a plant (`row_frame`). A monitor of one plant steps over an array of one
-record, a fleet over one with a record for each plant; the steps themselves are in the stages' modules. The step is the
-same machine code for all plants.
+stages then update are numbers: one record a plant (`row_frame`). The steps themselves are in the stages' modules. The
+step is the same machine code for all plants.
 
 Any other row is an event, and changes nothing here: the stages process it one by one (`pipeline`), with the same
 numbers. Events are: a row after a gap or a missing row; one by which the filter restarts; a value out of the signal's
@@ -12,7 +11,7 @@ alarm. A point beyond a limit that raises no alarm is no event.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +20,8 @@ from monitor_node.charts.chart_design import alarm_names
 from monitor_node.checks.stage import CHECKS
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.sampling import WHOLE
-from monitor_node.learn.process_reference import row_filter
-from monitor_node.learn.references import GATE, FilterReference, Reference, RowFilter
-from monitor_node.learn.signal_range import SignalRange, possible_ranges
+from monitor_node.learn.references import GATE, FilterReference, Reference
+from monitor_node.learn.signal_range import SignalRange
 from monitor_node.watch.row_frame import (
     CHARTS,
     POINT,
@@ -39,10 +37,10 @@ from monitor_node.watch.row_frame import (
     work_at,
 )
 from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.codegen.numba_kernel import Entry, borrow, call_at, inline, jit
 from reactorwatch.identification.black_box.filter import JUDGED, filter_row
 from reactorwatch.kalman.ekf import fill_row
-from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.charts.base import LARGEST_VALUE
 from reactorwatch.spc.charts.cusum import _judge as judge_cusum
@@ -67,19 +65,6 @@ MOST_PERIODS = 1.99 - WHOLE
 
 
 _fill_row = jit(fill_row)
-
-
-class FilterNumbers(NamedTuple):
-    """Numbers of the filters of some plants.
-
-    Attributes:
-        belief: state and covariance, shape (plants, states + states^2); of a black box see `BlackBoxFilter`.
-        variances: variances of the sensors and of the process, shape (plants, outputs + states); of a black box all
-            its constants.
-    """
-
-    belief: Array
-    variances: Array
 
 
 @inline
@@ -176,11 +161,10 @@ def _update_charts(p: Any, work: Any, settings: Any) -> int:
 def step(
     numbers: Words,
     frame: Words,
-    beliefs: Array,
+    belief: Array,
     variances: Array,
     parameters: Array,
     after: Array,
-    plant: int,
     time_ns: int,
     time_min: float,
     values: Array,
@@ -188,18 +172,18 @@ def step(
     """Take a row through all stages; returns the verdict.
 
     Args:
-        numbers: numbers of the plants, see `words_of`.
+        numbers: numbers of the plant, see `words_of`.
         frame: see `frame_of`.
-        beliefs: beliefs of the filters, see `FilterNumbers`.
-        variances: variances of the filters, see `FilterNumbers`.
+        belief: state and covariance of the filter, shape (states + states^2,); of a black box see `BlackBoxFilter`.
+        variances: variances of the sensors and of the process, shape (outputs + states,); of a black box all its
+            constants.
         parameters: parameters of the model, and room for the variances, shape (parameters + outputs + states,).
         after: belief of a filter, to work in.
-        plant: index of the plant.
         time_ns: time of the row.
         time_min: the same in minutes.
         values: values of the row, the inputs first.
     """
-    kept, belief, noise = borrow(numbers[plant]), borrow(beliefs[plant]), borrow(variances[plant])
+    kept, belief, noise = borrow(numbers), borrow(belief), borrow(variances)
     values, parameters, after = borrow(values), borrow(parameters), borrow(after)
     scratch = scratch_at(frame, kept.size)
     for i in range(scratch.size):
@@ -244,86 +228,6 @@ def step(
 _STEP = Entry(step)
 
 
-class RowStep:
-    """The step for plants with certain settings.
-
-    Args:
-        config: settings of the plants' monitors.
-        ranges: ranges of each input and of each output.
-        row_filter: filter of the plants' reference.
-
-    Attributes:
-        numbers_type: type of the numbers of a plant's stages.
-        filter_sizes: sizes of belief and variances of a filter.
-        parameters: parameters of the model, and room for the variances of a filter.
-        work: results of the newest step, shape (1,).
-        frame: see `frame_of`.
-        after: belief of a filter, to work in.
-    """
-
-    def __init__(self, config: MonitorConfig, ranges: Sequence[SignalRange], row_filter: RowFilter) -> None:
-        code, parameters, filter_sizes, spacing_min = row_filter
-        kinds = [chart for chart, _ in alarm_names(config)]
-        sizes = len(config.inputs), len(config.outputs), len(kinds)
-        self._code = code  # it owns the memory
-        types = types_of(config)
-        self.numbers_type, self.filter_sizes = types.numbers, filter_sizes
-        self._settings = np.zeros(1, types.settings)
-        p = self._settings[0]
-        constants = p["constants"]
-        constants["filter_address"], constants["spacing_min"] = 0 if code is None else code.address, spacing_min
-        constants["silence_limit"] = config.silence_periods
-        p["resolutions"] = [config.resolution.get(name, 0.0) for name in config.outputs]
-        p["ranges"] = [[item.lower, item.upper] for item in ranges]
-        constants["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
-        for i, kind in enumerate(kinds):
-            p["rules"][i] = (1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1)
-        constants["reach"], constants["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
-        self.work = np.zeros(1, types.work)
-        self._scratch = np.zeros(1, self.numbers_type)
-        self.frame = frame_of(sizes, self._scratch, self.work, self._settings)
-        self._numbers, self._words = self._scratch, words_of(self._scratch)
-        belief, variances = filter_sizes
-        self.after: Array = np.empty(belief)
-        self.parameters: Array = np.concatenate([parameters, np.empty(variances)])
-
-    @staticmethod
-    def of(
-        config: MonitorConfig, model: ProcessModel | None, ranges: Sequence[SignalRange] | None = None
-    ) -> "RowStep | None":
-        """The step for plants with these settings; None if their rows are not such that it could take them.
-
-        Args:
-            config: settings of the plants' monitors.
-            model: model by which the plants are judged; None: there is none.
-            ranges: ranges of each input and of each output; None: those of the model.
-        """
-        found = None if model is None else row_filter(model, config.inputs, config.outputs)
-        return RowStep.of_filter(config, found, ranges or possible_ranges(config, model))
-
-    @staticmethod
-    def of_filter(
-        config: MonitorConfig, row_filter: RowFilter | None, ranges: Sequence[SignalRange]
-    ) -> "RowStep | None":
-        """The step for plants with a filter; None if their rows are not such that it could take them.
-
-        Args:
-            config: settings of the plants' monitors.
-            row_filter: filter of the plants' reference; None: there is none.
-            ranges: ranges of each input and of each output.
-        """
-        return None if row_filter is None or not has_step(config) else RowStep(config, ranges, row_filter)
-
-    def update(self, numbers: Records, kalman: FilterNumbers, time_ns: int, time_min: float, values: Array) -> int:
-        """Take a row of one plant through all stages; returns the verdict."""
-        if numbers is not self._numbers:
-            self._numbers, self._words = numbers, words_of(numbers)
-        verdict: int = _STEP.call(
-            self._words, self.frame, *kalman, self.parameters, self.after, 0, time_ns, time_min, values
-        )
-        return verdict
-
-
 class OrdinaryRows:
     """Compiled step of one plant, with the numbers that it updates.
 
@@ -333,40 +237,58 @@ class OrdinaryRows:
 
     Attributes:
         numbers: numbers of the stages, shape (1,), see `row_frame.FrameTypes`.
-        kalman: numbers of the filter; None where there is no step.
-        reference: the reference whose rows it takes; None where there is none.
+        reference: the reference whose rows the step takes; None where there is no step.
     """
 
     def __init__(self, config: MonitorConfig, ranges: Sequence[SignalRange]) -> None:
-        self._config, self._ranges = config, ranges
-        self._step: RowStep | None = None
+        self._config, self._types = config, types_of(config)
         self._row = np.empty(len(config.signals))
-        self.numbers: Records = np.zeros(1, types_of(config).numbers)
-        self.kalman: FilterNumbers | None = None
+        self._scratch, self._work = np.zeros(1, self._types.numbers), np.zeros(1, self._types.work)
+        self._settings = np.zeros(1, self._types.settings)
+        kinds = [chart for chart, _ in alarm_names(config)]
+        p = self._settings[0]
+        constants = p["constants"]
+        constants["silence_limit"] = config.silence_periods
+        p["resolutions"] = [config.resolution.get(name, 0.0) for name in config.outputs]
+        p["ranges"] = [[item.lower, item.upper] for item in ranges]
+        constants["charts"] = [kinds.index(kind) if kind in kinds else -1 for kind in CHARTS]
+        for i, kind in enumerate(kinds):
+            p["rules"][i] = (1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1)
+        constants["reach"], constants["weight"] = 1 - config.dead_band, config.chart_settings["mewma_weight"]
+        sizes = len(config.inputs), len(config.outputs), len(kinds)
+        self._frame = frame_of(sizes, self._scratch, self._work, self._settings)
+        self.numbers: Records = np.zeros(1, self._types.numbers)
+        self._words = words_of(self.numbers)
+        self._filter: tuple[Array, Array, Array, Array] | None = None
+        self._code: CompiledFunction | None = None
         self.reference: FilterReference | None = None
 
     def start(self, reference: Reference) -> None:
         """Make the step of a reference, if there is one."""
-        self.kalman, self.reference = None, reference.filter
-        if self.reference is None:
-            self._step = None
+        self.stop()
+        if reference.filter is None or not has_step(self._config):
             return
-        row_filter = self.reference.row_filter(self._config.inputs, self._config.outputs)
-        self._step = RowStep.of_filter(self._config, row_filter, self._ranges)
-        if self._step is not None:
-            belief, variances = self.reference.numbers
-            self.kalman = FilterNumbers(belief[None], variances[None])
+        row_filter = reference.filter.row_filter(self._config.inputs, self._config.outputs)
+        if row_filter is None:
+            return
+        self.reference, self._code = reference.filter, row_filter.code  # the object owns the machine code
+        constants = self._settings[0]["constants"]
+        constants["filter_address"] = 0 if row_filter.code is None else row_filter.code.address
+        constants["spacing_min"] = row_filter.spacing_min
+        belief, variances = reference.filter.numbers
+        parameters = np.concatenate([row_filter.parameters, np.empty(variances.size)])
+        self._filter = belief, variances, parameters, np.empty(belief.size)
 
     def stop(self) -> None:
         """Take no row, until the next start."""
-        self._step = self.kalman = self.reference = None
+        self._filter = self.reference = None
 
     def take(self, time_ns: int, values: Sequence[float]) -> int:
-        """Take a row through all stages; returns the verdict, see `row_step`."""
-        assert self._step is not None
-        assert self.kalman is not None
+        """Take a row through all stages; returns the verdict, see `step`."""
+        assert self._filter is not None
         self._row[:] = values
-        return self._step.update(self.numbers, self.kalman, time_ns, time_ns / MINUTE_NS, self._row)
+        verdict: int = _STEP.call(self._words, self._frame, *self._filter, time_ns, time_ns / MINUTE_NS, self._row)
+        return verdict
 
     @property
     def results(self) -> tuple[list[float], list[float], list[float], list[float], Array]:
@@ -375,8 +297,7 @@ class OrdinaryRows:
         Predictions, their standard deviations, normalised residuals, expected values of these, and the points of the
         charts, see `ChartWatch.points`.
         """
-        assert self._step is not None
-        work, count = self._step.work[0], len(self._config.outputs)
+        work, count = self._work[0], len(self._config.outputs)
         outputs, expected = work["outputs"].tolist(), work["expected"].tolist()
         sds, z = outputs[2 * count : 3 * count], outputs[3 * count : 4 * count]
         return outputs[:count], sds, z, expected, work["points"]

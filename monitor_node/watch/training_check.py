@@ -14,6 +14,7 @@ import msgspec
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import LARGEST_FALSE_ALARMS, MonitorConfig
 from monitor_node.ingest.alignment import Row
+from monitor_node.learn.training import TIMES_FEWEST
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.pipeline import PlantPipeline
 from monitor_node.watch.promise import (
@@ -26,6 +27,7 @@ from monitor_node.watch.promise import (
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.stored_state import copy_of
 
 EXPECTED = 3.0
 """Alarms expected in the second half with the wider limits."""
@@ -82,7 +84,17 @@ def check_training(
     for row in aligned[:half]:
         learner.update(row, units, [])
     try:
-        start = learner.new_trials()
+        trained = learner.training.finish_early(times=TIMES_FEWEST)
+        memory, learned = copy_of(learner.memory), copy_of(trained.reference.memory)
+
+        def start(config: MonitorConfig) -> PlantPipeline:
+            """A pipeline that starts with what was learned; its settings may differ in the false alarms."""
+            pipeline = PlantPipeline(config, Annunciator(config), points=False, model=model)
+            pipeline.resume(copy_of(memory), 0)
+            reference = learned.reference(pipeline.baselines.equations, config.outputs, pipeline.models)
+            pipeline.start(trained._replace(reference=reference, checks=list(trained.checks)))
+            return pipeline
+
         strict = _watch(start(settings), aligned[half:], units)
         per_30_days = min(strict.promise.per_30_days * EXPECTED / strict.mean_count, LARGEST_FALSE_ALARMS)
         wide = msgspec.structs.replace(settings, false_alarms_per_30_days=per_30_days)

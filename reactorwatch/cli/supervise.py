@@ -35,9 +35,9 @@ from reactorwatch.records.output import check_folder_name
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import stop_on_signals
 from reactorwatch.runtime.logs import configure
-from recorder.__main__ import file_names
 from recorder.config import RecorderConfig
 from recorder.keep import ENDING
+from recorder.recording_files import file_names
 
 log = structlog.get_logger()
 

@@ -20,6 +20,7 @@ from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import parse_tables, read_settings, section
 from reactorwatch.terminal import printable_lines
 from reactorwatch.version import UNKNOWN, describe_build, this_build
+from recorder.files.metadata import gaps_of
 from recorder.files.recording import Recording, has_clock
 from recorder.tools.inspect import zero_ns_of
 
@@ -68,7 +69,7 @@ def run(file: Path, config: Path | None, plant: str | None, process: str | None 
     verification.notes += [
         f"{gap.messages} messages of {gap.stream} never reached this recording; what the monitor published about "
         "them, and what it learned from them, is then not reproduced"
-        for gap in recording.gaps
+        for gap in gaps_of(recording.metadata_records)
         if gap.stream in {keys.all_keys(monitor.plant, kind).removesuffix("/**") for kind in (keys.SAMPLE, *COMPARED)}
     ]
     zero_ns = zero_ns_of(recording)

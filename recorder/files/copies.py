@@ -202,11 +202,6 @@ class Window(NamedTuple):
         return stored.log_time_ns < self.received_ns[0]
 
 
-def receipt_window(from_ns: int, to_ns: int) -> Window:
-    """Window of messages received within a time."""
-    return Window((from_ns, to_ns))
-
-
 def sample_window(sources: Sequence[Path], from_ns: int, to_ns: int) -> Window:
     """Window of messages about samples of a time, and of other messages received meanwhile.
 

@@ -24,10 +24,9 @@ from reactorwatch.contract import keys
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import list_files
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder import RecordedMessage
 from recorder.files.index import LATEST_NS, read_summary, span_ns
-from recorder.files.metadata import CLOCK, NO_CLOCK, ZERO_NS, gaps_of, own_metadata, processes_in
+from recorder.files.metadata import CLOCK, NO_CLOCK, ZERO_NS, own_metadata, processes_in
 from recorder.files.part_file import PART, is_locked
 from recorder.files.reader import Reader, StoredMessage, Wanted, metadata_records
 
@@ -166,7 +165,7 @@ class Recording:
     @cached_property
     def metadata_by_file(self) -> list[dict[str, str]]:
         """Metadata of each file, empty if another program wrote it."""
-        return [own_metadata(records) for records in self._metadata_records]
+        return [own_metadata(records) for records in self._records_by_file]
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -174,18 +173,13 @@ class Recording:
         return self.metadata_by_file[0]
 
     @property
-    def gaps(self) -> tuple[Gap, ...]:
-        """Messages lost on the bus before the recorder."""
-        return gaps_of(chain.from_iterable(self._metadata_records))
-
-    @cached_property
-    def processes(self) -> dict[str, Process]:
-        """Processes by plant, as the recording describes them."""
-        return processes_in(chain.from_iterable(self._metadata_records))
+    def metadata_records(self) -> list[Metadata]:
+        """Metadata records of all files, those of other programs included."""
+        return list(chain.from_iterable(self._records_by_file))
 
     def process(self, plant: str | None) -> Process | None:
         """Process of a plant, or of the only plant, as the recording describes it; None: it does not."""
-        found = self.processes
+        found = processes_in(self.metadata_records)
         if plant is None:
             return next(iter(found.values())) if len(found) == 1 else None
         return found.get(plant)
@@ -237,7 +231,7 @@ class Recording:
         )
 
     @cached_property
-    def _metadata_records(self) -> list[list[Metadata]]:
+    def _records_by_file(self) -> list[list[Metadata]]:
         return [metadata_records(file) for file in self.files]
 
 

@@ -119,7 +119,7 @@ def overview(recording: Iterable[RecordedMessage]) -> Overview:
     seen = Overview()
     lists: dict[str, _GapList | None] = {}
     splitters: dict[str, RunSplitter] = {}
-    active: dict[str, int] = {}
+    active: dict[str, int] = {}  # index of the newest alarm, by key
     for entry in recording:
         if not entry.latched:
             _count(seen, entry)
@@ -130,7 +130,7 @@ def overview(recording: Iterable[RecordedMessage]) -> Overview:
             continue
         message = content_of(entry)
         if isinstance(message, messages.Alarm):
-            _follow(seen, active, message)
+            _follow(seen, active, entry.key, message)
         elif isinstance(message, messages.Sample) and message.quality != messages.QUALITY_UNSPECIFIED:
             of_key.update(message)
     seen.runs = {plant: splitter.runs for plant, splitter in splitters.items() if splitter.runs}
@@ -157,12 +157,12 @@ def _count(seen: Overview, entry: RecordedMessage) -> None:
     seen.last_ns = max(seen.last_ns, at_ns)
 
 
-def _follow(seen: Overview, active: dict[str, int], alarm: messages.Alarm) -> None:
+def _follow(seen: Overview, active: dict[str, int], key: str, alarm: messages.Alarm) -> None:
     """Add a raised or latched alarm, or the time at which it cleared."""
-    number = active.get(alarm.alarm)
+    number = active.get(key)
     known = number is not None and seen.alarms[number].raised_ns == alarm.raised_ns
     if alarm.raised_ns and not known and (alarm.event == "raised" or not alarm.cleared_ns):
-        active[alarm.alarm] = len(seen.alarms)
+        active[key] = len(seen.alarms)
         seen.alarms.append(Raised(alarm.alarm, alarm.priority, alarm.raised_ns, None, alarm.text))
     elif number is not None and known and alarm.cleared_ns and seen.alarms[number].cleared_ns is None:
         seen.alarms[number] = seen.alarms[number]._replace(cleared_ns=alarm.cleared_ns)
@@ -252,34 +252,25 @@ def inspect(path: Path) -> FileInfo:
     """
     if path.is_dir():
         recording = Recording(path)
-        found, start = overview(recording.messages()), read_start(recording.files[0])
-        return FileInfo(
-            overview=found,
-            metadata=recording.metadata,
-            zero_ns=zero_from(recording.metadata, found.starts_ns or 0),
-            damages=(),
-            gaps=recording.gaps,
-            processes=recording.processes,
-            profile=start.profile,
-            library=start.library,
-            attachments=tuple(attached.name for attached in start.attachments()),
-            live="" if recording.live is None else recording.live.name,
-        )
-    reader = Reader(path, tolerant=True)
-    found = overview(stored.recorded_message for stored in reader)
-    metadata, damages = own_metadata(reader.metadata), list(map(str, reader.damages))
-    if reader.orphans:
-        damages.append(f"{reader.orphans} messages of channels that are described nowhere")
+        found, reader, live = overview(recording.messages()), read_start(recording.files[0]), recording.live
+        metadata, records, damages = recording.metadata, recording.metadata_records, list[str]()
+    else:
+        reader, live = Reader(path, tolerant=True), None
+        found = overview(stored.recorded_message for stored in reader)
+        metadata, records, damages = own_metadata(reader.metadata), reader.metadata, list(map(str, reader.damages))
+        if reader.orphans:
+            damages.append(f"{reader.orphans} messages of channels that are described nowhere")
     return FileInfo(
         overview=found,
         metadata=metadata,
         zero_ns=zero_from(metadata, found.starts_ns or 0),
         damages=tuple(damages),
-        gaps=gaps_of(reader.metadata),
-        processes=processes_in(reader.metadata),
+        gaps=gaps_of(records),
+        processes=processes_in(records),
         profile=reader.profile,
         library=reader.library,
         attachments=tuple(attached.name for attached in reader.attachments()),
+        live="" if live is None else live.name,
     )
 
 

@@ -18,7 +18,6 @@ import recorder.panels
 from monitor_node.checks.stage import CHECKS
 from monitor_node.config import CHART_SIGNALS, MonitorConfig
 from monitor_node.watch import row_frame, row_step
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.spc.charts.catalogue import CHARTS
 from tests.unit.monitor_node.samples import leaking_run
 
@@ -166,6 +165,6 @@ def test_a_chart_or_check_that_is_not_compiled_for_fleets_leaves_plants_to_the_o
     signals: dict[str, Any] = {item.key: ("C",) for item in CHART_SIGNALS}
     for kind in CHARTS:
         config = MonitorConfig(charts=(kind.name,), **signals)
-        assert (row_step.RowStep.of(config, cstr()) is None) == (kind.name not in row_frame.CHARTS)
+        assert row_step.has_step(config) == (kind.name in row_frame.CHARTS)
     monkeypatch.setattr(row_step, "CHECKS", CHECKS[:-1])
-    assert row_step.RowStep.of(MonitorConfig(), cstr()) is None
+    assert not row_step.has_step(MonitorConfig())

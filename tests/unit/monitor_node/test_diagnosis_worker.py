@@ -84,7 +84,7 @@ def test_a_live_monitor_continues_while_its_training_is_diagnosed_and_changes_th
     assert monitor.rows == LATE // 3
     assert not changes(published)
     now_ns, until_s = 0, time.monotonic() + 5.0 * WITHIN_S  # a diagnosis computes for two seconds on an idle machine
-    while monitor.pipeline.model_update.is_pending:
+    while monitor.pipeline.baselines.update.is_pending:
         assert time.monotonic() < until_s
         assert node.next_tick_ns() <= now_ns + 100_000_000  # it looks for the finding soon
         now_ns += 100_000_000

@@ -100,7 +100,7 @@ def watched_from(jumps: list[tuple[int, int]], **length: float) -> tuple[int, in
             quality = Quality.QUALITY_GOOD
             monitor.on_sample(name, Sample(time_ns=time_ns, sequence=row, value=value, quality=quality), 0)
         if monitor.phase == "watching":
-            return monitor.rows - 1, monitor.pipeline.training_rows
+            return monitor.rows - 1, monitor.pipeline.training.trained_rows
     raise AssertionError("the training never ended")
 
 

@@ -54,10 +54,10 @@ def watch_warm_plant() -> Run:
     messages = plant("feed_temperature:constant:2")
     monitor = Monitor(CONFIG, 0)
     published = publish(monitor, messages[: TRAINED + 3])
-    assert monitor.pipeline.diagnosis_job is not None
-    finding, pending = find_deviations(monitor.pipeline.diagnosis_job), monitor.to_bytes()
+    assert monitor.pipeline.baselines.diagnosis_job is not None
+    finding, pending = find_deviations(monitor.pipeline.baselines.diagnosis_job), monitor.to_bytes()
     published += publish(monitor, messages[TRAINED + 3 : LATE])
-    monitor.pipeline.on_finding(finding)
+    monitor.pipeline.baselines.on_finding(finding)
     published += publish(monitor, messages[LATE : LATE + 60])
     changed = monitor.to_bytes()
     published += publish(monitor, messages[LATE + 60 :])

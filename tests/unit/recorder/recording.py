@@ -6,7 +6,6 @@ from pathlib import Path
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Health
-from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
 from recorder.files.ages import BootClock
 from recorder.files.part_file import PartFile
@@ -100,5 +99,5 @@ def recorder(
     """A recorder that has just begun."""
     config = RecorderConfig(out=str(out), **settings)  # type: ignore[arg-type]
     confirmed = Confirmed(start_ns, boot)
-    files = open_files(config, open_part, confirmed.read)
-    return Fed(start_node(config, files, start_ns, fingerprints, fingerprints_until_ns), files, start_ns, confirmed)
+    files = RecordingFiles(config, open_part, confirmed.read)
+    return Fed(RecorderNode(config, files, start_ns, fingerprints, fingerprints_until_ns), files, start_ns, confirmed)

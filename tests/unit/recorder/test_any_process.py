@@ -21,7 +21,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write_table import write_table
 from recorder.config import ReplayConfig
-from recorder.files.copies import cut, receipt_window
+from recorder.files.copies import Window, cut
 from recorder.files.recording import Recording
 from recorder.tools.convert import export_csv, import_csv, read_record
 from recorder.tools.inspect import inspect
@@ -136,8 +136,8 @@ def test_info_names_the_process_and_its_signals_by_role_with_their_units(tanks: 
 
 def test_cut_recordings_describe_their_processes(tanks: Path, tmp_path: Path) -> None:
     expected = signals_of(inspect(tanks).processes)
-    cut([tanks], tmp_path / "cut.mcap", receipt_window(*ALL_NS), {})
-    cut([tanks, tmp_path / "cut.mcap"], tmp_path / "both.mcap", receipt_window(*ALL_NS), {})
+    cut([tanks], tmp_path / "cut.mcap", Window(ALL_NS), {})
+    cut([tanks, tmp_path / "cut.mcap"], tmp_path / "both.mcap", Window(ALL_NS), {})
     for name in ("cut", "both"):
         assert signals_of(inspect(tmp_path / f"{name}.mcap").processes) == expected
     assert signals_of(inspect(tmp_path).processes) == expected

@@ -13,7 +13,7 @@ from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Mc
 from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
-from recorder.files.copies import cut, receipt_window, recover
+from recorder.files.copies import Window, cut, recover
 from recorder.files.index import LARGEST_MB, LATEST_NS
 from recorder.files.recording import Recording
 from recorder.tools.inspect import inspect
@@ -95,7 +95,7 @@ BOMBS: dict[str, Callable[[str], tuple[Chunk, int | None]]] = {
 }
 READERS: dict[str, Callable[[Path, Path], object]] = {
     "read": lambda path, _: list(Recording(path).messages()),
-    "cut": lambda path, out: cut([path], out, receipt_window(0, LATEST_NS), {}),
+    "cut": lambda path, out: cut([path], out, Window((0, LATEST_NS)), {}),
 }
 
 

@@ -10,8 +10,9 @@ import pytest
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import section
 from reactorwatch.runtime.node_main import main
-from recorder.__main__ import file_names, run
+from recorder.__main__ import run
 from recorder.config import RecorderConfig, ReplayConfig
+from recorder.recording_files import file_names
 
 NOON_IN_BERLIN = datetime(2026, 7, 1, 12, 0, 5, tzinfo=timezone(timedelta(hours=2)))
 

@@ -11,7 +11,7 @@ from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from recorder import RecordedMessage
-from recorder.files.copies import cut, receipt_window, sample_window
+from recorder.files.copies import Window, cut, sample_window
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import read_record
@@ -19,7 +19,7 @@ from tests.unit.recorder import golden
 
 MINUTE = 60_000_000_000
 ENTRIES = list(golden.entries())
-ALWAYS = receipt_window(0, 2**63 - 1)
+ALWAYS = Window((0, 2**63 - 1))
 
 
 def recorded(
@@ -39,7 +39,7 @@ def at(minutes: float) -> int:
 
 def test_a_cut_by_receipt_holds_what_was_received_then(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES)
-    window = receipt_window(ENTRIES[250].log_time_ns, ENTRIES[449].log_time_ns)
+    window = Window((ENTRIES[250].log_time_ns, ENTRIES[449].log_time_ns))
     assert cut([source], tmp_path / "cut.mcap", window, {}) == 200
     kept = [entry for entry in Recording(tmp_path / "cut.mcap").messages() if not entry.latched]
     assert kept == ENTRIES[250:450]
@@ -78,7 +78,7 @@ def test_a_cut_starts_with_the_latched_messages(tmp_path: Path) -> None:
 
 def test_a_cut_of_several_files_goes_across_them(tmp_path: Path) -> None:
     halves = [recorded(tmp_path / "b.mcap", ENTRIES[800:]), recorded(tmp_path / "a.mcap", ENTRIES[:800])]
-    window = receipt_window(ENTRIES[700].log_time_ns, ENTRIES[899].log_time_ns)
+    window = Window((ENTRIES[700].log_time_ns, ENTRIES[899].log_time_ns))
     assert cut(halves, tmp_path / "cut.mcap", window, {}) == 200
     assert [entry for entry in Recording(tmp_path / "cut.mcap").messages() if not entry.latched] == ENTRIES[700:900]
 
@@ -92,7 +92,7 @@ def test_what_cannot_be_read_is_cut_out_as_it_is(tmp_path: Path) -> None:
         for entry in ENTRIES[:10]:
             writer.write(entry)
         writer.write(strange, readable=False)
-    window = receipt_window(ENTRIES[5].log_time_ns, strange.log_time_ns)
+    window = Window((ENTRIES[5].log_time_ns, strange.log_time_ns))
     cut([path], tmp_path / "cut.mcap", window, {})
     assert list(Recording(tmp_path / "cut.mcap").messages()) == [*ENTRIES[5:10], strange]
 
@@ -100,7 +100,7 @@ def test_what_cannot_be_read_is_cut_out_as_it_is(tmp_path: Path) -> None:
 def test_where_nothing_was_received_no_file_is_written(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES[:50])
     with pytest.raises(InputError, match="holds no message of that time"):
-        cut([source], tmp_path / "cut.mcap", receipt_window(0, 10), {})
+        cut([source], tmp_path / "cut.mcap", Window((0, 10)), {})
     with pytest.raises(InputError, match="holds no sample of that time"):
         sample_window([source], at(500.0), at(600.0))
     assert list(tmp_path.iterdir()) == [source]
@@ -109,7 +109,7 @@ def test_where_nothing_was_received_no_file_is_written(tmp_path: Path) -> None:
 def test_no_source_is_written_over(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES[:50])
     with pytest.raises(InputError, match="is one of the files that are read"):
-        cut([source], source, receipt_window(0, 2**63), {})
+        cut([source], source, Window((0, 2**63)), {})
 
 
 def test_a_damaged_source_is_reported_and_nothing_is_written(tmp_path: Path) -> None:

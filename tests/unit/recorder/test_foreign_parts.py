@@ -8,7 +8,7 @@ from mcap.writer import CompressionType, Writer
 
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
-from recorder.files.copies import cut, receipt_window, recover
+from recorder.files.copies import Window, cut, recover
 from recorder.files.index import LATEST_NS
 
 MINUTE_NS = 60 * 10**9
@@ -56,13 +56,13 @@ def whole(notes: str = "") -> Parts:
 
 def test_a_cut_keeps_them(tmp_path: Path) -> None:
     source = foreign(tmp_path / "a.mcap", notes="a")
-    cut([source], tmp_path / "new.mcap", receipt_window(0, LATEST_NS), {})
+    cut([source], tmp_path / "new.mcap", Window((0, LATEST_NS)), {})
     assert parts(tmp_path / "new.mcap") == whole("a") == parts(source)
 
 
 def test_a_cut_of_two_recordings_keeps_them_and_writes_equal_ones_once(tmp_path: Path) -> None:
     sources = [foreign(tmp_path / "a.mcap"), foreign(tmp_path / "b.mcap", minute=1, notes="b")]
-    cut(sources, tmp_path / "new.mcap", receipt_window(0, LATEST_NS), {})
+    cut(sources, tmp_path / "new.mcap", Window((0, LATEST_NS)), {})
     assert parts(tmp_path / "new.mcap") == whole("b")
 
 
@@ -70,7 +70,7 @@ def test_of_several_profiles_none_is_kept(tmp_path: Path) -> None:
     cut(
         [foreign(tmp_path / "a.mcap"), foreign(tmp_path / "b.mcap", "x", 1)],
         tmp_path / "new.mcap",
-        receipt_window(0, 2**63 - 1),
+        Window((0, 2**63 - 1)),
         {},
     )
     assert parts(tmp_path / "new.mcap")[0] == ""

@@ -9,10 +9,10 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.__main__ import open_files
 from recorder.config import RecorderConfig
-from recorder.files.copies import cut, receipt_window, recover
+from recorder.files.copies import Window, cut, recover
 from recorder.files.metadata import GAP, gap_metadata, parse_gap
+from recorder.recording_files import RecordingFiles
 from recorder.tools.inspect import inspect
 
 from .recording import SECOND, Fed, recorder
@@ -63,9 +63,9 @@ def test_recovery_and_merging_keep_it_and_a_cut_keeps_those_of_its_time(fed: Fed
     run = tmp_path / "run.mcap"
     (tmp_path / "cut_off.mcap").write_bytes(run.read_bytes()[:-1])
     recover(tmp_path / "cut_off.mcap", tmp_path / "saved.mcap")
-    cut([run], tmp_path / "cut.mcap", receipt_window(0, 2**63 - 1), {})
-    cut([run], tmp_path / "with.mcap", receipt_window(11 * SECOND, 20 * SECOND), {})
-    cut([run], tmp_path / "without.mcap", receipt_window(11 * SECOND, 19 * SECOND), {})
+    cut([run], tmp_path / "cut.mcap", Window((0, 2**63 - 1)), {})
+    cut([run], tmp_path / "with.mcap", Window((11 * SECOND, 20 * SECOND)), {})
+    cut([run], tmp_path / "without.mcap", Window((11 * SECOND, 19 * SECOND)), {})
     kept = {name: inspect(tmp_path / f"{name}.mcap").gaps for name in ("saved", "cut", "with", "without")}
     assert kept == {"saved": (ALARMS,), "cut": (ALARMS,), "with": (ALARMS,), "without": ()}
 
@@ -74,7 +74,7 @@ def test_what_the_files_before_hold_is_not_written_again_once(tmp_path: Path) ->
     first = recorder(tmp_path, 10 * SECOND, black_box_min=0.0)
     first.receive([sample(0), sample(1)], SECOND)
     first.stop()
-    fingerprints = open_files(RecorderConfig(out=str(tmp_path))).fingerprints_since(0)
+    fingerprints = RecordingFiles(RecorderConfig(out=str(tmp_path))).fingerprints_since(0)
     assert len(fingerprints) == 3  # with its last report of health
     again = recorder(
         tmp_path, 30 * SECOND, fingerprints=fingerprints, fingerprints_until_ns=90 * SECOND, black_box_min=0.0

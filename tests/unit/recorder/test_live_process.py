@@ -16,10 +16,9 @@ from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
 from reactorwatch.process.fault import parse_fault
-from recorder.__main__ import open_files
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
-from recorder.files.copies import cut, receipt_window
+from recorder.files.copies import Window, cut
 from recorder.files.metadata import PROCESS, process_metadata, processes_in
 from recorder.files.recording import Recording
 from recorder.recording_files import RecordingFiles
@@ -87,20 +86,20 @@ def test_equations_of_a_later_version_are_left_out() -> None:
 
 def test_each_file_describes_the_plants_with_samples_in_it_and_a_copy_keeps_that(tmp_path: Path) -> None:
     config = RecorderConfig(plant="site", out=str(tmp_path), processes={"*": "cstr", "north": "three_tanks"})
-    with open_files(config) as files:
+    with RecordingFiles(config) as files:
         for plant, process in (("north", "three_tanks"), ("south", "cstr")):
             write_samples(files, plant, process, 20)
     written = sorted(tmp_path.glob("*.mcap"))
     names = [{plant: item.name for plant, item in inspect(file).processes.items()} for file in written]
     assert sorted(names, key=str) == [{"north": "three_tanks"}, {"south": "cstr"}]
     copy = tmp_path / "cut.mcap"
-    cut(written, copy, receipt_window(0, 2**62), {})
+    cut(written, copy, Window((0, 2**62)), {})
     assert {plant: item.name for plant, item in inspect(copy).processes.items()} == names[0] | names[1]
 
 
 def test_a_live_recording_is_read_and_diagnosed_with_no_option(tmp_path: Path) -> None:
     path = tmp_path / "tanks.mcap"
-    with open_files(RecorderConfig(plant="tanks", out=str(path), processes={"tanks": "three_tanks"})) as files:
+    with RecordingFiles(RecorderConfig(plant="tanks", out=str(path), processes={"tanks": "three_tanks"})) as files:
         write_samples(files, "tanks", "three_tanks", 200)
     described = Recording(path).process(None)
     assert described is not None
@@ -114,7 +113,7 @@ def test_without_equations_a_recording_is_not_diagnosed_and_the_line_states_the_
     path, bare = tmp_path / "bare.mcap", tmp_path / "bare.toml"
     signals = RIG[RIG.index("[[signals]]") :]
     bare.write_text(f'name = "rig"\n{signals}', encoding="utf-8")
-    with open_files(RecorderConfig(plant="tanks", out=str(path), processes={"tanks": str(bare)})) as files:
+    with RecordingFiles(RecorderConfig(plant="tanks", out=str(path), processes={"tanks": str(bare)})) as files:
         write_samples(files, "tanks", "three_tanks", 30)
     with pytest.raises(InputError, match=r"^process 'rig': must have equations for this, got none; name those of"):
         load_case(path, DiagnosisOptions())
@@ -128,5 +127,5 @@ def test_a_plant_s_own_entry_goes_before_patterns() -> None:
 
 def test_an_unknown_process_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^unknown process 'three_tank'; did you mean 'three_tanks'\?"):
-        open_files(RecorderConfig(plant="x", out=str(tmp_path / "x.mcap"), processes={"x": "three_tank"}))
+        RecordingFiles(RecorderConfig(plant="x", out=str(tmp_path / "x.mcap"), processes={"x": "three_tank"}))
     assert not list(tmp_path.iterdir())

@@ -12,7 +12,6 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, decode, encode
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal
 from recorder import RecordedMessage
-from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
 from recorder.files.recording import Recording
 from recorder.node import RecorderNode
@@ -26,8 +25,8 @@ SECOND = 10**9
 
 def node_on(path: Path, start_ns: int = 0) -> tuple[RecorderNode, RecordingFiles]:
     config = RecorderConfig(out=str(path), flush_period_s=1.0)
-    files = open_files(config)
-    return start_node(config, files, start_ns), files
+    files = RecordingFiles(config)
+    return RecorderNode(config, files, start_ns), files
 
 
 def of_health(entry: RecordedMessage) -> messages.Health:

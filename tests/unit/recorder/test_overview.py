@@ -34,8 +34,10 @@ def sampled(*sequences: int) -> list[RecordedMessage]:
     ]
 
 
-def alarm(at: int, event: str, raised: int, cleared: int = 0, *, latched: bool = False) -> RecordedMessage:
-    key = keys.key("cstr", keys.ALARM, "ewma/T")
+def alarm(
+    at: int, event: str, raised: int, cleared: int = 0, *, latched: bool = False, plant: str = "cstr"
+) -> RecordedMessage:
+    key = keys.key(plant, keys.ALARM, "ewma/T")
     message = messages.Alarm(time_ns=at, alarm="ewma/T", event=event, raised_ns=raised, cleared_ns=cleared)
     return entry(key, message, at, latched=latched)
 
@@ -66,6 +68,18 @@ def test_repeated_messages_are_not_counted_but_show_an_active_alarm() -> None:
     seen = overview([alarm(10, "raised", 10, latched=True), *sampled(0, 1), alarm(30, "cleared", 10, 30)])
     assert seen.messages == 3
     assert [(item.raised_ns, item.cleared_ns) for item in seen.alarms] == [(10, 30)]
+
+
+def test_alarms_of_one_name_in_two_plants_end_on_their_own() -> None:
+    seen = overview(
+        [
+            alarm(10, "raised", 10),
+            alarm(20, "raised", 20, plant="other"),
+            alarm(30, "cleared", 10, 30),
+            alarm(40, "cleared", 20, 40, plant="other"),
+        ]
+    )
+    assert [(item.raised_ns, item.cleared_ns) for item in seen.alarms] == [(10, 30), (20, 40)]
 
 
 def test_alarms_are_listed_with_their_ends() -> None:

@@ -25,8 +25,9 @@ from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import LOOPBACK
 from reactorwatch.runtime.retry import retry
 from reactorwatch.runtime.start import GONE_WITHIN_S, claim_name, instance_name, wait_ready
-from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
+from recorder.node import RecorderNode
+from recorder.recording_files import RecordingFiles
 from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S
 
@@ -44,8 +45,8 @@ def write_atomically(folder: Path) -> None:
 
 def start_recorder(out: Path) -> None:
     config = RecorderConfig(out=str(out))
-    with open_files(config) as files:
-        start_node(config, files, 0)
+    with RecordingFiles(config) as files:
+        RecorderNode(config, files, 0)
 
 
 STARTS: dict[str, tuple[str, Callable[[Path], object]]] = {

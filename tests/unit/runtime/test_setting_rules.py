@@ -18,8 +18,8 @@ from reactorwatch.errors import InputError
 from reactorwatch.limits import Limits
 from reactorwatch.runtime.config import SECTIONS, BusConfig, LogConfig, MetricsConfig, section
 from reactorwatch.runtime.setting_rules import MAX_SPAN_S, PROTOCOLS, check_endpoint, valid_choices
-from recorder.__main__ import build_black_box
 from recorder.config import RecorderConfig, ReplayConfig
+from recorder.node import build_black_box
 
 TABLES: dict[str, type[msgspec.Struct]] = {
     "bus": BusConfig,

@@ -10,7 +10,7 @@ from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.spc.spike_rate import SpikeRate, spike_count_limit
+from reactorwatch.spc.spike import SpikeRate, spike_count_limit
 
 from ..samples import samples
 

@@ -56,7 +56,7 @@ def own_monitor(name: str, messages: list[Encoded], finding: Finding | None) -> 
     monitor = Monitor(msgspec.structs.replace(CONFIG, plant=name), 0, points=False)
     published = [item for message in messages[:FOUND] for item in monitor.on_message(message, 0)]
     if finding is not None:
-        monitor.pipeline.on_finding(finding)
+        monitor.pipeline.baselines.on_finding(finding)
     return published + [item for message in messages[FOUND:] for item in monitor.on_message(message, 0)]
 
 

@@ -10,7 +10,6 @@ from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.learn.process_reference import ProcessReference
 from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, equations_text, read_equations
-from monitor_node.monitor_state import SEAL
 from monitor_node.replay import backtest
 from monitor_node.replay.verification import verify
 from reactorwatch.contract import keys
@@ -42,7 +41,7 @@ def test_a_diagnosis_of_the_training_finds_what_the_plant_was_before(warm: Run) 
 def test_the_second_training_of_a_kind_of_plant_makes_no_filter_again(warm: Run) -> None:
     monitor = Monitor(CONFIG, 0)
     publish(monitor, warm.messages[: TRAINED + 3])
-    job = monitor.pipeline.diagnosis_job
+    job = monitor.pipeline.baselines.diagnosis_job
     assert job is not None
     first, made = find_deviations(job), row_function.cache_info().misses
     assert find_deviations(job) == first
@@ -83,7 +82,7 @@ def test_a_given_model_with_effects_is_what_the_training_is_compared_with_on_the
     """The plant was 2 K warmer since five minutes before its training, and its model has it."""
     monitor = Monitor(CONFIG, 0)
     publish(monitor, warm.messages[: TRAINED + 3])
-    job = monitor.pipeline.diagnosis_job
+    job = monitor.pipeline.baselines.diagnosis_job
     assert job is not None
     times = array("q", [START_NS + time_ns for time_ns in job.rows.times])
     known = parse_fault(f"feed_temperature:step:2@{START_NS / MINUTE_NS - 5}min")
@@ -108,10 +107,10 @@ def test_a_change_whose_row_was_lost_holds_from_the_next_row_on(warm: Run) -> No
 def test_a_monitor_that_resumes_before_the_finding_continues_bit_for_bit(warm: Run) -> None:
     again = Monitor(CONFIG, 0)
     again.from_bytes(warm.pending)
-    job = again.pipeline.diagnosis_job
+    job = again.pipeline.baselines.diagnosis_job
     assert job is not None
     published = publish(again, warm.messages[TRAINED + 3 : LATE])
-    again.pipeline.on_finding(warm.finding)
+    again.pipeline.baselines.on_finding(warm.finding)
     published += publish(again, warm.messages[LATE:])
     assert published == warm.published[-len(published) :]
 
@@ -119,7 +118,7 @@ def test_a_monitor_that_resumes_before_the_finding_continues_bit_for_bit(warm: R
 def test_a_monitor_that_resumes_after_the_change_continues_bit_for_bit_without_a_training(warm: Run) -> None:
     again = Monitor(CONFIG, 0)
     again.from_bytes(warm.changed)
-    assert again.pipeline.diagnosis_job is None
+    assert again.pipeline.baselines.diagnosis_job is None
     assert [again.baseline] == changes(warm.published)
     published = publish(again, warm.messages[LATE + 60 :])
     assert published == warm.published[-len(published) :]
@@ -139,15 +138,15 @@ def test_a_finding_without_a_cause_changes_nothing_and_is_noted_once_unless_nomi
     monitor = Monitor(CONFIG, 0, diagnose=lambda _: finding)
     published = publish(monitor, warm.messages)
     assert published == publish(Monitor(GIVEN, 0), warm.messages)
-    assert monitor.pipeline.diagnosis_job is None
+    assert monitor.pipeline.baselines.diagnosis_job is None
     assert [note for note in monitor.notes if "so it is" in note] == monitor.notes[-1:] * (verdict != NOMINAL)
 
 
 def test_a_finding_of_another_training_is_ignored(warm: Run) -> None:
     monitor = Monitor(CONFIG, 0)
     publish(monitor, warm.messages[: TRAINED + 3])
-    monitor.pipeline.on_finding(warm.finding._replace(first_ns=warm.finding.first_ns + 1))
-    assert monitor.pipeline.diagnosis_job is not None
+    monitor.pipeline.baselines.on_finding(warm.finding._replace(first_ns=warm.finding.first_ns + 1))
+    assert monitor.pipeline.baselines.diagnosis_job is not None
     assert not changes(publish(monitor, warm.messages[TRAINED + 3 :]))
 
 
@@ -155,16 +154,14 @@ def test_without_the_setting_no_training_is_diagnosed(warm: Run) -> None:
     monitor = Monitor(GIVEN, 0)
     publish(monitor, warm.messages[: TRAINED + 3])
     assert monitor.memory.watching_since_ns is not None
-    assert monitor.pipeline.diagnosis_job is None
+    assert monitor.pipeline.baselines.diagnosis_job is None
 
 
-def test_a_state_from_before_this_version_is_read(warm: Run) -> None:
+def test_a_state_of_a_monitor_that_diagnoses_no_training_is_read_by_one_that_does(warm: Run) -> None:
     monitor = Monitor(GIVEN, 0)
     publish(monitor, warm.messages[: LATE + 60])
-    state = msgspec.msgpack.decode(SEAL.open(monitor.to_bytes()))
-    del state["watch"]["watched"]["baseline"]
     again = Monitor(CONFIG, 0)
-    again.from_bytes(SEAL.close(msgspec.msgpack.encode(state)))
+    again.from_bytes(monitor.to_bytes())
     assert publish(again, warm.messages[LATE + 60 :]) == publish(monitor, warm.messages[LATE + 60 :])
 
 
@@ -224,7 +221,7 @@ def recording(warm: Run, *, killed: bool = False) -> list[Encoded]:
             monitor.on_history_end()
             publish_all(monitor.on_tick(START_NS + 61 * SECOND_NS))
         if number == LATE:
-            monitor.pipeline.on_finding(warm.finding)
+            monitor.pipeline.baselines.on_finding(warm.finding)
         log.append(message._replace(received_ns=START_NS))
         publish_all(monitor.on_message(message, START_NS))
     publish_all(monitor.on_stop(START_NS + 120 * SECOND_NS))

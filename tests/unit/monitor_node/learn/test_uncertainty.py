@@ -14,6 +14,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.learn.process_reference import ProcessMemory, ProcessReference
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding, Uncertain, describe_uncertain, find_uncertain
+from monitor_node.learn.training_rows import RowArrays
 from monitor_node.replay import backtest
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.diagnosis.result import NOMINAL
@@ -36,7 +37,8 @@ def uncertain(kind: Kind, moves: int, seed: int = 11) -> tuple[str, ...]:
     record = simulate(kind, (WIDE, RARE, LITTLE)[moves], seed)
     rows = record.time_min < TRAINING_MIN
     measured = np.column_stack([record.columns[name][rows] for name in ("C", "T")])
-    return find_uncertain(cstr(), ("C", "T"), record.time_min[rows], record.columns["qc"][rows, None], measured).names
+    training = RowArrays(record.time_min[rows], record.columns["qc"][rows, None], measured)
+    return find_uncertain(cstr(), ("C", "T"), training).names
 
 
 def disturbances(kind: Kind, moves: int) -> set[str]:
@@ -64,8 +66,8 @@ def test_noise_with_memory_is_coloured_noise(memory: tuple[float, float]) -> Non
 
 
 def test_a_training_of_few_rows_is_left_as_it_is() -> None:
-    nothing = np.zeros((20, 1))
-    assert find_uncertain(cstr(), ("C", "T"), np.arange(20.0), nothing, np.zeros((20, 2))) == Uncertain()
+    rows = RowArrays(np.arange(20.0), np.zeros((20, 1)), np.zeros((20, 2)))
+    assert find_uncertain(cstr(), ("C", "T"), rows) == Uncertain()
 
 
 def test_uncertainty_is_stated_in_words() -> None:
@@ -106,8 +108,8 @@ def test_a_valve_lag_that_the_training_could_not_show_raises_no_alarm() -> None:
 def test_a_monitor_with_additional_states_resumes_bit_for_bit(uncertain: tuple[str, ...]) -> None:
     messages, monitor = messages_of(EXACT, 2, 12, 40.0), Monitor(QUICK, 0)
     first = publish(monitor, messages[: 3 * 202])
-    assert monitor.pipeline.diagnosis_job is not None
-    monitor.pipeline.on_finding(find(uncertain)(monitor.pipeline.diagnosis_job))
+    assert monitor.pipeline.baselines.diagnosis_job is not None
+    monitor.pipeline.baselines.on_finding(find(uncertain)(monitor.pipeline.baselines.diagnosis_job))
     first += publish(monitor, messages[3 * 202 : 3 * 300])
     (change,) = changes(first)
     assert all(item in change.model for item in uncertain)

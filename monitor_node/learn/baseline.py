@@ -1,0 +1,418 @@
+"""Baseline of a plant, learned from the rows of its training: the reference, and the distribution of its residuals.
+
+The noise of the process model is estimated, or a model is fitted to the rows, as the settings ask. Disturbed intervals
+are left out. The prewhitening is learned from the remaining residuals. A training with too much disturbance is refused.
+
+A signal with too few values is left out with the reason, and the others are monitored. The identified models predict
+without the inputs that are left out.
+"""
+
+from collections.abc import Callable
+from itertools import compress
+from math import log10
+from typing import NamedTuple
+
+import numpy as np
+from msgspec.structs import replace
+
+from monitor_node.config import MonitorConfig
+from monitor_node.ingest.sampling import regular_intervals
+from monitor_node.learn.arx import ROWS_A_PARAMETER, arx_structure, fewest_rows
+from monitor_node.learn.arx_reference import ArxReference
+from monitor_node.learn.black_box_reference import BlackBoxReference
+from monitor_node.learn.process_reference import ProcessReference
+from monitor_node.learn.references import Reference
+from monitor_node.learn.signal_range import possible_ranges
+from monitor_node.learn.training_rows import (
+    AfterMoves,
+    RowArrays,
+    Screening,
+    TrainingRows,
+    compare_after_moves,
+    screen_baseline,
+)
+from reactorwatch.arrays import Array
+from reactorwatch.contract.messages_pb2 import Check
+from reactorwatch.errors import InputError
+from reactorwatch.kalman.resolution import resolution_sd
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.spc.prewhitening import Prewhitening, learn
+from reactorwatch.spc.step_test import ROWS as STEP_ROWS
+
+FEWEST_ROWS = 50
+"""Least number of residuals; the training continues until there are as many."""
+
+FEWEST_FAMILIAR_ROWS = 200
+"""Least number of rows of a training after which `auto` takes a black box: after fewer, too many values of the inputs
+are unfamiliar to it, and it judges too few rows."""
+
+MINOR = 0.2
+"""Share of the smallest relevant standard deviation (of the filter: of the residual's) below which a deviation of a few
+times as much does not make an interval disturbed."""
+
+AS_WELL = 1.5
+"""Largest ratio of prewhitened residuals, process to identified model, for which `auto` uses the process model. It is
+above 1, as the process model holds where the input goes beyond the training."""
+
+USUAL_SHARE = 0.9
+"""Least share of rows without a defect; with fewer, the defect is the reason why outputs could not be predicted."""
+
+NO_VALUE = "no value of it has come"
+"""Reason for leaving a signal without values out."""
+
+FEWEST_MOVES = 5
+"""Moves of an input without which nothing checks how a model without equations follows it."""
+
+MOST_OUT_OF_RANGE = 1.0 / 3.0
+"""Share of impossible values of a signal; with more of them the plant is not the model's process."""
+
+NOTHING_LEARNED = Prewhitening(0.0, (), 1.0, FEWEST_ROWS, 0.5 / FEWEST_ROWS, 0.0)
+"""Prewhitening of an output that is left out and not evaluated."""
+
+
+class TrainingResult(NamedTuple):
+    """Result of a training.
+
+    Attributes:
+        rows: rows of the training.
+        reference: reference for the rows to come.
+        learned: prewhitening of its residuals, one an output.
+        z: residuals as the reference normalises them, shape (n, outputs); NaN if missing.
+        e: the same, prewhitened.
+        measured: outputs in undisturbed rows, shape (n, outputs); NaN elsewhere.
+        values: all signals, the inputs first, shape (n, inputs + outputs); NaN where disturbed or left out. Unlike
+            `measured` it has rows that could not be predicted.
+        checks: checks of the training.
+        refused: reason to start again; empty if the training is usable.
+        left_out: signals that cannot be monitored, with the reason.
+        responses: response of each residual to a lasting step of one unit of its output, shape (outputs, rows); NaN
+            where there is no model; None for equations.
+        outliers: number of single values of each output that were left out.
+        after_moves: size of the residuals after moves of the inputs, those that were left out too; as usual for
+            equations, whose limits allow for what is not known of the response to a move.
+        weakness: reason why the training did not determine how the plant follows the inputs; empty if it did.
+    """
+
+    rows: TrainingRows
+    reference: Reference
+    learned: list[Prewhitening]
+    z: Array
+    e: Array
+    measured: Array
+    values: Array
+    checks: list[Check]
+    refused: str
+    left_out: dict[str, str]
+    responses: Array | None
+    outliers: list[int]
+    after_moves: AfterMoves
+    weakness: str
+
+    def excess_rate(self, arl0: float) -> float:
+        """Times as many false alarms as promised, by what the training shows of moves of the inputs.
+
+        Where it did not determine the dynamics, each new set point may raise every alarm, and the next may come within
+        the length of the training.
+
+        Args:
+            arl0: in-control run length of each alarm, in rows.
+        """
+        return max(self.after_moves.excess_rate(arl0), arl0 / len(self.z) if self.weakness else 0.0)
+
+
+def fewest_values(config: MonitorConfig, model: ProcessModel | None) -> int:
+    """Least number of values of each output that a training needs.
+
+    Args:
+        config: settings of the monitor.
+        model: process model; None: there is none.
+    """
+    structure = arx_structure(config)
+    of_one_input = replace(structure, inputs=min(structure.inputs, 1))
+    return FEWEST_ROWS if model is not None else max(fewest_rows(of_one_input), FEWEST_ROWS)
+
+
+def learn_baseline(
+    config: MonitorConfig, model: ProcessModel | None, models: ArxReference, rows: TrainingRows, *, last_chance: bool
+) -> TrainingResult:
+    """Learn a baseline from the rows of a training.
+
+    Args:
+        config: settings of the monitor.
+        model: process model; None: the reference is a model that is fitted to the rows.
+        models: identified models, which are fitted, and judge after the training if they are chosen.
+        rows: the rows.
+        last_chance: True to use the training even if it is disturbed.
+    """
+    choice, outputs = _Choice(config, models, rows), config.outputs
+    (time_min, inputs, measured), left_out = choice.rows, choice.left_out
+    reference, z, screenings = choice.choose(model)
+    if not reference.follows_equations:
+        left_out |= _too_few_values(config.inputs, inputs)
+    left_out |= _too_few_residuals(outputs, z, choice.rows, left_out)
+    evaluated = [name not in left_out for name in outputs]
+    refused = _refusal(outputs, screenings, evaluated)
+    if not any(evaluated):
+        refused = "; ".join(map(": ".join, left_out.items()))
+    elif refused and last_chance:
+        none = np.zeros(len(z), dtype=np.bool_)
+        refused, screenings = "", [Screening(known, [], [], none, none) for known in np.isfinite(z).T]
+    usable = np.column_stack([item.usable for item in screenings]) & np.array(evaluated)
+    disturbed = np.column_stack([item.left_out for item in screenings]) | ~np.array(evaluated)
+    all_z, z = z, np.where(usable, z, np.nan)
+    learned = [
+        learn(column, sd / typical) if is_evaluated else NOTHING_LEARNED
+        for column, sd, typical, is_evaluated in zip(z.T, choice.smallest, reference.typical_sd, evaluated, strict=True)
+    ]
+    e = np.column_stack([_prewhiten(column, item) for column, item in zip(z.T, learned, strict=True)])
+    after_moves, weakness = AfterMoves(), choice.weakness
+    if not reference.follows_equations:
+        weakness = _few_moves(config.inputs, inputs) or weakness
+        if any(evaluated):
+            columns = [
+                np.where(screenings[i].single, np.inf, _prewhiten(all_z[:, i], learned[i]))
+                for i in np.flatnonzero(evaluated)
+            ]
+            after_moves = compare_after_moves(np.column_stack(columns), inputs)
+    found = {"training": [refused or _screening_summary(outputs, time_min, screenings, evaluated) or "ok"]}
+    found[BlackBoxReference.kind] = [weakness] if weakness else []
+    if choice.without_black_box and config.reference == "black-box":
+        found[BlackBoxReference.kind].append(f"the ARX models judge: {choice.without_black_box}")
+    if reference.is_identified:
+        models.start_judging(choice.given)
+        found["model"] = _simplifications(outputs, models, evaluated)
+    found["signals"] = [f"{name} is left out: {why}" for name, why in left_out.items()]
+    inputs = np.where([name not in left_out for name in config.inputs], inputs, np.nan)
+    return TrainingResult(
+        rows=rows,
+        reference=reference,
+        learned=learned,
+        z=z,
+        e=e,
+        measured=np.where(usable, measured, np.nan),
+        values=np.hstack([inputs, np.where(disturbed, np.nan, measured)]),
+        checks=[Check(name=name, result=text) for name, texts in found.items() for text in texts],
+        refused=refused,
+        left_out=left_out,
+        responses=reference.step_responses(STEP_ROWS),
+        outliers=[item.outliers for item in screenings],
+        after_moves=after_moves,
+        weakness=weakness,
+    )
+
+
+class _Candidate(NamedTuple):
+    """A reference, the normalised residuals of the training, shape (n, outputs), and their screening."""
+
+    reference: Reference
+    z: Array
+    screenings: list[Screening]
+
+
+class _Choice:
+    """Choice of the reference; arguments as for `learn_baseline`.
+
+    Attributes:
+        rows: rows of the training; outputs that cannot be monitored are NaN.
+        given: the same, with 0 for inputs that have too few values.
+        steps: resolution of each output; 0 if it has none.
+        smallest: smallest standard deviation of each output.
+        left_out: outputs that cannot be monitored, with the reason.
+        weakness: reason why the training did not determine how the plant follows the inputs; empty if it did.
+        without_black_box: reason why there is no black box; empty if there is, or it was not wanted.
+    """
+
+    def __init__(self, config: MonitorConfig, models: ArxReference, rows: TrainingRows) -> None:
+        self._config, self._models, outputs = config, models, config.outputs
+        self.rows = rows.arrays
+        columns = list(zip(outputs, self.rows.outputs.T, strict=True))
+        self.steps = [resolution_sd(column, config.resolution.get(name)) for name, column in columns]
+        self.smallest = [
+            max(config.smallest_sd.get(name, 0.0), sd, 1e-12) for name, sd in zip(outputs, self.steps, strict=True)
+        ]
+        self.left_out = _too_few_values(outputs, self.rows.outputs) | self._constant_outputs()
+        self.rows.outputs[:, [name in self.left_out for name in outputs]] = np.nan
+        has_values = np.count_nonzero(np.isfinite(self.rows.inputs), axis=0) >= FEWEST_ROWS
+        self.given = self.rows._replace(inputs=np.where(has_values, self.rows.inputs, 0.0))
+        self._has_all_inputs = bool(has_values.all())
+        self.weakness = self.without_black_box = ""
+
+    def _constant_outputs(self) -> dict[str, str]:
+        """Outputs that never vary, and have no smallest relevant deviation in the settings, with the reason."""
+        return {
+            name: f"it reads {np.nanmax(column):.6g} in the whole training; train on rows in which it changes, or "
+            "state its smallest_sd or resolution"
+            for name, column, step in zip(self._config.outputs, self.rows.outputs.T, self.steps, strict=True)
+            if not step and not self._config.smallest_sd.get(name) and np.isfinite(column).any()
+        }
+
+    def choose(self, model: ProcessModel | None) -> _Candidate:
+        """Fit the references that the settings allow, and choose one."""
+        wanted, models = self._config.reference, self._models
+        if not self._has_all_inputs:
+            models.learn_again(self.given)
+        identified = self._fit(lambda rows: (models, models.fit(rows)), self.given)
+        equations = self._fit_equations(model) if model is not None and self._has_all_inputs else None
+        if equations is not None and (wanted == "equations" or _predicts_as_well(equations, identified)):
+            return equations
+        is_driven = bool(self._config.inputs and self._has_all_inputs)  # without inputs there is nothing to simulate
+        is_long = len(self.rows.time_min) >= FEWEST_FAMILIAR_ROWS
+        if wanted == "black-box" or (wanted == "auto" and is_driven and is_long):
+            black_box = self._fit_black_box()
+            if black_box is not None:
+                self.weakness = black_box.reference.weakness  # ARX models know no better how the plant follows
+                if wanted == "black-box" or (not self.weakness and _predicts_as_well(black_box, identified)):
+                    return black_box
+        return identified
+
+    def _fit_equations(self, model: ProcessModel) -> _Candidate | None:
+        """Fit the filter of a process model; None if too many values are impossible: it is another process."""
+        columns, ranges = np.column_stack(self.rows[1:]), possible_ranges(self._config, model)
+        lower, upper = np.array([(item.lower, item.upper) for item in ranges]).T
+        out = np.isfinite(columns) & ((columns < lower) | (columns > upper))
+        if self._config.reference != "equations" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):
+            return None
+        inputs, outputs = np.hsplit(np.where(out, np.nan, columns), [len(self._config.inputs)])
+        possible = RowArrays(self.rows.time_min, inputs, outputs)
+
+        def fit(rows: RowArrays) -> tuple[Reference, Array]:
+            found = ProcessReference.fit(model, self._config.outputs, rows, self.smallest)
+            return found, found.run(possible)
+
+        return self._fit(fit, possible)
+
+    def _fit_black_box(self) -> _Candidate | None:
+        """Fit a black box; None if the rows do not allow it."""
+
+        def fit(rows: RowArrays) -> tuple[Reference, Array]:
+            return BlackBoxReference.learn(rows, self.rows.outputs, self.smallest, self._config.delay)
+
+        try:
+            return self._fit(fit, self.given)
+        except InputError as error:
+            self.without_black_box = str(error)
+            return None
+
+    def _fit(self, fit: Callable[[RowArrays], tuple[Reference, Array]], rows: RowArrays) -> _Candidate:
+        """Fit a reference, screen its normalised residuals, and fit it again without disturbed rows."""
+        reference, z = fit(rows)
+        if reference.is_identified:  # its residuals have the unit of the output
+            minor = [max(MINOR * sd, step) for sd, step in zip(self.smallest, self.steps, strict=True)]
+        else:
+            minor = [max(MINOR, step / sd) for sd, step in zip(reference.typical_sd, self.steps, strict=True)]
+        screenings = [screen_baseline(column, sd) for column, sd in zip(z.T, minor, strict=True)]
+        is_clean = not any(item.disturbed_intervals or item.outliers for item in screenings)
+        if not is_clean and not any(item.refused for item in screenings):
+            kept = np.column_stack([item.usable for item in screenings]) | ~np.isfinite(z)
+            reference, z = fit(rows._replace(outputs=np.where(kept, rows.outputs, np.nan)))
+        return _Candidate(reference, z, screenings)
+
+
+def _prewhiten(z: Array, learned: Prewhitening) -> Array:
+    e = z - learned.constant
+    for lag, coefficient in enumerate(learned.coefficients, start=1):
+        e[lag:] -= coefficient * z[:-lag]
+        e[:lag] = np.nan
+    return np.asarray(e / learned.sd)
+
+
+def _simplifications(outputs: tuple[str, ...], models: ArxReference, evaluated: list[bool]) -> list[str]:
+    """Terms that the identified models lack, each with the outputs."""
+    lacking: dict[str, list[str]] = {}
+    for name, predictor in compress(zip(outputs, models.predictors, strict=True), evaluated):
+        lacking.setdefault(predictor.simplification, []).append(name)
+    return [
+        f"{', '.join(names)}: predicted with {text}, as there are fewer than {ROWS_A_PARAMETER} rows a parameter"
+        for text, names in lacking.items()
+        if text
+    ]
+
+
+def _few_moves(names: tuple[str, ...], inputs: Array) -> str:
+    """Reason why the training cannot show how the outputs follow an input that hardly ever moved; empty if it can."""
+    counts = np.count_nonzero(np.nan_to_num(np.diff(inputs, axis=0)), axis=0).tolist()
+    few = [
+        f"{name} ({count}; {FEWEST_MOVES} are needed)"
+        for name, count in zip(names, counts, strict=True)
+        if 0 < count < FEWEST_MOVES
+    ]
+    if not few:
+        return ""
+    return (
+        f"the training has too few moves of {', '.join(few)}: at other set points false alarms may be more than "
+        "promised; train over more set points"
+    )
+
+
+def _predicts_as_well(candidate: _Candidate, identified: _Candidate) -> bool:
+    """True if a reference predicts about as well as the identified models."""
+    residuals, others = (item.z * np.array(item.reference.typical_sd) for item in (candidate, identified))
+    both = np.isfinite(residuals) & np.isfinite(others)
+    for columns in zip(residuals.T, others.T, both.T, strict=True):
+        if np.count_nonzero(columns[2]) >= FEWEST_ROWS:
+            sds = [learn(np.where(columns[2], column, np.nan), 1e-12).sd for column in columns[:2]]
+            if sds[0] > AS_WELL * sds[1]:
+                return False
+    return True
+
+
+def _too_few_values(names: tuple[str, ...], columns: Array) -> dict[str, str]:
+    """Signals with too few values, with the reason."""
+    counts = np.count_nonzero(np.isfinite(columns), axis=0).tolist()
+    return {
+        name: NO_VALUE
+        if not count
+        else f"only {count} of {len(columns)} rows have a value of it, {FEWEST_ROWS} are needed"
+        for name, count in zip(names, counts, strict=True)
+        if count < FEWEST_ROWS
+    }
+
+
+def _too_few_residuals(outputs: tuple[str, ...], z: Array, rows: RowArrays, left_out: dict[str, str]) -> dict[str, str]:
+    """Outputs with values, but too few predictions, with the reason."""
+    counts = np.count_nonzero(np.isfinite(z), axis=0).tolist()
+    return {
+        name: f"only {count} of its {len(z)} rows could be predicted, {FEWEST_ROWS} are needed: "
+        f"{_prediction_obstacle(rows.time_min, rows.inputs)}"
+        for name, count in zip(outputs, counts, strict=True)
+        if count < FEWEST_ROWS and name not in left_out
+    }
+
+
+def _prediction_obstacle(time_min: Array, inputs: Array) -> str:
+    """Reason why rows could not be predicted."""
+    follows = regular_intervals(time_min)
+    regular = np.count_nonzero(follows)
+    if regular < USUAL_SHARE * follows.size:
+        return f"do rows come one by one period? {regular} of {follows.size} spacings are within a tenth of the usual"
+    known = int(np.count_nonzero(np.isfinite(inputs).all(axis=1)))
+    if FEWEST_ROWS <= known < USUAL_SHARE * len(inputs):
+        return f"{'the input has a value' if inputs.shape[1] == 1 else 'all inputs have values'} in {known} of them"
+    return "too often a value is missing in the rows before"
+
+
+def _refusal(outputs: tuple[str, ...], screenings: list[Screening], evaluated: list[bool]) -> str:
+    refused = [
+        name
+        for name, item, is_evaluated in zip(outputs, screenings, evaluated, strict=True)
+        if item.refused and is_evaluated
+    ]
+    return f"more than a third of it was disturbed in {' and '.join(refused)}" if refused else ""
+
+
+def _screening_summary(
+    outputs: tuple[str, ...], time_min: Array, screenings: list[Screening], evaluated: list[bool]
+) -> str:
+    """Summary of the rows left out; empty if there are none."""
+    lines = []
+    for name, item, is_evaluated in zip(outputs, screenings, evaluated, strict=True):
+        if not is_evaluated:
+            continue
+        for (first, last), shift in zip(item.disturbed_intervals, item.shifts, strict=True):
+            digits = max(0, 2 - int(log10(max(time_min[-1] - time_min[0], 1.0))))
+            since, until = time_min[first] - time_min[0], time_min[last] - time_min[0]
+            when = f"{since:.{digits}f} to {until:.{digits}f} min from its start"
+            lines.append(f"left out {when}: {name} was off by {shift:+.1f} sd")
+        if item.outliers:
+            lines.append(f"left out {item.outliers} outliers of {name}")
+    return "; ".join(lines)
