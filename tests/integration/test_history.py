@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import threading
 from queue import SimpleQueue
 
 import pytest
@@ -15,6 +16,7 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 
 KEYS = ("reactor/cstr/sample/C", "reactor/cstr/sample/T")
+SLOW = "reactor/cstr/sample/x/@adv/**"
 PUBLISHED = [Encoded(KEYS[number % 2], str(number).encode(), "") for number in range(200)]
 
 
@@ -29,7 +31,7 @@ class SlowPublisher:
         settings.insert_json5("connect/endpoints", f'["{config.endpoint}"]')
         settings.insert_json5("scouting/multicast/enabled", "false")
         self.session = zenoh.open(settings)
-        self._queryable = self.session.declare_queryable("reactor/cstr/sample/x/@adv/**", self._on_query)
+        self._queryable = self.session.declare_queryable(SLOW, self._on_query)
 
     def _on_query(self, query: zenoh.Query) -> None:
         self.asked += 1
@@ -37,6 +39,18 @@ class SlowPublisher:
             self._held.append(query)
         else:
             query.drop()
+
+
+def wait_until_known(bus: bus_module.ZenohBus) -> None:
+    """Wait until a session knows of the slow publisher: before that, its queries do not go there."""
+    is_known = threading.Event()
+    querier = bus._session.declare_querier(SLOW)
+    listener = querier.declare_matching_listener(lambda status: is_known.set() if status.matching else None)
+    if querier.matching_status.matching:  # type: ignore[attr-defined] # the stub calls the status a bool
+        is_known.set()
+    assert is_known.wait(PATIENCE_S)
+    listener.undeclare()
+    querier.undeclare()
 
 
 @pytest.mark.parametrize("unanswered", [0, 1, 2], ids=["at once", "last numbers late", "history late, too"])
@@ -55,6 +69,7 @@ def test_an_answer_that_does_not_come_in_time_is_asked_for_again(
     with contextlib.closing(Router(free_endpoint())) as router:
         publisher, late = connect_client(router.config), connect_client(router.config)
         slow = SlowPublisher(router.config, unanswered)
+        wait_until_known(late)
         for message in PUBLISHED:
             publisher.publish(message)
         heard, complete = SimpleQueue[Encoded](), SimpleQueue[bool]()
