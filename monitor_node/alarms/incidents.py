@@ -105,8 +105,9 @@ class KpiCounter(Memory):
         """
         # Those in the future are from before the clock was set back.
         recent = self.recent = [item for item in self.recent if 0 <= time_ns - item.time_ns < RATE_WINDOW_NS]
-        states = [alarm.memory.state for alarm in alarms]
-        active = [alarm for alarm in alarms if alarm.memory.state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED)]
+        abnormal = [alarm for alarm in alarms if alarm.memory.state is not State.NORMAL]  # few of hundreds
+        states = [alarm.memory.state for alarm in abnormal]
+        active = [alarm for alarm in abnormal if alarm.memory.state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED)]
         return AlarmKpis(
             time_ns=time_ns,
             alarms_10min=len(recent),
