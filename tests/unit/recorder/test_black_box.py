@@ -37,6 +37,7 @@ def test_alarms_without_an_end_do_not_make_a_stretch_without_an_end() -> None:
             kept.append(over)
     assert len(kept) >= 2
     assert all(stretch.to_ns - stretch.raised_ns <= MAX_MARGINS * N for stretch in kept)
+    assert max(stretch.to_ns - stretch.from_ns for stretch in kept) == box.longest_ns
     for before, after in itertools.pairwise(kept):
         assert after.from_ns <= before.to_ns  # nothing between them is missing
 
@@ -56,5 +57,6 @@ def test_what_it_may_still_need_is_known() -> None:
     box = BlackBox(N)
     assert box.protected_ns(5000) == N  # of an alarm that comes now
     box.on_message(raised(), 5000)
+    assert box.protected_ns(5000) == N
     assert box.protected_ns(5500) == 500 + N
     assert box.close() == AlarmInterval(4400, 5600, 5000, "ewma/T")
