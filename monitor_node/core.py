@@ -20,7 +20,9 @@ from monitor_node.alarms.commands import execute_command
 from monitor_node.checks.silence import SilenceCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.health import HEARD_AGAIN_NS, NODE, STALL_NS, Failures, ReceiveStats
-from monitor_node.ingest.alignment import Aligner, Row
+from monitor_node.ingest.alignment import Aligner
+from monitor_node.ingest.duplicates import ReplayFilter
+from monitor_node.ingest.rows import Row
 from monitor_node.ingest.samples import (
     LARGEST_NUMBER,
     LARGEST_SAMPLE,
@@ -30,7 +32,7 @@ from monitor_node.ingest.samples import (
     SampleUnits,
     reject_reason,
 )
-from monitor_node.ingest.sequence_check import HeldSample, ReplayFilter, SequenceCheck
+from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from monitor_node.learn.baseline import NO_VALUE
 from monitor_node.learn.model_update import BASELINE, LIST
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding
@@ -44,7 +46,7 @@ from monitor_node.monitor_state import (
 )
 from monitor_node.watch.pipeline import PlantPipeline
 from monitor_node.watch.promise import PromiseStage
-from monitor_node.watch.training_check import check_training
+from monitor_node.watch.promise_check import check_training
 from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import OTHER_VERSION, Body, DecodeError, Encoded, Publication, decode, encode

@@ -17,7 +17,7 @@ from monitor_node.alarms.alarms import AlarmChange
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.charts import chart_point
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.alignment import MeasuredRow
+from monitor_node.ingest.rows import MeasuredRow
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication

@@ -5,7 +5,7 @@ from itertools import repeat
 from math import isfinite, nan
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.alignment import MeasuredRow
+from monitor_node.ingest.rows import MeasuredRow
 from monitor_node.learn.arx import ArxPredictor
 from monitor_node.learn.references import Reference
 from reactorwatch.contract import keys

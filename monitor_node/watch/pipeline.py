@@ -18,7 +18,7 @@ from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.causes.stage import Suspicion
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.health import NODE, Failures
-from monitor_node.ingest.alignment import MeasuredRow, Row
+from monitor_node.ingest.rows import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.baseline import NO_VALUE, TrainingResult

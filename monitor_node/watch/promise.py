@@ -3,7 +3,7 @@
 Limits aim at the configured rate always. On average over trainings they keep it. Of one plant an upper bound at 90 %
 is stated, because its limits were estimated (`reactorwatch.spc.training_errors`). Both take the plant to go on as in
 its training. Whether it does is checked twice: the second half of the training is judged by the first
-(`training_check`), and the alarms that come while the plant is watched are compared with those promised.
+(`promise_check`), and the alarms that come while the plant is watched are compared with those promised.
 """
 
 from collections.abc import Callable
@@ -230,7 +230,7 @@ LEAST_EXCESS = 1.5
 """Times as many false alarms as promised from which the promise is not kept."""
 
 CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, TrainingRows, str], TrainingCheck]
-"""Judges a training by itself, see `training_check`."""
+"""Judges a training by itself, see `promise_check`."""
 
 
 class PromiseStage:

@@ -114,7 +114,7 @@ def design(
     as_json: Json = False,
 ) -> None:
     """The chart that detects a shift fastest at a rate of false alarms."""
-    from reactorwatch.spc.run_length.design import design as fastest
+    from reactorwatch.spc.run_length.control_limits import design as fastest
 
     found = fastest(chart, arl0, shift, dimension=dimension, rules=_rules(rules))
     if as_json:

@@ -29,7 +29,7 @@ from scipy import special
 from reactorwatch.errors import InputError
 from reactorwatch.spc.m_of_n import false_alarm_rate
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.run_length.design import LONGEST_DESIGN, SHORTEST
+from reactorwatch.spc.run_length.control_limits import LONGEST_DESIGN, SHORTEST
 
 DAYS = 30
 DAYS_MIN = DAYS * 24 * 60.0

@@ -14,7 +14,7 @@ from reactorwatch.spc.charts.base import Array, Chart, Shown
 from reactorwatch.spc.estimated_t2 import estimated_t2_quantile
 from reactorwatch.spc.false_alarm_budget import degrees_of_freedom
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.run_length.design import mewma_limit
+from reactorwatch.spc.run_length.control_limits import mewma_limit
 from reactorwatch.spc.run_length.mewma import LARGEST_DIMENSION_WITHOUT_SHIFT as LARGEST_DIMENSION
 from reactorwatch.spc.training_errors import TrainingErrors, joint_relative_rate
 

@@ -39,7 +39,7 @@ from numpy.typing import ArrayLike
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Array
 from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.run_length.limits import check_range
+from reactorwatch.spc.run_length.arguments import check_range
 from reactorwatch.spc.run_length.mewma import SMALLEST_WEIGHT_WITHOUT_SHIFT
 from reactorwatch.spc.run_length.parameters import parameter_limit
 

@@ -26,7 +26,7 @@ from reactorwatch.spc.charts.base import Array, Judgement, vector
 from reactorwatch.spc.charts.residual_space import BLOCKS, adjustment, average_rows, fill_missing
 from reactorwatch.spc.false_alarm_budget import degrees_of_freedom
 from reactorwatch.spc.prewhitening import Prewhitening, learn
-from reactorwatch.spc.run_length.design import ewma_limit
+from reactorwatch.spc.run_length.control_limits import ewma_limit
 from reactorwatch.spc.training_errors import TrainingErrors, student_tail
 from reactorwatch.spc.value_chart import ValueBaseline, ValueChart, student_limit
 from reactorwatch.stored_state import Memory

@@ -25,8 +25,8 @@ from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.base import Array, Judgement, Setting, Shown, finite
 from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, CompiledChart, X, write_point
 from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.run_length.control_limits import cusum_limit
 from reactorwatch.spc.run_length.cusum import check_parameters
-from reactorwatch.spc.run_length.design import cusum_limit
 from reactorwatch.spc.training_errors import TrainingErrors
 
 CEILING = 2.0

@@ -22,7 +22,7 @@ from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.base import Array, Judgement, Setting, Shown, finite
 from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, CompiledChart, X, write_point
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.run_length.design import ewma_limit
+from reactorwatch.spc.run_length.control_limits import ewma_limit
 from reactorwatch.spc.run_length.ewma import check_parameters
 from reactorwatch.spc.training_errors import TrainingErrors, relative_rate
 

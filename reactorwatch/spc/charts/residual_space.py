@@ -38,7 +38,7 @@ from scipy import special
 from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.errors import InputError, positive
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, Judgement, Setting, vector
-from reactorwatch.spc.run_length.design import ewma_limit
+from reactorwatch.spc.run_length.control_limits import ewma_limit
 from reactorwatch.spc.training_errors import TrainingErrors, student_tail
 from reactorwatch.spc.value_chart import ValueBaseline, ValueChart, student_limit
 from reactorwatch.stored_state import Memory

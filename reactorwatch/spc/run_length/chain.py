@@ -19,7 +19,7 @@ from scipy import linalg, special
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.spc.run_length.limits import LONGEST
+from reactorwatch.spc.run_length.arguments import LONGEST
 
 
 def run_lengths(transitions: Array) -> Array:

@@ -28,8 +28,8 @@ from scipy import special
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, positive
+from reactorwatch.spc.run_length.arguments import check_length, check_range, shift_size
 from reactorwatch.spc.run_length.chain import nodes, run_lengths, stationary_distribution
-from reactorwatch.spc.run_length.limits import check_length, check_range, shift_size
 
 LARGEST_LIMIT, LARGEST_ALLOWANCE = 200.0, 100.0
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, positive
+from reactorwatch.spc.run_length.arguments import check_length, check_range, shift_size
 from reactorwatch.spc.run_length.chain import nodes, run_lengths, stationary_distribution
-from reactorwatch.spc.run_length.limits import check_length, check_range, shift_size
 
 SMALLEST_WEIGHT = 1e-3
 LARGEST_LIMIT = 10.0

@@ -24,9 +24,9 @@ from scipy import special
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import positive
+from reactorwatch.spc.run_length.arguments import check_length, check_range, shift_size
 from reactorwatch.spc.run_length.chain import run_lengths, stationary_distribution
 from reactorwatch.spc.run_length.ewma import ewma
-from reactorwatch.spc.run_length.limits import check_length, check_range, shift_size
 from reactorwatch.spc.run_length.t2 import t2
 
 SMALLEST_WEIGHT = 0.01

@@ -34,8 +34,8 @@ from scipy import special
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.spc.run_length.design import LONGEST_DESIGN, SHORTEST
-from reactorwatch.spc.run_length.limits import check_range
+from reactorwatch.spc.run_length.arguments import check_range
+from reactorwatch.spc.run_length.control_limits import LONGEST_DESIGN, SHORTEST
 from reactorwatch.spc.run_length.mewma import LARGEST_LIMIT, mewma
 
 _FIRST_HEIGHT, _HEIGHT_RATIO = 0.5, 1.25

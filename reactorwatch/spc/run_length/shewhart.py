@@ -13,8 +13,8 @@ from scipy import special
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, positive
+from reactorwatch.spc.run_length.arguments import check_length, shift_size
 from reactorwatch.spc.run_length.chain import run_lengths, stationary_distribution
-from reactorwatch.spc.run_length.limits import check_length, shift_size
 
 RULES = (1, 2, 3, 4)
 

@@ -6,7 +6,7 @@ T2 is chi-square with p degrees of freedom and the non-centrality shift^2; the r
 from scipy import special
 
 from reactorwatch.errors import positive
-from reactorwatch.spc.run_length.limits import check_length, check_range, shift_size
+from reactorwatch.spc.run_length.arguments import check_length, check_range, shift_size
 
 LARGEST_DIMENSION = 100
 

@@ -20,7 +20,7 @@ from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart
 from reactorwatch.spc.joint_chart import joint_limit
 from reactorwatch.spc.prewhitening import Prewhitening, learn
-from reactorwatch.spc.run_length.design import ewma_limit, mewma_limit
+from reactorwatch.spc.run_length.control_limits import ewma_limit, mewma_limit
 
 KNOWN = Prewhitening(0.0, (), 1.0, 10**12, 1e-13, 0.0)
 ARL0, TRAINING, WATCHED, PLANTS = 2000.0, 600, 6000, 300

@@ -7,7 +7,7 @@ from scipy import signal, stats
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Array
 from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.run_length.design import mewma_limit
+from reactorwatch.spc.run_length.control_limits import mewma_limit
 from reactorwatch.spc.run_length.parameters import parameter_limit, prepare_limit
 from reactorwatch.stored_state import copy_of
 from tests.unit.spc.members import COVARIANCE, ROOT, difference

@@ -5,7 +5,8 @@ import random
 
 import pytest
 
-from monitor_node.ingest.alignment import Aligner, Row
+from monitor_node.ingest.alignment import Aligner
+from monitor_node.ingest.rows import Row
 
 SIGNALS = ("qc", "C", "T")
 PERIOD = 100

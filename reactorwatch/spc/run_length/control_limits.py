@@ -16,9 +16,9 @@ import msgspec
 from scipy import special
 
 from reactorwatch.errors import InputError
+from reactorwatch.spc.run_length.arguments import check_range
 from reactorwatch.spc.run_length.cusum import LARGEST_LIMIT, cusum
 from reactorwatch.spc.run_length.ewma import ewma
-from reactorwatch.spc.run_length.limits import check_range
 from reactorwatch.spc.run_length.mewma import LARGEST_DIMENSION, SMALLEST_WEIGHT, mewma
 from reactorwatch.spc.run_length.mewma import LARGEST_LIMIT_WITHOUT_SHIFT as LARGEST_MEWMA_LIMIT
 from reactorwatch.spc.run_length.shewhart import checked_rules, shewhart

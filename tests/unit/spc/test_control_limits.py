@@ -5,7 +5,7 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.spc import run_length
-from reactorwatch.spc.run_length.design import (
+from reactorwatch.spc.run_length.control_limits import (
     cusum_limit,
     design,
     ewma_limit,

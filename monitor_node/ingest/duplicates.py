@@ -1,0 +1,75 @@
+"""Find samples that were received before: sent twice, or processed before a restart of the monitor."""
+
+from dataclasses import replace
+
+from monitor_node.ingest.rows import AlignmentMemory
+from reactorwatch.runtime.delivery.gap_tracker import GapTracker
+
+
+def is_duplicate(memory: AlignmentMemory, index: int, time_ns: int) -> bool:
+    """True if a sample of that signal and time is in a pending row, or in one of those emitted last.
+
+    Args:
+        memory: memory of the alignment.
+        index: index of the signal in the rows.
+        time_ns: sample time.
+    """
+    pending = memory.pending.get(time_ns)
+    numbers = pending.numbers if pending is not None else memory.emitted.get(time_ns)
+    return numbers is not None and numbers[index] is not None
+
+
+class ReplayFilter:
+    """Filter of samples that were processed before a restart.
+
+    A resumed monitor queries the history of its plant. It starts with samples that the stored state includes, followed
+    by those since the state was stored. A plant numbers the samples of each signal. So a sample was processed before
+
+    - if the state has the row of its time, with this sequence number of the signal; or
+    - if its row is older than any in the state, and neither its number nor its time is beyond the newest.
+
+    The sample that follows the newest ends the filter for its signal; one farther on does not, as another publisher may
+    have sent it before the history came. So does one with another number than the state has for its time: then the
+    plant was restarted with its clock set back. A sample that is missing in its row of the state was not processed, and
+    passes.
+
+    Args:
+        memory: memory of the alignment as stored.
+
+    Attributes:
+        has_begun: True if a sample has come.
+    """
+
+    def __init__(self, memory: AlignmentMemory) -> None:
+        self.has_begun = False
+        self._newest: list[GapTracker | None] = [
+            None if item.expected is None else replace(item) for item in memory.sequences
+        ]
+        waiting = {time_ns: row.numbers for time_ns, row in memory.pending.items()}
+        self._numbers = {time_ns: list(numbers) for time_ns, numbers in (memory.emitted | waiting).items()}
+
+    @property
+    def is_done(self) -> bool:
+        """True if every signal has passed its newest processed sample."""
+        return not any(self._newest)
+
+    def is_duplicate(self, index: int, time_ns: int, sequence: int) -> bool:
+        """True if a sample was processed before.
+
+        Args:
+            index: index of the signal in the rows.
+            time_ns: sample time.
+            sequence: sequence number.
+        """
+        self.has_begun = True
+        newest = self._newest[index]
+        if newest is None:
+            return False
+        numbers = self._numbers.get(time_ns)
+        if numbers is not None and numbers[index] is None:
+            return False
+        known = numbers is not None and numbers[index] == sequence
+        older = numbers is None and newest.is_past(sequence, time_ns)
+        if not (known or older) and (numbers is not None or sequence == newest.expected):
+            self._newest[index] = None
+        return known or older
