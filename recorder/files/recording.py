@@ -12,7 +12,6 @@ the intact part of that is read.
 import heapq
 from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import cached_property
-from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -145,6 +144,7 @@ class Recording:
             held = [source for source in sources if source.span != (0, 0)] or sources[:1]
             self._sources = [source._replace(first=not index) for index, source in enumerate(held)]
         self.files = [source.path for source in self._sources]
+        self._records: dict[Path, list[Metadata]] = {}
 
     def messages(self, kinds: Collection[str] | None = None, plant: str | None = None) -> Iterator[RecordedMessage]:
         """Messages in the order of receipt; those of equal time in the order of the file.
@@ -162,20 +162,20 @@ class Recording:
 
         return (stored.recorded_message for stored in merge_messages(self._sources, wanted=is_selected))
 
-    @cached_property
+    @property
     def metadata_by_file(self) -> list[dict[str, str]]:
         """Metadata of each file, empty if another program wrote it."""
-        return [own_metadata(records) for records in self._records_by_file]
+        return [own_metadata(self._records_of(file)) for file in self.files]
 
     @property
     def metadata(self) -> dict[str, str]:
         """Metadata of the first file."""
-        return self.metadata_by_file[0]
+        return own_metadata(self._records_of(self.files[0]))
 
     @property
     def metadata_records(self) -> list[Metadata]:
         """Metadata records of all files, those of other programs included."""
-        return list(chain.from_iterable(self._records_by_file))
+        return [record for file in self.files for record in self._records_of(file)]
 
     def process(self, plant: str | None) -> Process | None:
         """Process of a plant, or of the only plant, as the recording describes it; None: it does not."""
@@ -230,9 +230,11 @@ class Recording:
             f"on {keys.ROOT}/PLANT/{keys.SAMPLE}/SIGNAL; convert it to a table, and `import` that"
         )
 
-    @cached_property
-    def _records_by_file(self) -> list[list[Metadata]]:
-        return [metadata_records(file) for file in self.files]
+    def _records_of(self, file: Path) -> list[Metadata]:
+        """Metadata records of one file, read when they are needed: those of a later file may be damaged."""
+        if file not in self._records:
+            self._records[file] = metadata_records(file)
+        return self._records[file]
 
 
 def live_file(folder: Path) -> Path | None:

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.index import FOOTER, RECORD, TABLE_CURE, read_summary
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import read_record
+from recorder.tools.inspect import zero_ns_of
 from tests.unit.recorder import golden
 
 ENTRIES = [entry for entry in golden.entries() if "/sample/" in entry.key][:60]
@@ -134,3 +136,22 @@ def test_an_index_that_names_another_record_as_metadata_is_named(whole: bytes, t
     path.write_bytes(bytes(content).replace(struct.pack("<QQ", item.offset, item.length), header))
     with pytest.raises(InputError, match="its metadata cannot be read"):
         _ = Recording(path).metadata
+
+
+def test_damaged_metadata_of_a_later_file_stop_only_what_needs_those_of_all_files(tmp_path: Path) -> None:
+    for number, entries in enumerate((ENTRIES[:30], ENTRIES[30:])):
+        with RecordingWriter(tmp_path / f"run-{number}.mcap", {"plant": "cstr"}) as writer:
+            for entry in entries:
+                writer.write(entry)
+    later = tmp_path / "run-1.mcap"
+    (item,) = read_summary(later).metadata_indexes
+    content = bytearray(later.read_bytes())
+    struct.pack_into("<I", content, item.offset + RECORD.size, 2**31 - 1)  # length of the record's name
+    later.write_bytes(content)
+    recording = Recording(tmp_path)
+    assert recording.metadata["plant"] == "cstr"
+    assert zero_ns_of(recording) == ENTRIES[0].publish_time_ns
+    assert read_record(tmp_path, process=find_process("cstr")).rows
+    for all_files in ("metadata_records", "metadata_by_file"):
+        with pytest.raises(InputError, match=f"^{later}: its metadata cannot be read"):
+            getattr(recording, all_files)
