@@ -425,6 +425,7 @@ LATCHED_KINDS: Mapping[str, type[Message]] = {
 }
 """Kinds of messages that are latched, with their types."""
 STATES = frozenset(LATCHED_KINDS.values())
+"""Types of latched messages."""
 
 
 class LatchedMessages:

@@ -18,6 +18,7 @@ from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS, Record, to_time_ns
 from recorder import RecordedMessage
 from recorder.columns.samples import ContinuousTime, decode_messages
+from recorder.keep import STATES
 
 LONG_WAIT_NS = MINUTE_NS
 JUMP = 2.0
@@ -125,16 +126,16 @@ def filter_time(publications: Iterable[Publication], from_ns: int, to_ns: int) -
 def _schedule(tape: Iterable[Publication]) -> Iterator[tuple[Publication, int]]:
     """Add to each publication its time, continuous over the runs of its plant."""
     clocks = defaultdict[str, ContinuousTime](ContinuousTime)
-    first: list[Publication] | None = []  # alarms before all else: they are due with what follows them
+    first: list[Publication] | None = []  # latched messages before all else: they are due with what follows them
     for publication in tape:
-        if first is not None and isinstance(publication.message, messages.Alarm):
+        if first is not None and type(publication.message) in STATES:
             first.append(publication)
             continue
         time_ns = clocks[publication.key.split("/", 2)[1]].continuous_ns(*publication)
-        yield from ((alarm, time_ns) for alarm in first or ())
+        yield from ((latched, time_ns) for latched in first or ())
         first = None
         yield publication, time_ns
-    yield from ((alarm, alarm.message.time_ns) for alarm in first or ())
+    yield from ((latched, latched.message.time_ns) for latched in first or ())
 
 
 class Player:

@@ -9,6 +9,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication
 from reactorwatch.records.record import MINUTE_NS
+from recorder.keep import LATCHED_KINDS
 from recorder.tools.player import LONG_WAIT_NS, Player, filter_time
 
 SECOND_NS = 1_000_000_000
@@ -69,6 +70,16 @@ def test_standing_alarms_are_due_with_the_first_sample(rate: float) -> None:
     assert len(first) == len(STANDING) + 2
     assert first[-1] == sample(100)
     assert player.next_tick_ns() == round(SECOND_NS / rate)
+
+
+@pytest.mark.parametrize("kind", LATCHED_KINDS)
+def test_latched_messages_of_every_kind_are_due_with_the_first_sample(kind: str) -> None:
+    latched = Publication(keys.key("cstr", kind, "x"), LATCHED_KINDS[kind](time_ns=0))  # type: ignore[arg-type]
+    said = list[float]()
+    player = Player(lambda: iter([latched, sample(18_000), sample(18_001)]), 1.0, on_wait=said.append)
+    assert player.on_tick(0) == [latched, sample(18_000)]
+    assert player.next_tick_ns() == SECOND_NS
+    assert not said
 
 
 @pytest.mark.parametrize(
