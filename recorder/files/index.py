@@ -31,6 +31,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import wrap_read_errors
+from recorder.files.part_file import open_recording
 
 LATEST_NS = 2**64 - 1
 LARGEST_MB = "REACTORWATCH_LARGEST_CHUNK_MB"
@@ -69,9 +70,9 @@ def read_summary(path: Path) -> Summary:
         InputError: the file does not exist, is no MCAP file, is cut off, or its index is damaged.
     """
     with wrap_read_errors(path):
-        size = path.stat().st_size
-        stream = path.open("rb")
+        stream = open_recording(path)
     with stream:
+        size = os.fstat(stream.fileno()).st_size
         magic = stream.read(len(MCAP0_MAGIC))
         if not magic:
             raise InputError(f"{path}: expected an MCAP recording, got an empty file")
@@ -127,7 +128,7 @@ def read_indexed_metadata(path: Path, summary: Summary) -> list[Metadata]:
         InputError: one cannot be read.
     """
     found: list[Metadata] = []
-    with wrap_read_errors(path), path.open("rb") as stream:
+    with wrap_read_errors(path), open_recording(path) as stream:
         for item in summary.metadata_indexes:
             stream.seek(item.offset)
             try:

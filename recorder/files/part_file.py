@@ -117,6 +117,20 @@ class PartFile:
 _CHUNK = bytes([Opcode.CHUNK])
 
 
+def open_recording(path: Path) -> BinaryIO:
+    """Open a file of a recording to read it; if its recorder completed it meanwhile, under its complete name.
+
+    Raises:
+        OSError: it cannot be opened.
+    """
+    try:
+        return path.open("rb")
+    except FileNotFoundError:
+        if path.suffix != PART:
+            raise
+        return path.with_suffix("").open("rb")
+
+
 def is_locked(path: Path) -> bool:
     """True if a running process writes the file; False if it does not exist."""
     try:

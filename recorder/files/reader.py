@@ -42,7 +42,7 @@ from recorder.files.index import (
     read_indexed_metadata,
     read_summary,
 )
-from recorder.files.part_file import PART
+from recorder.files.part_file import PART, open_recording
 
 LATCHED = "reactorwatch.repeated"
 """Key in the metadata of a channel of latched messages, see `RecordedMessage.latched`."""
@@ -137,7 +137,7 @@ class Reader:
         self._path, self._from_ns, self._to_ns = path, from_ns, to_ns
         self._wanted, self._tolerant = wanted, tolerant
         self._attached: list[tuple[int, int]] = []
-        with wrap_read_errors(path), path.open("rb") as stream:
+        with wrap_read_errors(path), open_recording(path) as stream:
             self._size = os.fstat(stream.fileno()).st_size
             if not self._size:
                 raise InputError(f"{path}: expected an MCAP recording, got an empty file")

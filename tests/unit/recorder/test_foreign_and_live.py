@@ -11,8 +11,11 @@ from mcap.writer import Writer
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.api.files import expand_folder
+from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
+from recorder.files.metadata import METADATA
 from recorder.files.part_file import PART
+from recorder.files.reader import read_start
 from recorder.files.recording import Recording
 from recorder.tools.convert import read_record
 from recorder.tools.inspect import inspect
@@ -83,3 +86,22 @@ def test_a_folder_with_only_a_live_file_is_read_and_reported_as_live(tmp_path: P
     fed.kill()
     with pytest.raises(InputError, match=rf"holds no recording .*{part.name} is left of a recorder that was killed"):
         read_record(tmp_path)
+
+
+def test_a_live_file_that_is_completed_while_it_is_read_is_read_to_its_end(tmp_path: Path) -> None:
+    fed = recorder(tmp_path, START_NS)
+    fed.receive(samples_of(simulate_record(PlantConfig(seed=1), 20), "cstr", START_NS), 2 * SECOND)
+    fed.pass_time(MINUTE)
+    recording = Recording(tmp_path)
+    begun = len(list(recording.messages({keys.SAMPLE})))
+    fed.stop()
+    assert not list(tmp_path.glob(f"*{PART}"))
+    assert len(list(recording.messages({keys.SAMPLE}))) == begun > 0
+    assert recording.plants == ("cstr",)
+    assert recording.metadata["plant"] == "cstr"
+    assert METADATA in {record.name for record in recording.metadata_records}
+    assert read_start(recording.files[0]).library
+    (completed,) = tmp_path.glob("*.mcap")
+    completed.unlink()
+    with pytest.raises(InputError, match="there is no such file"):
+        list(recording.messages())
