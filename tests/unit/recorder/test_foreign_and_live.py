@@ -12,14 +12,19 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.api.files import expand_folder
 from reactorwatch.contract import keys
+from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
+from recorder import RecordedMessage
+from recorder.config import ReplayConfig
 from recorder.files.metadata import METADATA
 from recorder.files.part_file import PART
 from recorder.files.reader import read_start
 from recorder.files.recording import Recording
+from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import read_record
 from recorder.tools.inspect import inspect
 from recorder.tools.player import samples_of
+from recorder.tools.replay import open_tape
 
 from .recording import MINUTE, SECOND, recorder
 
@@ -105,3 +110,23 @@ def test_a_live_file_that_is_completed_while_it_is_read_is_read_to_its_end(tmp_p
     completed.unlink()
     with pytest.raises(InputError, match="there is no such file"):
         list(recording.messages())
+
+
+def test_each_pass_of_a_loop_plays_the_files_that_the_folder_holds_then(tmp_path: Path) -> None:
+    publications = list(samples_of(simulate_record(PlantConfig(seed=1), 30), "cstr", START_NS))
+    third = len(publications) // 3
+
+    def write(number: int) -> Path:
+        path = tmp_path / f"cstr-{number}.mcap"
+        with RecordingWriter(path, {"plant": "cstr"}) as writer:
+            for item in publications[number * third : (number + 1) * third]:
+                time_ns = item.message.time_ns
+                writer.write(RecordedMessage(*encode(item)[:3], time_ns, time_ns))
+        return path
+
+    oldest, _ = write(0), write(1)
+    _, tape = open_tape(ReplayConfig(file=str(tmp_path), loop=True))
+    assert list(tape()) == publications[: 2 * third]
+    oldest.unlink()
+    write(2)
+    assert list(tape()) == publications[third : 3 * third]
