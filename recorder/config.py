@@ -94,7 +94,7 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         to_min: end, in the minutes of `from_min`.
         loop: True to restart at the end.
         plant: name of the plant on the bus; empty keeps the recorded name (for a table, that of its process).
-        everything: True to play estimates, charts, alarms and faults too, not only samples.
+        everything: True to play all that the monitor published, and faults, not only samples.
         wait_for: names of nodes that must be alive before the first sample is published.
         process: process whose signals are played, by name or file; None: all signals of a recording, those of the
             reactor in a table.

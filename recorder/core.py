@@ -162,6 +162,8 @@ class Recorder:
 
     def _count_recorded(self, message: Encoded) -> None:
         """Count a sample that an earlier file holds, so that those around it in this file do not count as lost."""
+        if (topic := keys.parse(message.key)) is None or topic.kind != keys.SAMPLE:
+            return  # nothing else is counted, nor needs to be decoded
         sample = content_of(message)
         if not isinstance(sample, messages.Sample) or sample.quality == _NO_SAMPLE or sample.time_ns < 0:
             return

@@ -429,7 +429,7 @@ STATES = frozenset(LATCHED_KINDS.values())
 
 
 class LatchedMessages:
-    """Last message of each model, alarm, incident that is not over, baseline, promise and fault.
+    """Last message of each model, alarm, incident until its alarms are normal, baseline, promise and fault.
 
     Args:
         capacity: largest number of messages; beyond it the oldest is dropped.
@@ -449,8 +449,8 @@ class LatchedMessages:
         else:
             return
         self._last.pop(name, None)
-        if isinstance(message, messages.Incident) and message.until_ns:
-            return  # each is a key of its own, and a plant goes on for years
+        if isinstance(message, messages.Incident) and message.state == messages.ALARM_STATE_NORMAL:
+            return  # over and acknowledged; each is a key of its own, and a plant goes on for years
         self._last[name] = recorded
         if len(self._last) > self._capacity:
             del self._last[next(iter(self._last))]

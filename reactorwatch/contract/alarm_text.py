@@ -1,4 +1,4 @@
-"""Texts of alarms for people; a number that this version has no word for is shown as it is."""
+"""Texts of alarms and suspects of incidents; a number that this version has no word for is shown as it is."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -33,12 +33,12 @@ class NewSuspects:
 
     def update(self, number: int, suspects: Sequence[Suspect]) -> bool:
         """True if an incident has suspects, and other ones than before."""
-        if not suspects or list(suspects) == self._suspects.get(number):
+        if not suspects:
             return False
-        self._suspects[number] = list(suspects)
+        before, self._suspects[number] = self._suspects.pop(number, None), list(suspects)
         if len(self._suspects) > MAX_INCIDENTS:
-            del self._suspects[next(iter(self._suspects))]
-        return True
+            del self._suspects[next(iter(self._suspects))]  # the one that was published longest ago
+        return self._suspects.get(number) != before
 
 
 def describe_suspects(suspects: Iterable[Suspect]) -> str:

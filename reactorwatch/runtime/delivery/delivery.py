@@ -14,6 +14,8 @@ from reactorwatch.runtime.delivery.streams import stream_of
 MAX_STREAMS_QUERIED = 100
 """Streams whose publishers are queried again at once: with more than that the network broke down, and the queries would
 never end."""
+QUERY_ALL_INTERVAL_NS = 60_000_000_000
+"""Shortest time between two queries for all that is cached of a stream: thousands of messages a key."""
 
 
 class SequencedMessage(NamedTuple):
@@ -64,7 +66,8 @@ class Delivery:
             await_history=True, size=lambda item: len(item.payload), start_ns=time.monotonic_ns()
         )
         self._changed = threading.Condition()
-        self._closed = False
+        self._closed = threading.Event()
+        self._query_all_ns: dict[str, int] = {}  # time from which all of a stream may be queried again
         self._thread = threading.Thread(target=self._give_up_when_due, name="delivery", daemon=True)
         self._thread.start()
 
@@ -116,7 +119,7 @@ class Delivery:
     def close(self) -> None:
         """Deliver all held messages, with gaps between them, and end the thread."""
         with self._changed:
-            self._closed = True
+            self._closed.set()
             self._changed.notify()
         self._thread.join()
         self.flush_deliveries()
@@ -144,26 +147,36 @@ class Delivery:
         while True:
             with self._changed:
                 now_ns, due_ns = time.monotonic_ns(), self._buffer.due_ns()
-                while not self._closed and (due_ns is None or due_ns > now_ns):
+                while not self._closed.is_set() and (due_ns is None or due_ns > now_ns):
                     self._changed.wait(None if due_ns is None else (due_ns - now_ns) / 1e9)
                     now_ns, due_ns = time.monotonic_ns(), self._buffer.due_ns()
-                if self._closed:
+                if self._closed.is_set():
                     return
                 self._deliver(self._buffer.release_overdue(now_ns, only_queried=True))
                 overdue = self._buffer.take_overdue(now_ns)
             for stream, after_ns in islice(overdue.items(), MAX_STREAMS_QUERIED):
-                self.receive(self._query_missing(stream, (now_ns - after_ns) / 1e9))
+                if self._closed.is_set():
+                    return
+                self._recover(stream, (now_ns - after_ns) / 1e9)
 
-    def _query_missing(self, stream: str, since_s: float) -> list[SequencedMessage]:
+    def _recover(self, stream: str, since_s: float) -> None:
         """Query what is missing in a stream.
 
-        Messages that waited long on their way, because this process was too busy to take them, were published longer
-        ago than their arrival tells. The replies then begin behind the gap, and all that is cached is queried.
+        The replies may begin behind the gap: messages that waited long on their way, because this process was too busy
+        to take them, were published longer ago than their arrival tells. Then all that is cached is queried, at most
+        once in `QUERY_ALL_INTERVAL_NS`: a cache that is too small for the gap answers in vain, and a made-up publisher
+        could ask for it.
         """
         replies = list(self._query_stream(stream, since_s))
+        self.receive(replies)
         oldest: dict[int, int] = {}
         for reply in replies:
             oldest[reply.publisher] = min(reply.number, oldest.get(reply.publisher, reply.number))
+        now_ns = time.monotonic_ns()
         with self._changed:
-            begins_behind = self._buffer.is_missing_before(stream, oldest)
-        return list(self._query_stream(stream, inf)) if begins_behind else replies
+            is_cut_off = self._buffer.is_missing_before(stream, oldest)
+        if self._closed.is_set() or not is_cut_off or now_ns < self._query_all_ns.get(stream, now_ns):
+            return
+        self._query_all_ns = {name: due_ns for name, due_ns in self._query_all_ns.items() if due_ns > now_ns}
+        self._query_all_ns[stream] = now_ns + QUERY_ALL_INTERVAL_NS
+        self.receive(self._query_stream(stream, inf))

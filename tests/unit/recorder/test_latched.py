@@ -32,9 +32,13 @@ def test_the_last_message_of_each_model_alarm_and_fault_is_repeated_and_nothing_
     assert {(entry.log_time_ns, entry.latched) for entry in entries} == {(1000, True)}
 
 
-def test_an_incident_is_repeated_until_it_is_over() -> None:
-    first, over = messages.Incident(number=1, alarms=["a"]), messages.Incident(number=1, alarms=["a"], until_ns=5)
-    second = messages.Incident(number=2, alarms=["b"])
+def test_an_incident_is_repeated_until_all_its_alarms_are_normal() -> None:
+    """One of which an alarm has returned and was not acknowledged still waits for an operator, with its suspects."""
+    first, over = (
+        messages.Incident(number=1, alarms=["a"], until_ns=5, state=state)
+        for state in (messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED, messages.ALARM_STATE_NORMAL)
+    )
+    second = messages.Incident(number=2, alarms=["b"], state=messages.ALARM_STATE_UNACKNOWLEDGED)
     active = remembered(("incident/1", first), ("incident/2", second)).messages(1000)
     assert [entry.key for entry in active] == ["incident/1", "incident/2"]
     later = remembered(("incident/1", first), ("incident/2", second), ("incident/1", over)).messages(1000)

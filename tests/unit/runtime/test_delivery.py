@@ -132,6 +132,32 @@ def test_a_gap_that_was_long_on_its_way_is_queried_in_all_that_is_cached(clock: 
     assert [queried.get_nowait() for _ in range(queried.qsize())] == [reorder_buffer.TIMEOUT_NS / 1e9, inf]
 
 
+def test_replies_that_a_cache_no_longer_has_are_delivered_and_all_of_it_is_queried_once_a_minute(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The cache is too small for either gap: its answers begin behind them, and the query for all finds nothing."""
+    monkeypatch.setattr(reorder_buffer, "TIMEOUT_NS", 1_000_000)
+    monkeypatch.setattr(reorder_buffer, "RECOVERY_TIMEOUT_NS", 2_000_000)
+    received: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    queried: SimpleQueue[float] = SimpleQueue()
+
+    def query(_stream: str, since_s: float) -> list[SequencedMessage]:
+        queried.put(since_s)
+        return [] if isinf(since_s) else [message(newest[0] - 1)]
+
+    newest = [0]
+    delivery = Delivery(each(received), received.put, query)
+    delivery.start()
+    items = []
+    for newest[0] in (0, 4, 9):
+        delivery.receive([message(newest[0])])
+        items += [received.get(timeout=WITHIN_S) for _ in range(3 if newest[0] else 1)]
+    delivery.close()
+    found = [(item.first, item.last) if isinstance(item, Gap) else int(item.payload) for item in items]
+    assert found == [0, (1, 2), 3, 4, (5, 7), 8, 9]
+    assert [isinf(queried.get_nowait()) for _ in range(queried.qsize())] == [False, True, False]
+
+
 def test_a_stream_that_began_while_the_link_was_down_is_asked_for_from_its_beginning(clock: SimpleNamespace) -> None:
     """And again only for what was published since: a made-up publisher costs its victim little."""
     received: SimpleQueue[Encoded | Gap] = SimpleQueue()
