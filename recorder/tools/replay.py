@@ -205,7 +205,7 @@ def open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Itera
     whole = (config.from_min, config.to_min) == (-inf, inf)
     from_ns, to_ns = _span_ns(config, 0 if whole else zero_ns_of(recording))
 
-    def tape() -> Iterator[Publication]:  # each pass looks up the files anew: a recorder adds and deletes some
+    def tape() -> Iterator[Publication]:  # lists the files at each pass: a recorder adds and deletes some
         played = filter_playable(Recording(path).messages(kinds), config.plant, kinds, signals)
         return filter_time(played, from_ns, to_ns)
 
