@@ -48,10 +48,6 @@ class Memory(Storable, msgspec.Struct, forbid_unknown_fields=True):
     """Base class of structures that change with the rows and are their own state: their fields are what is stored."""
 
 
-class StoredState(Storable, msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base class of the states of what keeps its memory in another form; a subclass lists the fields."""
-
-
 def copy_of(memory: Stored) -> Stored:
     """A copy of a memory that shares nothing with it, as stored and read again."""
     return type(memory).from_bytes(memory.to_bytes())

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from math import log
 from typing import TypeAlias
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 from scipy.special import pdtrc
@@ -31,7 +32,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.false_alarm_budget import DAYS, DAYS_MIN
 from reactorwatch.spc.training_errors import CONFIDENCE, QUANTILE
-from reactorwatch.stored_state import Memory, StoredState
+from reactorwatch.stored_state import Memory, Storable
 
 UNLIKELY = 0.003
 """Probability of so many alarms by chance below which the promise is not kept."""
@@ -45,7 +46,7 @@ SAME_EVENT_ROWS = 20
 REMEDY = "train longer, or over more set points"
 
 
-class TrainingCheck(StoredState, frozen=True):
+class TrainingCheck(Storable, msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The second half of a training, judged by the first.
 
     Attributes:
