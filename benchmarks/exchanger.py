@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.promise.black_box import unfamiliar_rows
 from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig, ReferenceName
 from monitor_node.core import Monitor
 from reactorwatch.arrays import Array
@@ -139,9 +140,7 @@ def watch(flow: Array, measured: Array, config: MonitorConfig, sizes: Sequence[f
         if k in onsets:
             copies[k] = monitor.to_bytes()
         alarms += [f"{name}@{k}" for name in _take_row(monitor, k, values)]
-    result = Result(
-        monitor.pipeline.reference, alarms, {}, {}, getattr(monitor.pipeline.evaluation.reference, "unfamiliar_rows", 0)
-    )
+    result = Result(monitor.pipeline.reference, alarms, {}, {}, unfamiliar_rows(monitor))
     for size in sizes:
         delays = result.delays[size] = []
         result.missed[size] = []

@@ -24,6 +24,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.metrics import Metrics
+from reactorwatch.runtime.security.audit import is_query
 from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
 from reactorwatch.runtime.start import instance_name
 
@@ -189,7 +190,7 @@ class MonitorNode(FleetMonitor):
             monitor.rejects.add("too_many_commands", refusal)
             return CommandReply(accepted=False, text=refusal), []
         reply, publications = super().on_command(question, now_ns)
-        if reply is not None and reply.accepted:
+        if reply is not None and reply.accepted and not is_query(question):
             self._changed.add(topic.plant)
             self._poll_ns = 0
         return reply, self._keep(publications, now_ns)
@@ -245,7 +246,7 @@ class MonitorNode(FleetMonitor):
                 raise
             line = str(error)
         if self._is_single:
-            log.info(line)
+            log.info(line, plant=monitor.config.plant)
             self.resumed = monitor.rows > 0
             self._repeated = monitor.unconfirmed if self.resumed else []
         elif not line.endswith(RESUMED):

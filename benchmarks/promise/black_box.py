@@ -15,6 +15,7 @@ import numpy as np
 from benchmarks.promise.pool import poisson_interval, run_jobs
 from monitor_node.config import MonitorConfig, ReferenceName
 from monitor_node.core import Monitor
+from monitor_node.learn.black_box_reference import BlackBoxMemory
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Alarm
@@ -117,9 +118,16 @@ def watch(job: Job) -> Result:
         alarms,
         monitor.pipeline.expected_false_alarms,
         rows,
-        rows - getattr(monitor.pipeline.evaluation.reference, "unfamiliar_rows", 0),
+        rows - unfamiliar_rows(monitor),
         kept,
     )
+
+
+def unfamiliar_rows(monitor: Monitor) -> int:
+    """Number of rows for which a black box knew too little of the point of operation; 0 with another reference."""
+    reference = monitor.pipeline.evaluation.reference
+    memory = None if reference is None else reference.memory
+    return memory.unfamiliar_rows if isinstance(memory, BlackBoxMemory) else 0
 
 
 def print_table(executor: Executor, jobs: Sequence[Job]) -> None:

@@ -100,7 +100,7 @@ def window_of(rows: Sequence[Row], kalman: Filter) -> Window | None:
     """
     kept = rows_since_break(rows)
     times, inputs = np.array([row[0] for row in kept]), np.array([row[1] for row in kept], dtype=float)
-    if times.size <= BURN_IN_ROWS:
+    if times.size <= BURN_IN_ROWS + 1:  # an onset lies before the newest row
         return None
     measured, missing = np.array([row[2] for row in kept], dtype=float), _count_missing(times, inputs)
     run = _run_filter(kalman, times, inputs, measured, missing)

@@ -48,11 +48,6 @@ class ReplayFilter:
         waiting = {time_ns: row.numbers for time_ns, row in memory.pending.items()}
         self._numbers = {time_ns: list(numbers) for time_ns, numbers in (memory.emitted | waiting).items()}
 
-    @property
-    def is_done(self) -> bool:
-        """True if every signal has passed its newest processed sample."""
-        return not any(self._newest)
-
     def is_duplicate(self, index: int, time_ns: int, sequence: int) -> bool:
         """True if a sample was processed before.
 

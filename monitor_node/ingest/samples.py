@@ -54,13 +54,11 @@ class SampleUnits:
 
     Attributes:
         plain: newest unit by signal that needed no conversion.
-        converted: signals whose newest sample in another unit than `plain` was converted.
     """
 
     def __init__(self, declared: Mapping[str, str], model_units: Mapping[str, str]) -> None:
         self._wanted, self._declared = {**declared, **model_units}, dict(declared)
         self.plain: dict[str, str] = {}
-        self.converted: set[str] = set()
         self._conversions: dict[tuple[str, str], tuple[float, float] | InputError] = {}
 
     def convert(self, signal: str, unit: str, value: float) -> tuple[float, str]:
@@ -77,9 +75,6 @@ class SampleUnits:
         value, wanted = self._convert(signal, unit, value)
         if wanted == unit:
             self.plain[signal] = unit
-            self.converted.discard(signal)
-        else:
-            self.converted.add(signal)
         return value, wanted
 
     def _convert(self, signal: str, unit: str, value: float) -> tuple[float, str]:

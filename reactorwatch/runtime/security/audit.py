@@ -11,6 +11,15 @@ from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decod
 from reactorwatch.contract.messages_pb2 import Audit, BaselineCommand, CommandReply, ListAlarms
 
 
+def is_query(question: Encoded) -> bool:
+    """True for a command that asks for something and changes nothing."""
+    try:
+        command = decode(question.payload, question.encoding)
+    except DecodeError:
+        return False
+    return isinstance(command, ListAlarms) or (isinstance(command, BaselineCommand) and command.what == "list")
+
+
 def audit(question: Encoded, reply: CommandReply, now_ns: int) -> Publication | None:
     """Make the record of a command and its reply; None for a command that changes nothing, or on an unknown key.
 
@@ -20,14 +29,12 @@ def audit(question: Encoded, reply: CommandReply, now_ns: int) -> Publication | 
         now_ns: time of the reply.
     """
     topic = keys.parse(question.key)
-    if topic is None or topic.kind != keys.COMMAND:
+    if topic is None or topic.kind != keys.COMMAND or is_query(question):
         return None
     try:
         command = decode(question.payload, question.encoding)
     except DecodeError:
         command = None  # the reply holds the error
-    if isinstance(command, ListAlarms) or (isinstance(command, BaselineCommand) and command.what == "list"):
-        return None
     record = Audit(
         time_ns=now_ns,
         command=topic.name,

@@ -10,7 +10,7 @@ import pytest
 
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply, Health
-from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
+from reactorwatch.runtime.event_loop import BATCH, EventLoop, StopSignal, stop_on_signals
 from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
 
@@ -338,6 +338,23 @@ def test_a_batch_of_messages_is_bounded_in_the_same_way(bound: str, most: int, m
     assert not thread.is_alive()
     assert handled[0] == count
     assert ahead[0] <= 100 + 20
+
+
+def test_a_history_that_comes_at_once_is_handled_in_parts_between_which_the_node_publishes() -> None:
+    bus, stop, parts = Batched(Exchange()), StopSignal(), list[int]()
+    published = list[int]()
+
+    def on_batch(messages: list[Encoded], _now_ns: int) -> list[Publication]:
+        parts.append(len(messages))
+        return [Publication("out", Health())]
+
+    loop = EventLoop(Echo(), bus, stop, on_publish=lambda _publication: published.append(len(parts)))
+    loop.subscribe("in/**", on_batch=on_batch)
+    bus.hand_over([Encoded("in/x", b"", "")] * (2 * BATCH + 1))
+    stop.set()
+    loop.run()
+    assert parts == [BATCH, BATCH, 1]
+    assert published[:3] == [1, 2, 3]
 
 
 def test_messages_are_handed_over_together_in_their_order_and_tokens_as_they_come_and_go() -> None:

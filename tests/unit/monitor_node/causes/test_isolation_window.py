@@ -5,6 +5,8 @@ from math import nan
 import numpy as np
 import pytest
 
+from monitor_node.causes.isolation import causes_of
+from monitor_node.causes.scan import GlrScan
 from monitor_node.causes.window import BURN_IN_ROWS, GATE, Row, Window, window_of
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.library.cstr.model import cstr
@@ -32,6 +34,14 @@ def shifted(rows: list[Row], places: list[int], column: int, size: float) -> lis
 
 def missing(window: Window) -> list[tuple[int, int]]:
     return [(int(row), int(column)) for row, column in np.argwhere(np.isnan(window.measured))]
+
+
+def test_the_smallest_window_in_which_an_onset_can_be_sought_can_be_scanned(rows: list[Row]) -> None:
+    kalman = Filter(cstr(), SENSORS)
+    windows = [window_of(rows[:count], kalman) for count in range(BURN_IN_ROWS - 1, BURN_IN_ROWS + 4)]
+    assert [window is None for window in windows] == [True, True, True, False, False]
+    scan = GlrScan(cstr(), SENSORS, causes_of(cstr()))
+    assert all(scan.scan(window)[1].onset_min.size for window in windows if window is not None)
 
 
 def test_without_outliers_everything_counts(rows: list[Row]) -> None:

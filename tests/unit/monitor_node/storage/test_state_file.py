@@ -12,7 +12,7 @@ from monitor_node.node import MonitorNode
 from monitor_node.storage.state_files import CLAIM
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode, encode_message
-from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, Health
+from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, Health, ListAlarms
 from reactorwatch.errors import InputError
 
 from ..samples import leaking_run, samples
@@ -59,6 +59,27 @@ def test_it_is_stored_when_it_is_due_and_something_was_received(config: MonitorC
     before = path.stat().st_mtime_ns
     node.on_tick(70 * SECOND)
     assert path.stat().st_mtime_ns == before
+
+
+def test_a_command_that_only_asks_stores_nothing_and_one_that_changes_something_is_stored_at_once(
+    config: MonitorConfig, leak: list[Encoded]
+) -> None:
+    node, path = start_node(config, 0), Path(str(config.state_file))
+    for message in leak[:60]:
+        node.on_message(message, 0)
+    node.on_tick(60 * SECOND)
+    stored = []
+    for name, command in (
+        ("list_alarms", ListAlarms()),
+        ("baseline", BaselineCommand(what="list")),
+        ("baseline", BaselineCommand(what="relearn", by="ada", why="cleaned")),
+    ):
+        before = path.stat().st_ino
+        reply, _ = node.on_command(Encoded(f"reactor/cstr/command/{name}", *encode_message(command)), 61 * SECOND)
+        assert reply is not None
+        assert reply.accepted, reply.text
+        stored.append(path.stat().st_ino != before)
+    assert stored == [False, False, True]
 
 
 def test_a_change_of_an_alarm_is_stored_before_it_is_published(config: MonitorConfig, leak: list[Encoded]) -> None:
