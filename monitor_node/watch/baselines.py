@@ -19,7 +19,7 @@ from monitor_node.learn.model_update import (
     is_command,
 )
 from monitor_node.learn.training import Training
-from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding, equations_text, read_equations
+from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding, equations_text, read_equations
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.evaluation import Evaluation
 from monitor_node.watch.operation import Operation
@@ -70,15 +70,13 @@ class Baselines:
 
     def _keep(self) -> EvaluationMemory:
         """The baseline in force, as it is kept."""
-        kept = copy_of(self._evaluation.collect_memory())
-        kept.change = self.update.baseline
-        return kept
+        return copy_of(self._evaluation.collect_memory())
 
     def _judge_by(self, kept: EvaluationMemory) -> None:
         """Judge by a baseline that was replaced; its filters and charts start with the next row."""
         memory = copy_of(kept)
         memory.suspicion = None
-        self._evaluation.resume(memory, self._equations(memory.change), follows=False)
+        self._evaluation.resume(memory, self.equations_of(memory), follows=False)
         self._evaluation.restart_charts()
 
     def _stop_judging(self) -> None:
@@ -163,7 +161,7 @@ class Baselines:
         if trained is None:
             evaluation.notes.append("the identified models predict the training better; the baseline stays as it is")
             return None
-        self.modes.reference = trained.reference.kind
+        self.modes.reference, evaluation.memory.change = trained.reference.kind, change
         evaluation.start(trained, period_ns, units, again=True)
         self._check_training(trained.rows)
         if evaluation.memory.rows_watched:  # the filter stands at the end of the training, and rows have come since
@@ -181,9 +179,11 @@ class Baselines:
     @property
     def equations(self) -> ProcessModel | None:
         """Process model in force: as given, or as the change of the baseline has it; None: there is none."""
-        return self._equations(self.update.baseline)
+        return self.equations_of(self._evaluation.memory)
 
-    def _equations(self, change: Baseline | None) -> ProcessModel | None:
+    def equations_of(self, memory: EvaluationMemory) -> ProcessModel | None:
+        """Process model of a baseline; None: there is none. The newest change may be of another mode."""
+        change = memory.change
         return self._model if change is None or not change.model else read_equations(change.model)
 
     def schedule(self, command: BaselineCommand) -> Baseline:
@@ -206,7 +206,10 @@ class Baselines:
         accepted = memory.incident if change.what == ACCEPT else None
         memory.incident = self.update.rows = None
         if self._evaluation.reference is not None:
-            kept[_change_of(self.update.baseline).id] = self._keep()
+            replaced = self._keep()
+            replaced.change = _change_of(replaced.change)
+            replaced.change.id = _change_of(self.update.baseline).id  # its own may be that of another mode's baseline
+            kept[replaced.change.id] = replaced
         self.kept = list(kept.values())[-MOST_KEPT:]
         if restored is not None:
             change.model = _change_of(restored.change).model
@@ -216,7 +219,7 @@ class Baselines:
             self.training.restart(change.time_ns)
             if accepted is not None:
                 self.training.take_over(accepted)
-        self.update.baseline = change
+        self.update.baseline = self._evaluation.memory.change = change
         if self._evaluation.reference is None:
             self.modes.is_judged, self.modes.is_resumed = True, False
 
@@ -246,6 +249,9 @@ class Baselines:
         modes, training, evaluation = self.modes, self.training, self._evaluation
         evaluation.leave_ordinary()
         evaluation.memory.incident, began_ns = None, training.memory.began_ns
+        if (rows := self.update.rows) is not None:  # its finding would change the baseline of the next mode
+            self.on_finding(Finding(rows.times_ns[0], FAILED, "the plant changed its mode before the end"))
+            self.update.rows = None
         is_watched = evaluation.reference is not None
         if modes.is_judged and (is_watched or training.memory.rows.times):
             left = modes.others[_key_of(modes.mode)] = self._keep()
@@ -263,7 +269,7 @@ class Baselines:
         modes.is_resumed = known is not None and modes.is_learned
         training.restart(began_ns)
         if known is not None and known.training is not None:
-            training.memory.rows = known.training
+            training.memory.rows, evaluation.memory.change = known.training, known.change
             self._models.resume(known.predictors, follows=False)
         if not modes.is_learned or (known is not None and training.is_enough()):
             return

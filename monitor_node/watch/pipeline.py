@@ -154,7 +154,7 @@ class PlantPipeline:
         baselines.modes, baselines.kept, update.baseline = memory.modes, memory.kept, memory.change
         update.changes.extend(memory.commands)
         update.rows = memory.undiagnosed if self._config.diagnose_training else None
-        self.evaluation.resume(memory.evaluation, baselines.equations, now_ns, follows=True)
+        self.evaluation.resume(memory.evaluation, baselines.equations_of(memory.evaluation), now_ns, follows=True)
 
     def resume_from_alarms(self) -> None:
         """Follow alarms that were set from outside."""

@@ -38,7 +38,7 @@ class EvaluationMemory(Memory, kw_only=True):
         rows_watched: number of evaluated rows.
         until_drift: number of rows until the next drift point.
         incident: rows since an alarm without a known cause is active; None: there is none.
-        change: change of the baseline by which it came into force, once it is replaced; None: the first training.
+        change: change of the baseline by which it came into force; None: the first training.
         training: rows of its training, of a mode that was left before the end; None else.
     """
 
@@ -93,7 +93,7 @@ class PipelineMemory(Memory):
         evaluation: memory of what judges the rows.
         modes: memory of the modes.
         kept: baselines that can be restored, the oldest first.
-        change: change of the baseline in force; None: there was none.
+        change: newest change of a baseline, of any mode; None: there was none.
         undiagnosed: rows of the training while its diagnosis is pending; None: it is not.
         commands: changes by accepted commands that hold from the next row on, in order.
     """
