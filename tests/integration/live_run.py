@@ -119,6 +119,23 @@ class LiveRun:
         with self._changed:
             assert self._changed.wait_for(condition, WITHIN_S), f"not within {WITHIN_S:g} s"
 
+    def wait_until_recorded(self) -> None:
+        """Wait until the recorder has written the alarms received here; it can recover what it missed from a live node.
+
+        The recording is read with each report of the monitor's health.
+        """
+        with self._changed:
+            received, health = _changes(self.alarms), self.health
+
+        def is_recorded() -> bool:
+            nonlocal health
+            if health is self.health:
+                return False
+            health = self.health
+            return set(received) <= set(self._alarms_in(self.folder))
+
+        self.wait(is_recorded)
+
     def end(self, plant: "subprocess.Popen[bytes]") -> None:
         """End the plant, wait until the monitor has judged its last row, and end the others."""
         self.wait_until(self._duration_min)
@@ -129,7 +146,10 @@ class LiveRun:
 
     def recorded_alarms(self) -> list[Change]:
         """Changes of alarms in the recording; messages repeated after a restart count once."""
-        recorded = [decode(item.payload, item.encoding) for item in Recording(self.recording).messages({keys.ALARM})]
+        return self._alarms_in(self.recording)
+
+    def _alarms_in(self, path: Path) -> list[Change]:
+        recorded = [decode(item.payload, item.encoding) for item in Recording(path).messages({keys.ALARM})]
         return list(dict.fromkeys(_changes(item for item in recorded if isinstance(item, Alarm))))
 
     def expected_alarms(self) -> list[Change]:

@@ -35,6 +35,7 @@ def test_three_kills_change_no_alarm(tmp_path: Path) -> None:
                 run.wait_until(KILLS_MIN[kill])
             else:
                 run.wait(lambda: looks(run) >= LOOKS)
+                run.wait_until_recorded()
             run.kill("monitor", monitor)
             monitor = run.start("monitor")
             assert "the monitor resumes from it" in (tmp_path / "monitor.log").read_text(encoding="utf-8")
