@@ -62,7 +62,7 @@ def run(
     def start() -> MonitorNode:
         if state is not None:
             make_folder(state, "--state")
-        return MonitorNode(config, time.time_ns(), fleet, metrics, token)
+        return MonitorNode(config, time.time_ns(), fleet, metrics, token, kinds)
 
     is_single = fleet.plants is None
     kinds = load_kinds(fleet.share_promise(config), fleet)  # errors in the settings are raised before it joins
@@ -118,7 +118,9 @@ def watch(node: MonitorNode, bus: Bus, stop: StopSignal, history_s: float = 0.0)
         on_backlog=partial(setattr, node, "is_behind"),
     )
     samples = keys.samples_of(node.expression)
-    loop.subscribe(samples, history_s=history_s, on_history_end=node.on_history_end, on_batch=node.on_messages)
+    # Batches cost a fleet less time, and each sample up to 5 ms, which the alarms of one plant need not wait.
+    on_batch = None if node.is_single else node.on_messages
+    loop.subscribe(samples, history_s=history_s, on_history_end=node.on_history_end, on_batch=on_batch)
     loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
     loop.accept_commands(*(f"{node.expression}/{keys.COMMAND}/{name}" for name in COMMANDS))
     node.declare_tokens(bus)

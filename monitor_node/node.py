@@ -12,7 +12,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker
 from monitor_node.fleet.config import ONE_PLANT, FleetConfig, parse_shard
-from monitor_node.fleet.monitor import FleetMonitor, load_kinds
+from monitor_node.fleet.monitor import FleetMonitor, PlantKind, load_kinds
 from monitor_node.health import NODE, OtherMonitors
 from monitor_node.learn.training_diagnosis import read_equations
 from monitor_node.storage.state_files import RESUMED, StateStore
@@ -61,12 +61,14 @@ class MonitorNode(FleetMonitor):
         fleet: settings of the fleet; by default the one plant of the monitor's settings is watched.
         metrics: metrics of each plant; None: there are none.
         token: own instance token; empty: a new one, see `instance_token`.
+        kinds: kinds of plants, as `load_kinds` returned them; None: they are loaded.
 
     Raises:
         InputError: the settings are inconsistent, or a file of the settings or the folder of states is unusable.
 
     Attributes:
         expression: key expression of the plants.
+        is_single: True for the monitor of one plant.
         resumed: True if the monitor of one plant resumed from a stored state.
         token: instance token of this node.
         preparation: steps that prepare the end of the training and the search for causes; None: there are none left.
@@ -79,13 +81,14 @@ class MonitorNode(FleetMonitor):
         fleet: FleetConfig = ONE_PLANT,
         metrics: Metrics | None = None,
         token: str = "",
+        kinds: tuple[PlantKind, ...] | None = None,
     ) -> None:
         self._fleet, self.metrics = fleet, metrics
         self.expression = plants_of(config, fleet)
         self.token = token or instance_token(config, fleet)
         self.preparation: Iterator[None] | None = None
         self.resumed = False
-        self._is_single = fleet.plants is None
+        self.is_single = fleet.plants is None
         self._bus: Bus | None = None
         self._tokens: set[str] = set()
         self._worker = DiagnosisWorker()
@@ -102,15 +105,15 @@ class MonitorNode(FleetMonitor):
         self._kpi_keys: set[str] = set()  # keys of KPIs that are not empty
         self._evicted_logged, self._excess_logged = 0, False
         super().__init__(
-            load_kinds(fleet.share_promise(config), fleet),
+            load_kinds(fleet.share_promise(config), fleet) if kinds is None else kinds,
             start_ns,
             parse_shard(fleet.shard),
-            points=fleet.points or self._is_single,
-            passes=InputError if self._is_single else (),
+            points=fleet.points or self.is_single,
+            passes=InputError if self.is_single else (),
             on_watch=self._on_watched,
             diagnose=self._worker.submit,
         )
-        if self._is_single and config.state_file is not None:
+        if self.is_single and config.state_file is not None:
             self._states = StateStore(Path(config.state_file), config.plant)
         elif fleet.state is not None:
             self._states = StateStore(make_folder(Path(fleet.state), "--state"))
@@ -122,7 +125,7 @@ class MonitorNode(FleetMonitor):
     # --- plants ----------------------------------------------------------------------------------------------
 
     def _plants_at_start(self, config: MonitorConfig) -> list[str]:
-        if self._is_single:
+        if self.is_single:
             return [config.plant]
         stored = [] if self._states is None else self._states.plants
         return [plant for plant in stored if keys.matches(self.expression, f"{keys.ROOT}/{plant}")]
@@ -147,7 +150,7 @@ class MonitorNode(FleetMonitor):
 
     def _on_watched(self, plant: str, watched: bool) -> None:
         """Show a plant's token and its metrics, or withdraw them."""
-        if not self._is_single:
+        if not self.is_single:
             log.info("watching" if watched else "no longer watching", plant=plant)
         if watched:
             if self.metrics is not None:
@@ -167,7 +170,7 @@ class MonitorNode(FleetMonitor):
     def on_history_end(self) -> None:
         """See `Monitor.on_history_end`; the history of a plant that is cut off comes once its publishers are there."""
         for monitor in self._monitors.values():
-            if self._is_single or not monitor.awaits_samples:
+            if self.is_single or not monitor.awaits_samples:
                 monitor.on_history_end()
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
@@ -205,11 +208,11 @@ class MonitorNode(FleetMonitor):
             for plant, finding in self._worker.pop_findings():
                 log.info("training diagnosed", plant=plant, verdict=finding.verdict)
                 self.on_finding(plant, finding)
-                if finding.equations and self._is_single:
+                if finding.equations and self.is_single:
                     extended = stage.preparation(self._monitors[plant].config, read_equations(finding.equations))
                     self.preparation = chain(self.preparation or (), extended)
         publications = self._keep(super().on_tick(now_ns), now_ns)
-        if self._is_single or now_ns >= self._report_ns:
+        if self.is_single or now_ns >= self._report_ns:
             self._report_ns = now_ns + LOG_INTERVAL_NS
             self._log_notes()
             self._log_rejects(now_ns)
@@ -241,11 +244,11 @@ class MonitorNode(FleetMonitor):
         try:
             line = self._states.load(monitor)
         except InputError as error:
-            if self._is_single:
+            if self.is_single:
                 self._states.close()
                 raise
             line = str(error)
-        if self._is_single:
+        if self.is_single:
             log.info(line, plant=monitor.config.plant)
             self.resumed = monitor.rows > 0
             self._repeated = monitor.unconfirmed if self.resumed else []
@@ -271,11 +274,11 @@ class MonitorNode(FleetMonitor):
     def _store(self, states: StateStore, plants: list[str]) -> None:
         """Store the states of plants; that of one plant is on the disk when this returns, or could not be written."""
         for plant in plants:
-            if self._is_single or self.is_worth_storing(plant):
+            if self.is_single or self.is_worth_storing(plant):
                 monitor = self._monitors[plant]
                 states.put(plant, monitor.to_bytes())
                 self._stored_at[plant] = monitor.memory.received
-        if self._is_single and plants and not self._count_failures(states):
+        if self.is_single and plants and not self._count_failures(states):
             self._logged.clear()
 
     def _count_failures(self, states: StateStore) -> int:
@@ -302,9 +305,9 @@ class MonitorNode(FleetMonitor):
             publications, self._repeated = self._repeated + publications, []
         if publications:
             publications = self._log(publications)
-        if self._is_single:
+        if self.is_single:
             self._log_notes()
-        if self._is_single and self._states is not None:
+        if self.is_single and self._states is not None:
             (monitor,) = self._monitors.values()
             repeatable = [item for item in publications if not isinstance(item.message, Health)]
             monitor.unconfirmed = repeatable or monitor.unconfirmed
@@ -318,12 +321,12 @@ class MonitorNode(FleetMonitor):
         kept, is_checked = list[Publication](), False
         for publication in publications:
             message = publication.message
-            if isinstance(message, AlarmKpis) and not self._is_single and publication.key not in self._kpi_keys:
+            if isinstance(message, AlarmKpis) and not self.is_single and publication.key not in self._kpi_keys:
                 if is_empty(message):
                     continue
                 self._kpi_keys.add(publication.key)
             kept.append(publication)
-            if isinstance(message, Health) and self._is_single:
+            if isinstance(message, Health) and self.is_single:
                 message.waiting_for = next(iter(self._logged.values()), "")
             topic = keys.parse(publication.key) if isinstance(message, Alarm | Baseline | Incident) else None
             plant = topic.plant if topic is not None else ""

@@ -24,7 +24,7 @@ def double(value):
 
 
 def compute(folder: Path, module: str) -> str:
-    """What the kernel computes with a helper in a module of this name."""
+    """Result of the kernel with a helper in a module of this name."""
     (folder / f"{module}.py").write_text(HELPER, encoding="utf-8")
     (folder / "names.py").write_text(f"from {module} import double\n", encoding="utf-8")
     done = subprocess.run([sys.executable, "kernel.py"], cwd=folder, capture_output=True, text=True, check=False)

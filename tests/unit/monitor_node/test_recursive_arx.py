@@ -59,7 +59,7 @@ def test_its_prediction_is_that_of_its_newest_parameters(
 
 
 def adapted(monitor: Monitor) -> bytes:
-    """What the adaptive model has learned."""
+    """Memory of the recursive least squares of the adaptive model."""
     return monitor.pipeline.models.predictors[0].rls.memory.to_bytes()
 
 

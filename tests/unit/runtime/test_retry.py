@@ -60,7 +60,7 @@ STARTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "a fleet's folder to list": ("iterdir", StateStore),
     "a monitor's state": ("read_bytes", lambda path: MonitorNode(MonitorConfig(state_file=str(path / "state")), 0)),
 }
-"""What nodes need of a folder at their start: the call of the system that is refused, and who makes it."""
+"""Calls of the system that a node makes on a folder at its start, and the function that makes each."""
 
 
 @pytest.mark.parametrize("number", PASSING + LASTING, ids=errno.errorcode.get)
