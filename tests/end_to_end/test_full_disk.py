@@ -13,6 +13,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.runtime.bus_zenoh import ZenohBus
+from tests.running import mount_small_disk
 
 from .conftest import PATIENCE_S, REACTORWATCH, Command, Start, WaitAlive
 
@@ -79,13 +80,8 @@ def test_a_full_disk_is_listed_with_the_other_alarms_and_can_be_acknowledged(
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A folder on a disk of 300 kB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(folder)]
-    if subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("needs the right to mount a disk of its own")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
+    with mount_small_disk(tmp_path / "disk", "300k") as folder:
+        yield folder
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import LOOPBACK, free_endpoint
 from reactorwatch.runtime.start import GONE_WITHIN_S
+from tests.running import mount_small_disk
 
 from .conftest import PATIENCE_S, REACTORWATCH, WaitAlive
 
@@ -203,13 +204,8 @@ def test_a_stop_ends_the_wait_for_a_folder_at_once(
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    folder = tmp_path / "out"
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(folder)]
-    if subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("needs the right to mount a disk of its own")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
+    with mount_small_disk(tmp_path / "out", "64k") as folder:
+        yield folder
 
 
 @pytest.mark.slow
