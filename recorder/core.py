@@ -10,7 +10,6 @@ must stay visible.
 
 from collections import Counter
 from collections.abc import Collection, Mapping
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import structlog
@@ -19,15 +18,15 @@ from google.protobuf.message import Message
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.alarm_states import CODES, Event, State, next_state
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode, encoding_of
 from reactorwatch.contract.commands import check_signature, decode_command
 from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from reactorwatch.version import version
-from recorder import RecordedMessage
+from recorder import Channel, StoredMessage
 from recorder.columns.samples import SequenceCounter, content_of
-from recorder.keep import Channel
+from recorder.keep import channel_of
 
 log = structlog.get_logger()
 
@@ -45,44 +44,35 @@ COMMANDS: Mapping[str, type[Message]] = {
 """Message type by command."""
 
 NODE = "recorder"
-MAX_COUNTERS = 60_000
-"""Keys of samples whose sequence numbers are checked; beyond it the least recently used key is evicted."""
+MAX_TRACKED = 65_536
+"""Keys whose samples are counted, and those of other messages; beyond it the least recently used one is evicted."""
 NO_ROOM_NS = 60_000_000_000
 """The alarm about keys clears after this time without a rejected message."""
 LOG_INTERVAL_NS = 60_000_000_000
 MAX_QUOTE = 200
 """Characters of a key in a text: publishers control it."""
 
-_new = tuple.__new__  # builds a named tuple in half the time of its constructor, for each message
+_SAMPLE = encoding_of(messages.Sample)
 _NO_SAMPLE = messages.QUALITY_UNSPECIFIED  # which protobuf reads out of bytes that hold something else
 _LARGEST_COUNT = 2**64 - 1  # a sequence number may be any nonsense; the sum of what it skips must still fit its field
 
 
-class ReceivedMessage(NamedTuple):
-    """A received message with its decoded content.
+class ReceivedMessage(StoredMessage, gc=False):
+    """A received message with its decoded content; None if the payload is not what its encoding names."""
 
-    Attributes:
-        recorded: the message as it is recorded.
-        message: decoded content; None if the payload is not what its encoding names.
-        channel: channel of the file that the message belongs to.
-        sequence: sequence number of a sample; 0 for other messages.
-    """
-
-    recorded: RecordedMessage
     message: Message | None
+
+
+class TrackedKey(NamedTuple):
+    """Channel of the readable messages of a key and an encoding, and the counter of their samples, if they are some."""
+
     channel: Channel
-    sequence: int = 0
+    counter: SequenceCounter | None
 
 
 def fingerprint(key: str, payload: bytes) -> int:
     """Hash of a message; differs between processes."""
     return hash((key, payload))
-
-
-@lru_cache(maxsize=MAX_COUNTERS)
-def channel_of(key: str, encoding: str, is_readable: bool) -> Channel:
-    """Channel of the messages of a key and an encoding, readable or not."""
-    return Channel(key, encoding, is_readable and keys.parse(key) is not None)
 
 
 class Recorder:
@@ -114,7 +104,9 @@ class Recorder:
         self._refused: Counter[str] = Counter()
         self.is_stopped = False
         self.alarms = OwnAlarms(plant)
-        self._counters: dict[str, SequenceCounter] = {}  # by key, in the order of their last samples
+        self._tracked: dict[
+            tuple[str, str], TrackedKey
+        ] = {}  # by key and encoding, in the order of their last messages
         self._evicted = SequenceCounter()  # counts of evicted keys
         self._no_room_ns = 0  # time of the last rejected message
         self._logged_ns: int | None = None  # time of the last log line about it
@@ -140,25 +132,23 @@ class Recorder:
             decoded: Any = decode(payload, encoding)
         except DecodeError as error:
             self._refused[error.reason] += 1
-            recorded = RecordedMessage(key, payload, encoding, received_ns, received_ns)
-            return ReceivedMessage(recorded, None, channel_of(key, encoding, False))
-        channel = channel_of(key, encoding, True)
+            channel = channel_of(key, encoding, is_readable=False)
+            return ReceivedMessage(channel, 0, received_ns, received_ns, payload, None)
+        channel, counter = self._track(key, encoding)
         if not channel.is_product:
             self._refused["key"] += 1
-        sequence = 0
-        if isinstance(decoded, messages.Sample):
+        if type(decoded) is not messages.Sample:
+            time_ns, sequence = getattr(decoded, "time_ns", received_ns), 0
+        else:
             time_ns, sequence = decoded.time_ns, decoded.sequence
             if time_ns >= 0 and decoded.quality == _NO_SAMPLE:
                 self._refused["payload"] += 1
-            elif time_ns >= 0 and channel.is_product:
-                self._counter(key).update(sequence, time_ns)
-        else:
-            time_ns = getattr(decoded, "time_ns", received_ns)
+            elif time_ns >= 0 and counter is not None:
+                counter.update(sequence, time_ns)
         if time_ns < 0:  # before 1970, which MCAP cannot represent
             self._refused["time"] += 1
             time_ns = received_ns
-        recorded = _new(RecordedMessage, (key, payload, encoding, received_ns, time_ns, False))
-        return _new(ReceivedMessage, (recorded, decoded, channel, sequence))
+        return ReceivedMessage(channel, sequence, received_ns, time_ns, payload, decoded)
 
     def _count_recorded(self, message: Encoded) -> None:
         """Count a sample that an earlier file holds, so that those around it in this file do not count as lost."""
@@ -167,25 +157,24 @@ class Recorder:
         sample = content_of(message)
         if not isinstance(sample, messages.Sample) or sample.quality == _NO_SAMPLE or sample.time_ns < 0:
             return
-        if channel_of(message.key, message.encoding, True).is_product:
-            self._counter(message.key).update(sample.sequence, sample.time_ns)
+        if (counter := self._track(message.key, message.encoding).counter) is not None:
+            counter.update(sample.sequence, sample.time_ns)
 
-    def _counter(self, key: str) -> SequenceCounter:
-        """Counter of a key, which becomes the most recently used one."""
-        counter = self._counters.pop(key, None)
-        if counter is None:
-            counter = self._new_counter()
-        self._counters[key] = counter
-        return counter
-
-    def _new_counter(self) -> SequenceCounter:
-        """Counter of a new key, for which the least recently used one is evicted if there are too many."""
-        if len(self._counters) >= MAX_COUNTERS:
-            evicted = self._counters.pop(next(iter(self._counters)))
-            self._evicted.lost += evicted.lost
-            self._evicted.duplicated += evicted.duplicated
-            self._evicted.out_of_order += evicted.out_of_order
-        return SequenceCounter()
+    def _track(self, key: str, encoding: str) -> TrackedKey:
+        """Channel and counter of a key and an encoding, which become the most recently used ones."""
+        name = key, encoding
+        tracked = self._tracked.pop(name, None)
+        if tracked is None:
+            if len(self._tracked) >= MAX_TRACKED:
+                evicted = self._tracked.pop(next(iter(self._tracked))).counter
+                if evicted is not None:
+                    self._evicted.lost += evicted.lost
+                    self._evicted.duplicated += evicted.duplicated
+                    self._evicted.out_of_order += evicted.out_of_order
+            channel = channel_of(key, encoding, is_readable=True)
+            tracked = TrackedKey(channel, SequenceCounter() if channel.is_product and encoding == _SAMPLE else None)
+        self._tracked[name] = tracked
+        return tracked
 
     def _is_recorded(self, key: str, payload: bytes, now_ns: int) -> bool:
         """True if an earlier file holds the message; each fingerprint matches once."""
@@ -215,7 +204,7 @@ class Recorder:
         """Count a message whose key has no channel in the file, and raise the alarm."""
         self._refused["too many keys"] += 1
         self._no_room_ns = now_ns
-        key = received.recorded.key[:MAX_QUOTE]
+        key = received.channel.key[:MAX_QUOTE]
         kind = "of this software" if received.channel.is_product else "of other programs"
         if self._logged_ns is None or now_ns - self._logged_ns >= LOG_INTERVAL_NS:
             self._logged_ns = now_ns
@@ -253,7 +242,8 @@ class Recorder:
             phase: phase to report; empty derives it from the state.
         """
         phase = phase or ("not recording" if self.is_stopped else "recording")
-        checks = [self._evicted, *self._counters.values()]
+        counters = (tracked.counter for tracked in self._tracked.values())
+        checks = [self._evicted, *(counter for counter in counters if counter is not None)]
         self._reports += 1
         health = messages.Health(
             time_ns=now_ns,
