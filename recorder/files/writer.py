@@ -77,6 +77,7 @@ class RecordingWriter:
         with self._write_errors():
             self._stream = open_part(self._part)
         self._writer = Writer(self._stream)  # type: ignore[arg-type]
+        self._add_message = self._writer.add_message
         self._writer.start(profile, f"reactorwatch {this_build()}")
         build = {} if "version" in metadata else build_metadata()  # a copy keeps that of its source
         self._writer.add_metadata(METADATA, {**build, **metadata})
@@ -119,7 +120,7 @@ class RecordingWriter:
         if number is None:
             number = self._channels[channel] = self._register(channel)
         sequence = stored.sequence & MAX_SEQUENCE
-        self._writer.add_message(number, stored.log_time_ns, stored.payload, stored.publish_time_ns, sequence)
+        self._add_message(number, stored.log_time_ns, stored.payload, stored.publish_time_ns, sequence)
         self._in_chunk += 1
         if self._stream.chunk_end != self._chunk_end:  # the chunk was full
             self._note_chunk()
