@@ -26,8 +26,8 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from reactorwatch.version import version
 from recorder import Channel, StoredMessage
-from recorder.columns.samples import SequenceCounter
 from recorder.keep import channel_of
+from recorder.samples import SequenceCounter
 
 log = structlog.get_logger()
 

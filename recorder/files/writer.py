@@ -24,11 +24,11 @@ from reactorwatch.contract.codec import encoding_of, message_type
 from reactorwatch.errors import InputError
 from reactorwatch.version import build_metadata, this_build
 from recorder import Channel, RecordedMessage, StoredMessage
-from recorder.columns.samples import content_of
 from recorder.files.metadata import METADATA
 from recorder.files.part_file import PART, PartFile, is_locked
 from recorder.files.reader import LATCHED, StoredChannel
 from recorder.keep import MAX_CHANNELS, channel_of
+from recorder.samples import content_of
 
 MAX_SEQUENCE = 2**32 - 1
 """Largest sequence number in MCAP; larger ones wrap around to 0."""
