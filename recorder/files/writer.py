@@ -24,11 +24,11 @@ from reactorwatch.contract.codec import encoding_of, message_type
 from reactorwatch.errors import InputError
 from reactorwatch.version import build_metadata, this_build
 from recorder import Channel, RecordedMessage, StoredMessage
-from recorder.columns.samples import content_of
 from recorder.files.metadata import METADATA
 from recorder.files.part_file import PART, PartFile, is_locked
 from recorder.files.reader import LATCHED, StoredChannel
 from recorder.keep import MAX_CHANNELS, channel_of
+from recorder.samples import content_of
 
 MAX_SEQUENCE = 2**32 - 1
 """Largest sequence number in MCAP; larger ones wrap around to 0."""
@@ -77,6 +77,7 @@ class RecordingWriter:
         with self._write_errors():
             self._stream = open_part(self._part)
         self._writer = Writer(self._stream)  # type: ignore[arg-type]
+        self._add_message = self._writer.add_message
         self._writer.start(profile, f"reactorwatch {this_build()}")
         build = {} if "version" in metadata else build_metadata()  # a copy keeps that of its source
         self._writer.add_metadata(METADATA, {**build, **metadata})
@@ -119,7 +120,7 @@ class RecordingWriter:
         if number is None:
             number = self._channels[channel] = self._register(channel)
         sequence = stored.sequence & MAX_SEQUENCE
-        self._writer.add_message(number, stored.log_time_ns, stored.payload, stored.publish_time_ns, sequence)
+        self._add_message(number, stored.log_time_ns, stored.payload, stored.publish_time_ns, sequence)
         self._in_chunk += 1
         if self._stream.chunk_end != self._chunk_end:  # the chunk was full
             self._note_chunk()

@@ -26,7 +26,7 @@ def test_an_entry_has_the_time_of_receipt_and_that_of_its_sample() -> None:
     message = encoded(messages.Sample(time_ns=77, value=1.0, quality=GOOD), received_ns=500)
     kept = Recorder("cstr", 0).on_message(message, 600)
     assert kept is not None
-    assert kept.message is not None
+    assert kept.channel.is_readable
     assert kept.recorded_message == RecordedMessage(KEY, message.payload, encoding_of(messages.Sample), 500, 77)
 
 
@@ -54,7 +54,7 @@ def test_what_cannot_be_read_is_kept_as_it_is_and_counted_by_reason() -> None:
         Encoded("reactor/cstr/sample/T", b"", encoding_of(messages.Sample)),
     ]
     kept = [recorder.on_message(message, 50) for message in strange]
-    assert [item is not None and item.message is not None for item in kept] == [False, False, True, True, True]
+    assert [item is not None and item.channel.is_readable for item in kept] == [False, False, True, True, True]
     for message, item in zip(strange, kept, strict=True):
         assert item is not None
         assert item.recorded_message[:3] == message[:3]
@@ -65,7 +65,7 @@ def test_what_cannot_be_read_is_kept_as_it_is_and_counted_by_reason() -> None:
 
 
 def test_the_counts_of_keys_that_are_followed_no_longer_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recorder.core.MAX_TRACKED", 3)
+    monkeypatch.setattr("recorder.core.MAX_COUNTERS", 3)
     recorder = Recorder("cstr", 0)
     for number in range(10):
         for sequence in (0, 2, 2):
