@@ -1,4 +1,4 @@
-"""Of the history of its plant a resumed monitor takes each sample that it had not processed, and no other."""
+"""A resumed monitor takes each sample of its plant's history that it had not processed, and no other."""
 
 from copy import deepcopy
 

@@ -126,7 +126,7 @@ def test_rejects_are_reported_by_reason_at_most_once_a_minute() -> None:
     assert rejects.total == 4
 
 
-def test_an_example_is_truncated_at_300_characters_and_says_so() -> None:
+def test_an_example_of_more_than_300_characters_is_truncated_and_ends_in_three_dots() -> None:
     for length, shown in ((300, "x" * 300), (301, "x" * 300 + "...")):
         rejects = RejectCounter()
         rejects.add("unit", "x" * length)
