@@ -57,7 +57,6 @@ class RecorderNode:
         self._next_health_ns = self._next_retry_ns = start_ns
         missed = files.find_missed_intervals(self._black_box, start_ns)
         files.start_file((), start_ns)
-        files.recover_orphans()
         for interval in missed:
             files.save_black_box(interval)
 
