@@ -139,11 +139,13 @@ class RecorderNode:
             return []
         channels, channel = self._channels, received.channel
         try:
-            channels_full = not channels.has(channel) and channels.needs_new_file(channel, now_ns)
-            if channels_full or self._rotation.is_full(now_ns, self._files.size_bytes):
+            if self._rotation.is_full(now_ns, self._files.size_bytes):
                 self._start_file(received.log_time_ns, now_ns)
             if not channels.admit(channel, now_ns):
-                return self._core.reject_key(received, now_ns)
+                if not channels.needs_new_file(channel, now_ns):
+                    return self._core.reject_key(received, now_ns)
+                self._start_file(received.log_time_ns, now_ns)
+                channels.admit(channel, now_ns)
             self._files.write(received)
         except InputError as error:
             self._core.count_unrecorded(1)

@@ -83,7 +83,6 @@ class RecordingFiles:
         self._limits = Limits(config.keep_mb * MB, config.keep_days * DAY_NS, config.keep_files)
         self._synced, self._open_part = config.fsync != "never", open_part
         self._find_process = PlantProcesses(config.processes).find
-        self._keys: set[str] = set()  # in the current file
         self._plants: set[str] = set()  # with samples in the current file
         self._writer: RecordingWriter | None = None
         self._black_boxes = names.folder / BLACK_BOX
@@ -138,7 +137,7 @@ class RecordingFiles:
         if self._previous:
             metadata["after"] = self._previous
         self._writer = RecordingWriter(path, metadata, self._open_part)
-        self._keys, self._plants = set(), set()
+        self._plants = set()
         self._file_count += 1
         self._previous = path.name
         for entry in latched:
@@ -156,15 +155,13 @@ class RecordingFiles:
             WriteError: the file cannot be written; see `abandon`.
         """
         assert self._writer is not None, "a file was started"
-        key = received.channel.key
-        if key not in self._keys:
-            self._describe_plant(key)
+        if not self._writer.has(received.channel):
+            self._describe_plant(received.channel.key)
         self._writer.append(received)
         self._last_ns = received.log_time_ns
 
     def _describe_plant(self, key: str) -> None:
         """Describe the process of a plant at the first of its samples in the file."""
-        self._keys.add(key)
         topic = keys.parse(key)
         if topic is None or topic.kind != keys.SAMPLE or topic.plant in self._plants:
             return

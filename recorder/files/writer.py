@@ -109,6 +109,10 @@ class RecordingWriter:
         channel = channel_of(key, encoding, is_readable=readable, latched=latched)
         self.append(StoredMessage(channel, sequence, log_time_ns, publish_time_ns, payload))
 
+    def has(self, channel: Channel) -> bool:
+        """True if the channel has a message in the file."""
+        return channel in self._channels
+
     def append(self, stored: StoredMessage) -> None:
         """Append a received message, or one of another file unchanged, with its channel.
 
