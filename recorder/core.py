@@ -120,12 +120,12 @@ class Recorder:
         if received_ns < self._last_ns:
             received_ns = self._last_ns
         self._last_ns = received_ns
-        counted = None
+        counters, counted = self._counters, None
         if encoding == _SAMPLE and len(payload) <= MAX_PAYLOAD:
-            counted = self._counters.pop(key, None) or self._new_counter(key)
+            counted = counters.pop(key, None) or self._new_counter(key)
         if counted is None:
             return None if is_recorded else self._receive_other(key, payload, encoding, received_ns)
-        self._counters[key] = counted
+        counters[key] = counted
         channel, counter = counted
         sample = self._sample
         try:

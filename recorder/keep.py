@@ -401,8 +401,8 @@ class ChannelBudget:
         return channel in self._received_ns or channel in self._others
 
     def needs_new_file(self, channel: Channel, now_ns: int) -> bool:
-        """True if this file has no free channel and the next one would."""
-        if not channel.is_product or channel in self._received_ns or not self._is_full:
+        """True if the next file would have a free channel for one that was not admitted to this file."""
+        if not channel.is_product:
             return False
         if 0 <= self._next_check_ns - now_ns <= CHECK_INTERVAL_NS:
             return False

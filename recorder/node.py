@@ -57,7 +57,6 @@ class RecorderNode:
         self._next_health_ns = self._next_retry_ns = start_ns
         missed = files.find_missed_intervals(self._black_box, start_ns)
         files.start_file((), start_ns)
-        files.recover_orphans()
         for interval in missed:
             files.save_black_box(interval)
 
@@ -140,11 +139,13 @@ class RecorderNode:
             return []
         channels, channel = self._channels, received.channel
         try:
-            channels_full = not channels.has(channel) and channels.needs_new_file(channel, now_ns)
-            if channels_full or self._rotation.is_full(now_ns, self._files.size_bytes):
+            if self._rotation.is_full(now_ns, self._files.size_bytes):
                 self._start_file(received.log_time_ns, now_ns)
             if not channels.admit(channel, now_ns):
-                return self._core.reject_key(received, now_ns)
+                if not channels.needs_new_file(channel, now_ns):
+                    return self._core.reject_key(received, now_ns)
+                self._start_file(received.log_time_ns, now_ns)
+                channels.admit(channel, now_ns)
             self._files.write(received)
         except InputError as error:
             self._core.count_unrecorded(1)

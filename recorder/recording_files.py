@@ -28,11 +28,11 @@ from recorder import RecordedMessage, StoredMessage
 from recorder.config import MB, RecorderConfig
 from recorder.core import ReceivedMessage, fingerprint
 from recorder.files.ages import Ages, BootClock, read_boot_clock
-from recorder.files.copies import Window, cut, find_orphans, list_damaged, repair
-from recorder.files.index import read_summary, span_ns
+from recorder.files.copies import Window, cut, delete_partial_copies, find_orphans, list_damaged, repair
+from recorder.files.index import span_ns
 from recorder.files.metadata import FILE_INDEX, GAP, PROCESS, gap_metadata, process_metadata
-from recorder.files.part_file import PART, PartFile, is_locked
-from recorder.files.reader import Reader, Wanted
+from recorder.files.part_file import PART, PartFile
+from recorder.files.reader import Reader, Wanted, select_topics
 from recorder.files.writer import RecordingWriter, check_free, part_of
 from recorder.keep import (
     DAY_NS,
@@ -83,19 +83,16 @@ class RecordingFiles:
         self._limits = Limits(config.keep_mb * MB, config.keep_days * DAY_NS, config.keep_files)
         self._synced, self._open_part = config.fsync != "never", open_part
         self._find_process = PlantProcesses(config.processes).find
-        self._keys: set[str] = set()  # in the current file
         self._plants: set[str] = set()  # with samples in the current file
         self._writer: RecordingWriter | None = None
-        self._black_boxes = BlackBoxFiles(names)
+        self._black_boxes = names.folder / BLACK_BOX
         self._tasks = BackgroundTasks()
         self._file_count = 0
         self._previous = ""
         self._last_ns = 0
-        self._abandoned: list[Path] = []
         first = names.first(datetime.now(UTC))
-        self._orphans = [] if not names.folder.is_dir() else find_orphans(names)
-        for copy in self._black_boxes.partial_copies():
-            copy.unlink(missing_ok=True)
+        self._orphans = [] if not names.folder.is_dir() else find_orphans(names)  # repaired once a file is started
+        delete_partial_copies(self._black_boxes, f"{names.stem}-")
         if not self._orphans:
             check_free(first)
         self._ages = Ages(names.folder / f".{names.stem}.ages", read_clock)
@@ -116,14 +113,8 @@ class RecordingFiles:
         """Free space on the disk of the folder."""
         return free_bytes(self._names.folder)
 
-    def recover_orphans(self) -> None:
-        """Repair files of a crashed recorder in the background."""
-        for part in self._orphans:
-            self._tasks.submit(f"recovering {part}", partial(repair, part))
-        self._orphans = []
-
     def start_file(self, latched: Iterable[RecordedMessage], now_ns: int) -> Path:
-        """Complete the current file and start the next one.
+        """Complete the current file and start the next one; orphans are repaired in the background.
 
         Args:
             latched: messages to repeat at its start.
@@ -146,15 +137,15 @@ class RecordingFiles:
         if self._previous:
             metadata["after"] = self._previous
         self._writer = RecordingWriter(path, metadata, self._open_part)
-        self._keys, self._plants = set(), set()
+        self._plants = set()
         self._file_count += 1
         self._previous = path.name
         for entry in latched:
             self._writer.write(entry)
         log.info("recording", file=str(path))
-        for part in self._abandoned:
+        for part in self._orphans:
             self._tasks.submit(f"recovering {part}", partial(repair, part))
-        self._abandoned = []
+        self._orphans = []
         return path
 
     def write(self, received: ReceivedMessage) -> None:
@@ -164,15 +155,13 @@ class RecordingFiles:
             WriteError: the file cannot be written; see `abandon`.
         """
         assert self._writer is not None, "a file was started"
-        key = received.channel.key
-        if key not in self._keys:
-            self._describe_plant(key)
+        if not self._writer.has(received.channel):
+            self._describe_plant(received.channel.key)
         self._writer.append(received)
         self._last_ns = received.log_time_ns
 
     def _describe_plant(self, key: str) -> None:
         """Describe the process of a plant at the first of its samples in the file."""
-        self._keys.add(key)
         topic = keys.parse(key)
         if topic is None or topic.kind != keys.SAMPLE or topic.plant in self._plants:
             return
@@ -201,9 +190,10 @@ class RecordingFiles:
         Returns:
             The intervals that have ended and were never copied.
         """
-        saved = self._black_boxes.spans()
+        saved = self._black_box_spans()
         ended = []
-        for stored in self._messages_since(now_ns - black_box.longest_ns, is_alarm) if black_box.longest_ns else ():
+        alarms = select_topics({keys.ALARM})
+        for stored in self._messages_since(now_ns - black_box.longest_ns, alarms) if black_box.longest_ns else ():
             at_ns = stored.log_time_ns
             if any(first_ns <= at_ns <= last_ns for first_ns, last_ns in saved):
                 continue
@@ -262,7 +252,7 @@ class RecordingFiles:
         saved = self._writer.abandon()
         part = part_of(self._writer.path)
         if part.exists():
-            self._abandoned.append(part)
+            self._orphans.append(part)
         self._writer = None
         return saved
 
@@ -301,8 +291,13 @@ class RecordingFiles:
         return [*self._complete_files(), *list_damaged(self._names)]
 
     def _copy_black_box(self, interval: AlarmInterval) -> None:
-        path = self._black_boxes.new(interval)
         raised = datetime.fromtimestamp(interval.raised_ns / 1e9, UTC)
+        self._black_boxes.mkdir(exist_ok=True)
+        name = f"{self._names.stem}-{raised:%Y%m%dT%H%M%SZ}-{interval.alarm.replace('/', '-')}"
+        path, number = self._black_boxes / f"{name}{ENDING}", 1
+        while path.exists():
+            number += 1
+            path = self._black_boxes / f"{name}-{number}{ENDING}"
         metadata = {**self._metadata, "alarm": interval.alarm, "raised": raised.isoformat(timespec="milliseconds")}
         window = Window((interval.from_ns, interval.to_ns))
         while True:
@@ -317,6 +312,17 @@ class RecordingFiles:
                 if all(source.exists() for source in sources):
                     raise  # else the file being written was completed meanwhile
         log.info("black box", file=str(path), alarm=interval.alarm, messages=count)
+
+    def _black_box_spans(self) -> list[tuple[int, int]]:
+        """First and last time of receipt of each saved interval; damaged files are skipped.
+
+        A killed recorder may leave an interval that was never copied: its alarms are in none of these.
+        """
+        spans = []
+        for path in self._black_boxes.glob(f"{self._names.stem}-*{ENDING}"):
+            with contextlib.suppress(InputError):
+                spans.append(span_ns(Reader(path).summary))
+        return spans
 
     def _delete_oldest(self, now_ns: int, protected_ns: int | None) -> None:
         writer = self._writer  # before the others are listed: its file may become one of them
@@ -342,52 +348,6 @@ def free_bytes(folder: Path) -> int:
     """Free space on the disk of a folder, which may have been deleted."""
     folder = folder.absolute()
     return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.is_dir())).free
-
-
-def is_alarm(topic: str) -> bool:
-    """True for the topic of an alarm."""
-    parsed = keys.parse(topic)
-    return parsed is not None and parsed.kind == keys.ALARM
-
-
-class BlackBoxFiles:
-    """Folder of one recorder's black box.
-
-    A killed recorder may leave an interval that was never copied. The next start finds it: its alarms are in the
-    recordings and in no file of the black box.
-
-    Args:
-        names: names of its recordings.
-    """
-
-    def __init__(self, names: FileNames) -> None:
-        self._folder = names.folder / BLACK_BOX
-        self._stem = names.stem
-
-    def new(self, interval: AlarmInterval) -> Path:
-        """Unused path for an interval; its folder is created."""
-        self._folder.mkdir(exist_ok=True)
-        raised = datetime.fromtimestamp(interval.raised_ns / 1e9, UTC)
-        name = f"{self._stem}-{raised:%Y%m%dT%H%M%SZ}-{interval.alarm.replace('/', '-')}"
-        path, count = self._folder / f"{name}{ENDING}", 1
-        while path.exists():
-            count += 1
-            path = self._folder / f"{name}-{count}{ENDING}"
-        return path
-
-    def spans(self) -> list[tuple[int, int]]:
-        """First and last time of receipt of each file; damaged files are skipped."""
-        spans = []
-        for path in self._folder.glob(f"{self._stem}-*{ENDING}"):
-            try:
-                spans.append(span_ns(read_summary(path)))
-            except InputError:
-                continue
-        return spans
-
-    def partial_copies(self) -> list[Path]:
-        """Unfinished copies of a killed recorder."""
-        return [copy for copy in self._folder.glob(f".{self._stem}-*.tmp{PART}") if not is_locked(copy)]
 
 
 class BackgroundTasks:

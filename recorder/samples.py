@@ -120,16 +120,17 @@ class SequenceCounter(GapTracker):
     def update(self, sequence: int, time_ns: int) -> RunTransition:
         """Count one sample."""
         points, expected = self.points, self.expected
-        if sequence == expected and time_ns > self.newest_ns and len(points) > 1:  # as nearly always, so written out
+        count = len(points)
+        if sequence == expected and time_ns > self.newest_ns and count > 1:  # as nearly always, so written out
             self.expected, self.newest_ns, self._checkpoint = sequence + 1, time_ns, None
             points.append((sequence, time_ns))
-            if len(points) > MAX_POINTS:
+            if count >= MAX_POINTS:
                 del points[1 : MAX_POINTS // 2 : 2]
             return SAME_RUN
         if expected is None:
             self.advance(sequence, time_ns)
             return SAME_RUN
-        if self._checkpoint is None and len(points) > 1:
+        if self._checkpoint is None and count > 1:
             number, then_ns = points[-2]
             self._checkpoint = self._checkpoint_at(number + 1, then_ns)
         if not self._continues(sequence, time_ns, expected) and self._follows_checkpoint(sequence, time_ns):

@@ -23,7 +23,7 @@ from recorder import RecordedMessage, StoredMessage
 from recorder.files.index import LATEST_NS
 from recorder.files.metadata import METADATA, own_metadata, parse_gap
 from recorder.files.part_file import PART, is_locked, lock_orphan
-from recorder.files.reader import Damage, Reader, read_start
+from recorder.files.reader import Damage, Reader, read_start, select_topics
 from recorder.files.recording import SourceFile, merge_messages, open_sources
 from recorder.files.writer import RecordingWriter
 from recorder.keep import LATCHED_KINDS, FileNames, LatchedMessages
@@ -112,7 +112,7 @@ def recover(path: Path, out: Path) -> RecoveryResult:
 
 
 def find_orphans(names: FileNames) -> list[Path]:
-    """Find files left by crashed recorders, and delete their unfinished copies.
+    """Find files left by crashed recorders, and delete their unfinished repairs.
 
     Raises:
         InputError: the named file is being written by another recorder.
@@ -125,10 +125,15 @@ def find_orphans(names: FileNames) -> list[Path]:
                 orphans.append(part)
             elif not names.dated:
                 raise InputError(f"recording {part.with_name(name)}: {part} is being written by another recorder")
-    for copy in names.folder.glob(f".{names.stem}*.tmp{PART}"):
+    delete_partial_copies(names.folder, names.stem)
+    return orphans
+
+
+def delete_partial_copies(folder: Path, start: str) -> None:
+    """Delete the unfinished copies of a killed recorder whose names have this start."""
+    for copy in folder.glob(f".{start}*.tmp{PART}"):
         if not is_locked(copy):
             copy.unlink(missing_ok=True)
-    return orphans
 
 
 def list_damaged(names: FileNames) -> list[Path]:
@@ -189,17 +194,12 @@ class Window(NamedTuple):
     received_ns: tuple[int, int]
     sampled_ns: tuple[int, int] | None = None
 
-    def contains(self, stored: StoredMessage) -> bool:
-        """True if a message is in the window."""
+    def side_of(self, stored: StoredMessage) -> int:
+        """-1 for a message before the window, 0 for one in it, 1 for one after it."""
+        (from_ns, to_ns), at_ns = self.received_ns, stored.log_time_ns
         if self.sampled_ns is not None and has_sample_time(stored.channel.key):
-            return self.sampled_ns[0] <= stored.publish_time_ns <= self.sampled_ns[1]
-        return self.received_ns[0] <= stored.log_time_ns <= self.received_ns[1]
-
-    def starts_after(self, stored: StoredMessage) -> bool:
-        """True if the window starts after a message."""
-        if self.sampled_ns is not None and has_sample_time(stored.channel.key):
-            return stored.publish_time_ns < self.sampled_ns[0]
-        return stored.log_time_ns < self.received_ns[0]
+            (from_ns, to_ns), at_ns = self.sampled_ns, stored.publish_time_ns
+        return (at_ns > to_ns) - (at_ns < from_ns)
 
 
 def sample_window(sources: Sequence[Path], from_ns: int, to_ns: int) -> Window:
@@ -242,7 +242,7 @@ def cut(
     count = 0
     with atomic_write(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(files)) as writer:
         for stored in merge_messages(files, *window.received_ns, tolerant=tolerant):
-            if stored.channel.latched or not window.contains(stored):
+            if stored.channel.latched or window.side_of(stored):
                 continue
             if not count:
                 for entry in _latched_messages(files, window, stored.log_time_ns):
@@ -264,16 +264,11 @@ def has_sample_time(topic: str) -> bool:
 def _latched_messages(sources: Sequence[SourceFile], window: Window, start_ns: int) -> list[RecordedMessage]:
     """Latched messages at the start of the window."""
     latched = LatchedMessages()
-
-    def is_latched(topic: str) -> bool:
-        parsed = keys.parse(topic)
-        return parsed is not None and parsed.kind in LATCHED_KINDS
-
     for source in sources:
         if source.span[0] > start_ns:
             continue
-        for stored in Reader(source.path, to_ns=start_ns, wanted=is_latched, tolerant=True):
-            if not (stored.channel.latched or window.starts_after(stored)):
+        for stored in Reader(source.path, to_ns=start_ns, wanted=select_topics(LATCHED_KINDS), tolerant=True):
+            if not (stored.channel.latched or window.side_of(stored) < 0):
                 continue
             recorded = stored.recorded_message
             if (content := content_of(recorded)) is not None:

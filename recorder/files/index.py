@@ -6,6 +6,7 @@ beyond it is decompressed.
 """
 
 import io
+import mmap
 import os
 import struct
 import zlib
@@ -20,7 +21,6 @@ from mcap.records import (
     Channel,
     Chunk,
     ChunkIndex,
-    Metadata,
     MetadataIndex,
     Schema,
     Statistics,
@@ -30,8 +30,6 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.input_file import wrap_read_errors
-from recorder.files.part_file import open_recording
 
 LATEST_NS = 2**64 - 1
 LARGEST_MB = "REACTORWATCH_LARGEST_CHUNK_MB"
@@ -63,35 +61,30 @@ DAMAGE = (
 """Errors that the library and its dependencies raise for damaged bytes."""
 
 
-def read_summary(path: Path) -> Summary:
-    """Index at the end of the file; empty if the file has none, which the format allows.
+def read_summary(path: Path, data: mmap.mmap) -> Summary:
+    """Index at the end of a file; empty if the file has none, which the format allows.
+
+    Args:
+        path: the file, for errors.
+        data: its content.
 
     Raises:
-        InputError: the file does not exist, is no MCAP file, is cut off, or its index is damaged.
+        InputError: it is no MCAP file, is cut off, or its index is damaged.
     """
-    with wrap_read_errors(path):
-        stream = open_recording(path)
-    with stream:
-        size = os.fstat(stream.fileno()).st_size
-        magic = stream.read(len(MCAP0_MAGIC))
-        if not magic:
-            raise InputError(f"{path}: expected an MCAP recording, got an empty file")
-        if magic != MCAP0_MAGIC[: len(magic)]:
-            raise foreign_file_error(path)
-        tail = FOOTER.size + len(MCAP0_MAGIC)
-        if size < len(MCAP0_MAGIC) + tail:
-            raise damage_error(path, "is cut off")
-        stream.seek(-tail, 2)
-        end = stream.read()
-        opcode, length, start, _, crc = FOOTER.unpack_from(end)
-        if not end.endswith(MCAP0_MAGIC) or opcode != Opcode.FOOTER or length != FOOTER.size - RECORD.size:
-            raise damage_error(path, "is cut off: the recorder was killed, or is still writing it")
-        if not start:
-            return Summary()
-        if start > size - tail:
-            raise damage_error(path, "its index is damaged")
-        stream.seek(start)
-        content = stream.read()
+    size, magic = len(data), data[: len(MCAP0_MAGIC)]
+    if magic != MCAP0_MAGIC[: len(magic)]:
+        raise foreign_file_error(path)
+    tail = FOOTER.size + len(MCAP0_MAGIC)
+    if size < len(MCAP0_MAGIC) + tail:
+        raise damage_error(path, "is cut off")
+    opcode, length, start, _, crc = FOOTER.unpack_from(data, size - tail)
+    if data[-len(MCAP0_MAGIC) :] != MCAP0_MAGIC or opcode != Opcode.FOOTER or length != FOOTER.size - RECORD.size:
+        raise damage_error(path, "is cut off: the recorder was killed, or is still writing it")
+    if not start:
+        return Summary()
+    if start > size - tail:
+        raise damage_error(path, "its index is damaged")
+    content = data[start:]
     if crc and zlib.crc32(content[: -len(MCAP0_MAGIC) - 4]) != crc:
         raise damage_error(path, "its index is damaged: the checksum differs")
     try:
@@ -119,27 +112,6 @@ def _parse_summary(content: bytes) -> Summary:
             case Statistics():
                 summary.statistics = record
     return summary
-
-
-def read_indexed_metadata(path: Path, summary: Summary) -> list[Metadata]:
-    """Metadata records that an index names.
-
-    Raises:
-        InputError: one cannot be read.
-    """
-    found: list[Metadata] = []
-    with wrap_read_errors(path), open_recording(path) as stream:
-        for item in summary.metadata_indexes:
-            stream.seek(item.offset)
-            try:
-                reader = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=item.length)
-                record = next(reader.records)
-            except DAMAGE as error:
-                raise damage_error(path, "its metadata cannot be read", error) from error
-            if not isinstance(record, Metadata):
-                raise damage_error(path, "its metadata cannot be read (the index names another record)")
-            found.append(record)
-    return found
 
 
 def is_indexed(summary: Summary) -> bool:

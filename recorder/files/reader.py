@@ -13,7 +13,8 @@ import mmap
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -27,6 +28,7 @@ from mcap.summary import Summary
 from mcap.well_known import MessageEncoding
 from mcap.writer import MCAP0_MAGIC
 
+from reactorwatch.contract import keys
 from reactorwatch.contract.codec import PREFIX
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import wrap_read_errors
@@ -41,7 +43,6 @@ from recorder.files.index import (
     decompress,
     foreign_file_error,
     is_indexed,
-    read_indexed_metadata,
     read_summary,
 )
 from recorder.files.part_file import PART, open_recording
@@ -50,6 +51,22 @@ LATCHED = "reactorwatch.repeated"
 """Key in the metadata of a channel of latched messages, see `RecordedMessage.latched`."""
 Wanted = Callable[[str], bool]
 """Returns True for topics to read."""
+
+
+def select_topics(kinds: Collection[str] | None, plant: str | None = None) -> Wanted:
+    """Topics of the product of some kinds, such as `keys.SAMPLE`, and of a plant; None for all of them.
+
+    Topics of other programs are selected only if nothing is excluded.
+    """
+
+    def is_selected(key: str) -> bool:
+        topic = keys.parse(key)
+        if topic is None:
+            return kinds is None and plant is None
+        return (kinds is None or topic.kind in kinds) and (plant is None or topic.plant == plant)
+
+    return is_selected
+
 
 _OPCODES = frozenset(Opcode)
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)  # a plain number compares faster
@@ -134,7 +151,7 @@ class Reader:
             self.damages.append(Damage(0, "the beginning cannot be read"))
             self._start = self._size if chunk is None else chunk
         try:
-            self.summary = read_summary(path)
+            self.summary = read_summary(path, self._bytes)
         except InputError:
             if not tolerant:
                 raise
@@ -204,6 +221,21 @@ class Reader:
                 yield Attachment.read(_stream(content))
             except DAMAGE as error:
                 self._add_damage(start, f"an attachment ({error})")
+
+    def read_indexed_metadata(self) -> None:
+        """Read the metadata records that the index names, without a pass.
+
+        Raises:
+            InputError: one cannot be read.
+        """
+        for item in self.summary.metadata_indexes:
+            opcode, end = self._record_at(item.offset)
+            try:
+                if opcode != Opcode.METADATA or end is None:
+                    raise ValueError("the index names another record")
+                self._messages(opcode, item.offset + RECORD.size, end)
+            except DAMAGE as error:
+                raise damage_error(self._path, "its metadata cannot be read", error) from error
 
     def _add_damage(self, at: int, what: str, *, is_end: bool = False) -> None:
         damage = Damage(at, what, is_end)
@@ -380,9 +412,9 @@ def metadata_records(path: Path) -> list[Metadata]:
     """
     reader = Reader(path, wanted=lambda _: False, tolerant=path.suffix == PART)
     if reader.summary.chunk_indexes or reader.summary.metadata_indexes:
-        return read_indexed_metadata(path, reader.summary)
-    for _ in reader:
-        pass
+        reader.read_indexed_metadata()
+    else:
+        deque(reader, maxlen=0)
     return reader.metadata
 
 

@@ -24,10 +24,10 @@ from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import list_files
 from recorder import RecordedMessage, StoredMessage
-from recorder.files.index import LATEST_NS, read_summary, span_ns
+from recorder.files.index import LATEST_NS, span_ns
 from recorder.files.metadata import CLOCK, NO_CLOCK, ZERO_NS, own_metadata, processes_in
 from recorder.files.part_file import PART, is_locked
-from recorder.files.reader import Reader, Wanted, metadata_records
+from recorder.files.reader import Reader, Wanted, metadata_records, select_topics
 
 MAX_TOPICS = 5
 """Topics of other programs that an error names."""
@@ -68,7 +68,7 @@ def open_sources(paths: Iterable[Path], *, tolerant: bool = False) -> list[Sourc
     found: list[tuple[tuple[int, int], Path, Summary | None]] = []
     for path in paths:
         try:
-            summary = read_summary(path)
+            summary = Reader(path).summary
             found.append((span_ns(summary), path, summary))
         except InputError:
             if not tolerant:
@@ -153,14 +153,8 @@ class Recording:
             kinds: kinds to read, such as `keys.SAMPLE`; None for all, other programs' keys included.
             plant: plant to read; None for all.
         """
-
-        def is_selected(key: str) -> bool:
-            topic = keys.parse(key)
-            if topic is None:
-                return kinds is None and plant is None
-            return (kinds is None or topic.kind in kinds) and (plant is None or topic.plant == plant)
-
-        return (stored.recorded_message for stored in merge_messages(self._sources, wanted=is_selected))
+        wanted = select_topics(kinds, plant)
+        return (stored.recorded_message for stored in merge_messages(self._sources, wanted=wanted))
 
     @property
     def metadata_by_file(self) -> list[dict[str, str]]:

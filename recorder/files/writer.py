@@ -20,7 +20,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import encoding_of, message_type
+from reactorwatch.contract.codec import message_type
 from reactorwatch.errors import InputError
 from reactorwatch.version import build_metadata, this_build
 from recorder import Channel, RecordedMessage, StoredMessage
@@ -32,8 +32,6 @@ from recorder.samples import content_of
 
 MAX_SEQUENCE = 2**32 - 1
 """Largest sequence number in MCAP; larger ones wrap around to 0."""
-
-_SAMPLE = encoding_of(messages.Sample)
 
 
 class WriteError(InputError):
@@ -93,21 +91,23 @@ class RecordingWriter:
         """Bytes written, without the current chunk."""
         return self._stream.tell()
 
-    def write(self, message: RecordedMessage, *, readable: bool = True) -> None:
+    def write(self, message: RecordedMessage) -> None:
         """Append a message; the sequence number of a sample becomes that of the MCAP message.
 
-        Args:
-            message: the message.
-            readable: False writes the payload without the schema that its encoding names.
+        A payload that is not what its encoding names is written without a schema, so that it stops no reader.
 
         Raises:
             WriteError: as `append`.
         """
         key, payload, encoding, log_time_ns, publish_time_ns, latched = message
-        sample = content_of(message) if readable and encoding == _SAMPLE else None
-        sequence = sample.sequence if isinstance(sample, messages.Sample) else 0
-        channel = channel_of(key, encoding, is_readable=readable, latched=latched)
+        content = content_of(message)
+        sequence = content.sequence if isinstance(content, messages.Sample) else 0
+        channel = channel_of(key, encoding, is_readable=content is not None, latched=latched)
         self.append(StoredMessage(channel, sequence, log_time_ns, publish_time_ns, payload))
+
+    def has(self, channel: Channel) -> bool:
+        """True if the channel has a message in the file."""
+        return channel in self._channels
 
     def append(self, stored: StoredMessage) -> None:
         """Append a received message, or one of another file unchanged, with its channel.

@@ -91,7 +91,7 @@ def test_what_cannot_be_read_is_cut_out_as_it_is(tmp_path: Path) -> None:
     with RecordingWriter(path, {}) as writer:
         for entry in ENTRIES[:10]:
             writer.write(entry)
-        writer.write(strange, readable=False)
+        writer.write(strange)
     window = Window((ENTRIES[5].log_time_ns, strange.log_time_ns))
     cut([path], tmp_path / "cut.mcap", window, {})
     assert list(Recording(tmp_path / "cut.mcap").messages()) == [*ENTRIES[5:10], strange]

@@ -9,7 +9,8 @@ import pytest
 from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
-from recorder.files.index import FOOTER, RECORD, TABLE_CURE, read_summary
+from recorder.files.index import FOOTER, RECORD, TABLE_CURE
+from recorder.files.reader import Reader
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import read_record
@@ -131,7 +132,7 @@ def test_an_index_that_names_another_record_as_metadata_is_named(whole: bytes, t
     """The record is longer than the index says, or of another kind."""
     path, content = tmp_path / "run.mcap", without_checksum(whole)
     path.write_bytes(content)
-    (item,) = read_summary(path).metadata_indexes
+    (item,) = Reader(path).summary.metadata_indexes
     header = struct.pack("<QQ", 8, length)
     path.write_bytes(bytes(content).replace(struct.pack("<QQ", item.offset, item.length), header))
     with pytest.raises(InputError, match="its metadata cannot be read"):
@@ -144,7 +145,7 @@ def test_damaged_metadata_of_a_later_file_stop_only_what_needs_those_of_all_file
             for entry in entries:
                 writer.write(entry)
     later = tmp_path / "run-1.mcap"
-    (item,) = read_summary(later).metadata_indexes
+    (item,) = Reader(later).summary.metadata_indexes
     content = bytearray(later.read_bytes())
     struct.pack_into("<I", content, item.offset + RECORD.size, 2**31 - 1)  # length of the record's name
     later.write_bytes(content)

@@ -77,7 +77,7 @@ def test_foreign_bytes_are_kept_with_their_stated_encoding_and_no_schema(tmp_pat
     with RecordingWriter(path, {}) as writer:
         writer.write(sample(1))
         for entry in strange:
-            writer.write(entry, readable=False)
+            writer.write(entry)
     assert list(Recording(path).messages())[1:] == strange
     with path.open("rb") as stream:
         factory = DecoderFactory()
@@ -193,7 +193,7 @@ def test_a_full_disk_is_reported_in_one_line(tmp_path: Path) -> None:
     """A limit on the size of files stands for the full disk: the system refuses the write in the same way."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     writer = RecordingWriter(tmp_path / "run.mcap", {})
-    writer.write(sample(1)._replace(payload=np.random.default_rng(1).bytes(100_000)), readable=False)
+    writer.write(sample(1)._replace(payload=np.random.default_rng(1).bytes(100_000)))
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:
         with pytest.raises(
