@@ -66,7 +66,7 @@ def read_summary(path: Path, data: mmap.mmap) -> Summary:
 
     Args:
         path: the file, for errors.
-        data: its content.
+        data: content of the file.
 
     Raises:
         InputError: it is no MCAP file, is cut off, or its index is damaged.
