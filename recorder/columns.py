@@ -480,6 +480,11 @@ def _update_statistics(before: SignalStatistics | None, item: SampleColumns) -> 
     )
 
 
+def times_of(items: Iterable[Any]) -> Times:
+    """Times of messages."""
+    return np.array([item.time_ns for item in items], np.int64)
+
+
 _Dated = TypeVar("_Dated", messages.ModelSnapshot, messages.Health, messages.Promise)
 
 

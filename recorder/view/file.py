@@ -24,8 +24,7 @@ from reactorwatch.records.atomic import atomic_write
 from recorder.columns import RunColumns
 from recorder.panels import PANELS
 from recorder.panels.base import Colour, Panel, Series, TimePlot, View
-from recorder.view.drawing import Renderer
-from recorder.view.stream import APPLICATION, SAMPLE_TIME
+from recorder.view.drawing import APPLICATION, SAMPLE_TIME, Renderer
 
 _PIPE_BYTES = 65_536
 
