@@ -97,11 +97,8 @@ def _plot(run: RunColumns, name: str, role: str, setpoints: Sequence[str]) -> Ti
     ]
     measured, estimated, rebuilt = run.samples.get(name), run.estimates.get(name), run.reconstructions.get(name)
     if measured is not None:
-        series.append(
-            Series("measured", measured.time_ns, measured.value, MEASURED, width=2.5)
-            if role == "output"
-            else Series("measured", measured.time_ns, measured.value, _ROLE_COLOURS[role], held=True)
-        )
+        style = (MEASURED, 2.5, False) if role == "output" else (_ROLE_COLOURS[role], 1.5, True)
+        series.append(Series("measured", measured.time_ns, measured.value, *style))
     elif not series:
         return None
     if estimated is not None:
@@ -257,15 +254,12 @@ def _parameter(name: str, items: Iterable[messages.ModelSnapshot], colour: Colou
 
 
 def _excitation(run: RunColumns, signal: str) -> TimePlot:
-    series = []
-    for purpose, name, colour in (
-        (REFERENCE, _FIXED[REFERENCE], LIMIT),
-        (FROZEN, _FIXED[FROZEN], PREDICTED),
-        (ADAPTIVE, "adaptive model", MEASURED),
-    ):
-        items = run.models.get((signal, purpose), ())
-        if items:
-            series.append(Series(name, times_of(items), np.array([item.excitation for item in items]), colour))
+    names = ((REFERENCE, _FIXED[REFERENCE], LIMIT), (FROZEN, _FIXED[FROZEN], PREDICTED))
+    series = [
+        Series(name, times_of(items), np.array([item.excitation for item in items]), colour)
+        for purpose, name, colour in (*names, (ADAPTIVE, "adaptive model", MEASURED))
+        if (items := run.models.get((signal, purpose), ()))
+    ]
     return TimePlot(f"Excitation of the model of {signal}", "", tuple(series))
 
 

@@ -151,7 +151,7 @@ def read_time_plots(path: Path) -> list[TimePlot]:
 
 @dataclass
 class _Line:
-    """Data of a line, collected from the chunks of its entity."""
+    """Data of a line, from the chunks of its entity."""
 
     style: dict[str, Any] = field(default_factory=dict)
     times: list[NDArray[np.int64]] = field(default_factory=list)

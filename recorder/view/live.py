@@ -61,22 +61,15 @@ def query_history(bus: Bus, plant: str) -> RunHistory:
             if isinstance(reply, messages.CommandReply):
                 listed += reply.alarms
                 answered.add(node)
-    zero_ns: int | None = None
-    for message in bus.query_history(keys.all_keys(plant, keys.HEALTH)):
-        reported_ns = zero_of(message)
-        zero_ns = zero_ns if reported_ns is None else reported_ns
+    zeros_ns = [zero_of(message) for message in bus.query_history(keys.all_keys(plant, keys.HEALTH))]
+    zero_ns = next((zero_ns for zero_ns in reversed(zeros_ns) if zero_ns is not None), None)
     alarms = [Publication(keys.key(plant, keys.ALARM, item.alarm), item) for item in alarm_changes(listed)]
     alarms += [Publication(keys.key(plant, keys.INCIDENT, str(item.number)), item) for item in incidents_of(listed)]
     return RunHistory(tuple(map(encode, alarms)), zero_ns, frozenset(answered))
 
 
 class HistoryQuery:
-    """Repeats the query when a node that lists alarms appears, until it replies; never blocks.
-
-    Args:
-        query: `query_history`.
-        answered: nodes that have replied before.
-    """
+    """Repeats a query when a node that lists alarms appears and has not replied before; never blocks."""
 
     def __init__(self, query: Callable[[], RunHistory], answered: frozenset[str] = frozenset()) -> None:
         self._query = query
@@ -176,7 +169,7 @@ class LiveDashboard:
         is_closed: returns True once the viewer is closed.
         now_ns: clock reading.
         past: history of the run before the subscription.
-        query: repeats the query for alarms when a node appears; None never repeats it.
+        query: query for the history when a node appears; None never repeats it.
         process: process of the plant; None: unknown.
     """
 
