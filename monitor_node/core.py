@@ -20,8 +20,7 @@ from monitor_node.alarms.commands import execute_command
 from monitor_node.checks.silence import SilenceCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.health import HEARD_AGAIN_NS, NODE, STALL_NS, Failures, ReceiveStats
-from monitor_node.ingest.alignment import Aligner
-from monitor_node.ingest.duplicates import ReplayFilter
+from monitor_node.ingest.alignment import Aligner, ReplayFilter
 from monitor_node.ingest.rows import Row
 from monitor_node.ingest.samples import (
     LARGEST_NUMBER,

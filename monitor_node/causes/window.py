@@ -18,7 +18,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.ingest.sampling import missing_rows
+from monitor_node.ingest.rows import missing_rows
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.ekf import LONGEST_GAP_MIN, Filter, FilterState

@@ -19,8 +19,7 @@ from monitor_node.causes.stage import Suspicion
 from monitor_node.checks.base import CheckRow
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.health import NODE, Failures
-from monitor_node.ingest.rows import MeasuredRow, Row
-from monitor_node.ingest.sampling import SamplingPeriod
+from monitor_node.ingest.rows import MeasuredRow, Row, SamplingPeriod
 from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.baseline import NO_VALUE, TrainingResult
 from monitor_node.learn.model_update import is_command
