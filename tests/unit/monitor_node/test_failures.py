@@ -55,7 +55,7 @@ def health_message(said: list[Publication], plant: str) -> Health:
     [
         (PlantPipeline, "update", "row"),
         (ChartWatch, "update", "row"),
-        (SilenceCheck, "on_row", "row"),
+        (SilenceCheck, "update", "row"),
         (Annunciator, "end_row", "row"),
         (PlantPipeline, "snapshots", "models"),
     ],
