@@ -37,7 +37,7 @@ class SpikeCheck(SignalCheck):
 
     def start(self, training: CheckTraining) -> None:
         """See `SignalCheck`."""
-        self.memory = Spikes.learn(training.e, training.outliers, training.period_ns, training.arl0)
+        self.memory.learn(training.e, training.outliers, training.period_ns, training.arl0)
         self._set_limits()
 
     def _set_limits(self) -> None:

@@ -257,8 +257,7 @@ class Spikes(Memory):
 
     of_outputs: list[Spike | None] = field(default_factory=list)
 
-    @classmethod
-    def learn(cls, e: Sequence[Sequence[float]], outliers: Sequence[int], period_ns: float, arl0: float) -> "Spikes":
+    def learn(self, e: Sequence[Sequence[float]], outliers: Sequence[int], period_ns: float, arl0: float) -> None:
         """Learn from a training; an output with too few residuals has no method.
 
         Args:
@@ -267,14 +266,13 @@ class Spikes(Memory):
             period_ns: sampling period.
             arl0: least mean number of rows between two false alarms of an output.
         """
-        memory = cls()
+        self.of_outputs = []
         for residuals, count in zip(e, outliers, strict=True):
             z = [size for size in residuals if isfinite(size)]
             spike = Spike(spike_limit(z, arl0)) if len(z) >= FEWEST_ROWS else None
             if spike is not None and count:
                 spike.usual = SpikeRate.learn(count, len(residuals), period_ns, arl0)
-            memory.of_outputs.append(spike)
-        return memory
+            self.of_outputs.append(spike)
 
     @property
     def is_ordinary(self) -> bool:
