@@ -57,7 +57,7 @@ class ChartsMemory(Memory):
 _Judgements: TypeAlias = list[Judgement | None] | None
 
 _Made: TypeAlias = Bank[CompiledChart] | list[SignalChart] | JointChart | ValueChart
-"""What is made for a name of charts: one chart an output, as a bank where there is a kernel, or one of several."""
+"""Charts of one name: one an output, as a bank where there is a kernel, or one of several signals."""
 
 
 class _ChartRow(NamedTuple):
