@@ -15,7 +15,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import AlignmentMemory
 from monitor_node.ingest.samples import UnusableSamples
 from monitor_node.ingest.sequence_check import SequenceCheck
-from monitor_node.watch.pipeline_memory import PipelineMemory
+from monitor_node.watch.pipeline import PipelineMemory
 from reactorwatch.errors import InputError
 from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.model import ProcessModel
