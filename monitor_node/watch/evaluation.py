@@ -226,10 +226,8 @@ class Evaluation:
         memory.charts, memory.shift = self.charts.memory, self.shift.memory
         values, e = trained.measured.T.tolist(), trained.e.T.tolist()
         self.signals.start(CheckTraining(values, e, trained.outliers, period_ns, arl0))
-        watch = self._watch(trained, units, period_min) if self.promises.states_power else None
-        self.promises.start(
-            self._alarm_rates(trained, arl0), self.chance_alarms / arl0, period_min, trained.excess_rate(arl0), watch
-        )
+        rates, mean_rate = self._alarm_rates(trained, arl0), self.chance_alarms / arl0
+        self.promises.start(rates, mean_rate, period_min, trained.excess_rate(arl0))
         memory.promise = self.promises.promise
         if not again:
             self.notes += self.drift.start(self.models.predictors, self.evaluated, arl0)
