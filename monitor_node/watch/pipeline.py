@@ -265,8 +265,10 @@ class PlantPipeline:
         self.operation.inputs = measured.inputs
         changes: list[AlarmChange] = []
         seen = CheckRow(time_ns, row.values, measured.units)
-        usable = seen.without(evaluation.signals.update("signals", seen, changes))
-        measured.inputs, measured.values = tuple(usable[: self._inputs]), usable[self._inputs :]
+        invalid = evaluation.signals.update("signals", seen, changes)
+        if True in invalid:
+            usable = seen.without(invalid)
+            measured.inputs, measured.values = tuple(usable[: self._inputs]), usable[self._inputs :]
         if evaluation.reference is not None and modes.is_judged:
             if row.restarted:
                 evaluation.signals.on_restart()
@@ -293,7 +295,9 @@ class PlantPipeline:
             self._mask_signals(row, memory.left_out)
         seen = CheckRow(time_ns, row.values, units)
         stuck = signals.update("outputs", seen, changes)
-        row.values = values = seen.without(stuck)
+        if True in stuck:
+            row.values = seen.without(stuck)
+        values = row.values
         if row.interval.is_gap:  # the input in it is unknown
             evaluation.restart()
         predictions, sds, extrapolation = reference.update(
