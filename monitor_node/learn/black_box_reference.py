@@ -5,7 +5,7 @@ active it learns nothing, and what it learned shortly before is taken back: its 
 is `COPY_ROWS` to twice as many rows old, so a fault that was not noticed at once is not part of them.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from math import inf, nan
 
 import msgspec
@@ -32,6 +32,11 @@ COPY_ROWS = 250
 
 UNCERTAIN = 0.2
 """Standard deviation of a coefficient of the dynamics above which the training did not determine them."""
+
+UNFAMILIAR = {
+    "black-box": "rows are not judged while inputs have values that the black box has not learned, and teach it"
+}
+"""Obstacle once there was a row at an unfamiliar point of operation."""
 
 
 class BlackBoxMemory(Memory, tag="black-box"):
@@ -85,12 +90,15 @@ class BlackBoxReference(FilterReference):
     """
 
     kind = "black-box"
+    learns = True
 
     def __init__(self, memory: BlackBoxMemory) -> None:
         self._memory, self.model = memory, memory.model
         self._filter = BlackBoxFilter(memory.model, memory.filter)
         memory.filter = self._filter.memory
         self._outputs, self._count, self.period_min = memory.outputs, memory.count, memory.period_min
+        if memory.unfamiliar_rows:
+            self.obstacles = UNFAMILIAR
         if not memory.copies:
             memory.copies = [self._parameters()] * 2
 
@@ -188,12 +196,6 @@ class BlackBoxReference(FilterReference):
             "more than promised; train over more set points"
         )
 
-    def obstacles(self, inputs: Sequence[str]) -> Iterator[tuple[str, str]]:
-        """See `Reference`."""
-        if self._memory.unfamiliar_rows:
-            text = "rows are not judged while inputs have values that the black box has not learned, and teach it"
-            yield self.kind, text
-
     def row_filter(self, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> RowFilter:
         """See `Reference`."""
         belief, constants = self.numbers
@@ -236,6 +238,7 @@ class BlackBoxReference(FilterReference):
         if predicted.judged:
             return RowPrediction(prediction, sd)
         self._memory.unfamiliar_rows += 1
+        self.obstacles = UNFAMILIAR
         return RowPrediction([nan] * self._count, sd, (prediction, sd))
 
     def step_responses(self, rows: int) -> Array:
