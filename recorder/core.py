@@ -26,8 +26,8 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from reactorwatch.version import version
 from recorder import RecordedMessage
-from recorder.columns.samples import SequenceCounter, content_of
 from recorder.keep import Channel
+from recorder.samples import SequenceCounter, content_of
 
 log = structlog.get_logger()
 

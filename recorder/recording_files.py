@@ -25,7 +25,6 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder import RecordedMessage
-from recorder.columns.samples import content_of
 from recorder.config import MB, RecorderConfig
 from recorder.core import ReceivedMessage, fingerprint
 from recorder.files.ages import Ages, BootClock, read_boot_clock
@@ -45,6 +44,7 @@ from recorder.keep import (
     Limits,
     select_deletions,
 )
+from recorder.samples import content_of
 
 log = structlog.get_logger()
 

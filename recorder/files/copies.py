@@ -20,7 +20,6 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.output import refuse_source
 from recorder import RecordedMessage
-from recorder.columns.samples import content_of
 from recorder.files.index import LATEST_NS
 from recorder.files.metadata import METADATA, own_metadata, parse_gap
 from recorder.files.part_file import PART, is_locked, lock_orphan
@@ -28,6 +27,7 @@ from recorder.files.reader import Damage, Reader, StoredMessage, read_start
 from recorder.files.recording import SourceFile, merge_messages, open_sources
 from recorder.files.writer import RecordingWriter
 from recorder.keep import LATCHED_KINDS, FileNames, LatchedMessages
+from recorder.samples import content_of
 
 log = structlog.get_logger()
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, steady_states
-from recorder.columns.run import RunColumns, Times, Values, find_model
+from recorder.columns import RunColumns, Times, Values, find_model
 from recorder.panels.base import (
     ALARM,
     FAULT,

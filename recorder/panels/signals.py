@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.columns.run import (
+from recorder.columns import (
     ADAPTIVE,
     EQUATIONS,
     FROZEN,

@@ -9,8 +9,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.contract.promise_text import describe_sizes, promise_fields
 from reactorwatch.records.record import to_minutes
-from recorder.columns.run import RunColumns
-from recorder.columns.run_reader import LISTED
+from recorder.columns import LISTED, RunColumns
 from recorder.panels.base import (
     ALARM,
     FAULT,

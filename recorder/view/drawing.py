@@ -13,7 +13,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorder.columns.run import RunColumns
+from recorder.columns import RunColumns
 from recorder.panels.base import (
     Arrangement,
     EventLog,

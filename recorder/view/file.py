@@ -21,7 +21,7 @@ from rerun.chunk import RrdReader
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
-from recorder.columns.run import RunColumns
+from recorder.columns import RunColumns
 from recorder.panels import PANELS
 from recorder.panels.base import Colour, Panel, Series, TimePlot, View
 from recorder.view.drawing import Renderer

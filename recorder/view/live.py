@@ -21,9 +21,9 @@ from reactorwatch.contract.codec import Encoded, Publication, encode, encode_mes
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.description.process import Process
 from reactorwatch.runtime.bus import Bus
-from recorder.columns.run_reader import LISTED, SEGMENT_MESSAGES, RunReader
-from recorder.columns.samples import content_of
+from recorder.columns import LISTED, SEGMENT_MESSAGES, RunReader
 from recorder.panels import PANELS
+from recorder.samples import content_of
 from recorder.view.drawing import Renderer
 
 _ALARM = encoding_of(Alarm)

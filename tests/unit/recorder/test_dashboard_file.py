@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from reactorwatch.errors import InputError
-from recorder.columns.run import RunColumns, SampleColumns
-from recorder.columns.run_reader import read_run, read_segments
+from recorder.columns import RunColumns, SampleColumns, read_run, read_segments
 from recorder.panels import PANELS
 from recorder.panels.base import (
     MEASURED,

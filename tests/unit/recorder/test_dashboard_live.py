@@ -10,8 +10,7 @@ from rerun.chunk import RrdReader
 
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.find import find_process
-from recorder.columns.run import RunColumns
-from recorder.columns.run_reader import read_run
+from recorder.columns import RunColumns, read_run
 from recorder.view.drawing import Renderer
 from recorder.view.live import DRAW_INTERVAL_NS, LiveDashboard
 from recorder.view.stream import SAMPLE_TIME
