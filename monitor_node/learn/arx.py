@@ -397,28 +397,19 @@ class ArxReference(Reference):
 
     def adapt(self, row: MeasuredRow) -> list[float]:
         """Update with a row that the adaptive models do not judge; returns their predictions if they are published."""
-        found = self._update_adaptive(row.inputs, row.values, row.follows)
+        found = self._update_adaptive(row)
         return found if self.points else []
 
-    def _update_adaptive(self, inputs: Sequence[float], values: Sequence[float], follows: bool) -> list[float]:
-        pairs = zip(self.predictors, values, strict=True)
-        return [predictor.update(inputs, value, follows=follows) for predictor, value in pairs]
+    def _update_adaptive(self, row: MeasuredRow) -> list[float]:
+        pairs = zip(self.predictors, row.values, strict=True)
+        return [predictor.update(row.inputs, value, follows=row.follows) for predictor, value in pairs]
 
-    def update(
-        self,
-        time_ns: int,
-        inputs: Sequence[float],
-        values: list[float],
-        accept: tuple[bool, ...],
-        missing: int = 0,
-        *,
-        follows: bool = True,
-    ) -> RowPrediction:
+    def update(self, row: MeasuredRow, accept: tuple[bool, ...]) -> RowPrediction:
         """See `Reference`. Predictions with an input beyond the training are extrapolations."""
-        predict = self._predict_by_matrix if self.stays_as_fitted else self._update_adaptive
-        predictions = predict(inputs, values, follows)
+        predictions = self._predict_by_matrix(row) if self.stays_as_fitted else self._update_adaptive(row)
         extrapolation = predictions, [predictor.extrapolation_sd for predictor in self.predictors]
-        beyond = [self.config.inputs[i] for i, (low, high) in self._ranges if inputs[i] < low or inputs[i] > high]
+        outside = (i for i, (low, high) in self._ranges if row.inputs[i] < low or row.inputs[i] > high)
+        beyond = [self.config.inputs[i] for i in outside]
         text = "is beyond its range in the training: the identified model does not hold there"
         self.obstacles = {name: f"rows are not judged while {name} {text}" for name in beyond}
         judged = np.where(self._uses_inputs, nan, predictions).tolist() if beyond else predictions
@@ -473,15 +464,15 @@ class ArxReference(Reference):
                 needed[i, : structure.history, :inputs] = 1.0
         self._theta, self._needed = theta.reshape(outputs, -1), needed.reshape(outputs, -1)
 
-    def _predict_by_matrix(self, inputs: Sequence[float], values: Sequence[float], follows: bool) -> list[float]:
+    def _predict_by_matrix(self, row: MeasuredRow) -> list[float]:
         """Predict all outputs of a row from the rows before; NaN where there is no prediction."""
-        past, row = self._memory.past, np.array([*inputs, *values])
+        past, signals, inputs = self._memory.past, np.array([*row.inputs, *row.values]), len(row.inputs)
         assert past is not None
-        before = past.ravel() if follows else np.full(past.size, nan)
-        known, present = np.isfinite(before), np.isfinite(row)
-        complete = present[len(inputs) :] & (present[: len(inputs)].all() | ~self._uses_inputs)
+        before = past.ravel() if row.follows else np.full(past.size, nan)
+        known, present = np.isfinite(before), np.isfinite(signals)
+        complete = present[inputs:] & (present[:inputs].all() | ~self._uses_inputs)
         complete &= self._needed @ ~known == 0.0
-        self._memory.past = np.concatenate([row, before[: -row.size]]).reshape(past.shape)
+        self._memory.past = np.concatenate([signals, before[: -signals.size]]).reshape(past.shape)
         predicted = self._theta @ np.where(known, before, 0.0) + self._offsets
         predictions: list[float] = np.where(complete, predicted, nan).tolist()
         return predictions

@@ -5,12 +5,12 @@ active it learns nothing, and what it learned shortly before is taken back: its 
 is `COPY_ROWS` to twice as many rows old, so a fault that was not noticed at once is not part of them.
 """
 
-from collections.abc import Sequence
 from math import inf, nan
 
 import msgspec
 import numpy as np
 
+from monitor_node.ingest.rows import MeasuredRow
 from monitor_node.ingest.sampling import TOLERANCE, regular_intervals
 from monitor_node.learn.references import GATE, FilterReference, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
@@ -212,24 +212,15 @@ class BlackBoxReference(FilterReference):
             self._filter.reset_parameters((numbers[0], numbers[1:]))
         self._memory.copies = [self._parameters()] * 2
 
-    def update(
-        self,
-        time_ns: int,
-        inputs: Sequence[float],
-        values: list[float],
-        accept: tuple[bool, ...],
-        missing: int = 0,
-        *,
-        follows: bool = True,
-    ) -> RowPrediction:
+    def update(self, row: MeasuredRow, accept: tuple[bool, ...]) -> RowPrediction:
         """See `Reference`. There is no prediction just after a missing row."""
-        time_min, before = time_ns / MINUTE_NS, self._memory.time_min
+        time_min, before = row.time_ns / MINUTE_NS, self._memory.time_min
         if before is None or abs(time_min - before - self.period_min) > TOLERANCE * self.period_min:
             self._filter.restart()
-        measured = [values[i] for i in self._outputs]
+        measured = [row.values[i] for i in self._outputs]
         limits = [inf if accept[i] else GATE for i in self._outputs]
-        predicted = self._filter.update(inputs, measured, limits)
-        self.accept_row(time_min, tuple(inputs))
+        predicted = self._filter.update(row.inputs, measured, limits)
+        self.accept_row(time_min, row.inputs)
         prediction, sd = [nan] * self._count, [1.0] * self._count
         if predicted is None:
             return RowPrediction(prediction, sd)

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
+from monitor_node.ingest.rows import MeasuredRow
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
@@ -96,25 +97,12 @@ class Reference(ABC):
     # --- rows ------------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def update(
-        self,
-        time_ns: int,
-        inputs: Sequence[float],
-        values: list[float],
-        accept: tuple[bool, ...],
-        missing: int = 0,
-        *,
-        follows: bool = True,
-    ) -> RowPrediction:
+    def update(self, row: MeasuredRow, accept: tuple[bool, ...]) -> RowPrediction:
         """Predict a row, then update with it.
 
         Args:
-            time_ns: time of the row.
-            inputs: one value an input; NaN if missing.
-            values: outputs; NaN if missing.
-            accept: outputs that correct the reference whatever their residual.
-            missing: number of rows missing just before this one.
-            follows: True if the row before was one period ago.
+            row: the row.
+            accept: one flag an output: it corrects the reference whatever its residual.
         """
 
     @abstractmethod

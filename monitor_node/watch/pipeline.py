@@ -293,9 +293,7 @@ class PlantPipeline:
         values = row.values
         if row.interval.is_gap:  # the input in it is unknown
             evaluation.restart()
-        predictions, sds, extrapolation = reference.update(
-            time_ns, row.inputs, values, memory.quarantined, row.interval.missing, follows=row.follows
-        )
+        predictions, sds, extrapolation = reference.update(row, memory.quarantined)
         z = [(value - prediction) / sd for value, prediction, sd in zip(values, predictions, sds, strict=True)]
         tested = z
         if extrapolation is not None:
