@@ -27,14 +27,14 @@ def test_an_entry_has_the_time_of_receipt_and_that_of_its_sample() -> None:
     message = encoded(messages.Sample(time_ns=77, value=1.0, quality=GOOD), received_ns=500)
     kept = Recorder("cstr", 0).on_message(message, 600)
     assert kept is not None
-    assert kept.message is not None
-    assert kept.recorded == RecordedMessage(KEY, message.payload, encoding_of(messages.Sample), 500, 77)
+    assert kept.channel.is_readable
+    assert kept.recorded_message == RecordedMessage(KEY, message.payload, encoding_of(messages.Sample), 500, 77)
 
 
 def test_without_a_time_of_receipt_it_is_the_moment_of_the_work() -> None:
     kept = Recorder("cstr", 0).on_message(encoded(messages.Sample(time_ns=77, quality=GOOD)), 600)
     assert kept is not None
-    assert kept.recorded.log_time_ns == 600
+    assert kept.recorded_message.log_time_ns == 600
 
 
 def test_the_time_of_receipt_never_runs_backwards() -> None:
@@ -42,7 +42,7 @@ def test_the_time_of_receipt_never_runs_backwards() -> None:
     received = [
         recorder.on_message(encoded(messages.Sample(quality=GOOD), received_ns=at), at) for at in (300, 200, 400)
     ]
-    assert [kept.recorded.log_time_ns for kept in received if kept] == [300, 300, 400]
+    assert [kept.recorded_message.log_time_ns for kept in received if kept] == [300, 300, 400]
 
 
 def test_what_cannot_be_read_is_kept_as_it_is_and_counted_by_reason() -> None:
@@ -55,11 +55,11 @@ def test_what_cannot_be_read_is_kept_as_it_is_and_counted_by_reason() -> None:
         Encoded("reactor/cstr/sample/T", b"", encoding_of(messages.Sample)),
     ]
     kept = [recorder.on_message(message, 50) for message in strange]
-    assert [item is not None and item.message is not None for item in kept] == [False, False, True, True, True]
+    assert [item is not None and item.channel.is_readable for item in kept] == [False, False, True, True, True]
     for message, item in zip(strange, kept, strict=True):
         assert item is not None
-        assert item.recorded[:3] == message[:3]
-    assert [item.recorded.publish_time_ns for item in kept if item] == [50, 50, 0, 50, 0]
+        assert item.recorded_message[:3] == message[:3]
+    assert [item.recorded_message.publish_time_ns for item in kept if item] == [50, 50, 0, 50, 0]
     report = health(recorder)
     assert dict(report.refused_by_reason) == {"encoding": 1, "payload": 2, "key": 1, "time": 1}
     assert (report.refused, report.received) == (5, 5)
