@@ -123,7 +123,7 @@ def test_the_time_of_what_the_recorder_adds_is_not_before_any_message() -> None:
     assert [recorder.monotonic_ns(at) for at in (50, 300, 200)] == [100, 300, 300]
     kept = recorder.on_message(encoded(messages.Sample(quality=GOOD), received_ns=250), 400)
     assert kept is not None
-    assert kept.recorded.log_time_ns == 300
+    assert kept.log_time_ns == 300
 
 
 def test_a_message_of_an_earlier_file_is_left_out_once_and_only_until_the_history_has_come() -> None:
@@ -250,4 +250,6 @@ def test_the_channel_of_a_message_is_of_the_product_if_key_and_payload_are(*, un
         message = encoded(messages.Sample(quality=GOOD), key)
         kept = Recorder("cstr", 0).on_message(message._replace(payload=b"\xff") if unreadable else message, 0)
         assert kept is not None
-        assert kept.channel == (key, message.encoding, is_ours and not unreadable)
+        channel = kept.channel
+        assert (channel.key, channel.encoding) == (key, message.encoding)
+        assert (channel.is_product, channel.is_readable) == (is_ours and not unreadable, not unreadable)

@@ -12,9 +12,9 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
-from recorder import RecordedMessage
+from recorder import RecordedMessage, StoredMessage
 from recorder.files.copies import RecoveryResult, Window, cut, recover, sample_window
-from recorder.files.reader import Damage, StoredChannel, StoredMessage, metadata_records
+from recorder.files.reader import Damage, StoredChannel, metadata_records
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import read_record
@@ -175,7 +175,7 @@ def test_the_model_that_stands_is_that_of_the_moment_and_not_a_later_one(tmp_pat
 def stored(key: str, log_time_ns: int, publish_time_ns: int) -> StoredMessage:
     """A message of a file."""
     record = McapChannel(id=1, topic=key, message_encoding="x", metadata={}, schema_id=0)
-    return StoredMessage(StoredChannel(key, "x", False, record, None), 0, log_time_ns, publish_time_ns, b"")
+    return StoredMessage(StoredChannel(key, "x", record=record, schema=None), 0, log_time_ns, publish_time_ns, b"")
 
 
 @pytest.mark.parametrize(

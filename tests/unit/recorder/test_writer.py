@@ -16,7 +16,7 @@ from recorder import RecordedMessage
 from recorder.files.copies import recover
 from recorder.files.index import read_summary
 from recorder.files.part_file import PartFile
-from recorder.files.reader import Reader, metadata_records
+from recorder.files.reader import Reader, StoredChannel, metadata_records
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter, WriteError, check_free
 from tests.unit.recorder import golden
@@ -208,11 +208,13 @@ def test_a_sample_has_its_number_modulo_2_to_the_32_and_anything_else_has_0(tmp_
     message = RecordedMessage("reactor/cstr/sample/T", sample.SerializeToString(), encoding_of(Sample), 1, 1)
     with RecordingWriter(tmp_path / "run.mcap", {}) as writer:
         writer.write(message)
-        writer.write(message, sequence=2**32 + 7)
         writer.write(message, readable=False)
         writer.write(message._replace(encoding="text"))
-    found = [(stored.sequence, stored.channel.schema is not None) for stored in Reader(tmp_path / "run.mcap")]
-    assert found == [(5, True), (7, True), (0, False), (0, False)]
+    found = [
+        (stored.sequence, isinstance(stored.channel, StoredChannel) and stored.channel.schema is not None)
+        for stored in Reader(tmp_path / "run.mcap")
+    ]
+    assert found == [(5, True), (0, False), (0, False)]
 
 
 def test_a_recording_has_a_channel_for_each_key_encoding_and_use_and_one_schema_for_each_type(tmp_path: Path) -> None:
@@ -229,7 +231,7 @@ def test_a_recording_has_a_channel_for_each_key_encoding_and_use_and_one_schema_
     with RecordingWriter(copy, {}) as writer:
         for _ in range(2):  # two readers have objects of their own for equal channels
             for stored in Reader(path):
-                writer.copy(stored)
+                writer.append(stored)
     copied = read_summary(copy)
     assert (len(copied.channels), len(copied.schemas)) == (len(summary.channels), len(summary.schemas))
     assert [stored.recorded_message for stored in Reader(copy)] == 2 * [
