@@ -275,3 +275,24 @@ def test_a_message_of_another_type_on_a_key_is_a_difference_that_names_both() ->
 
 def test_nan_is_equal_to_itself() -> None:
     assert differences(keys.CHART, ChartPoint(statistic=math.nan), ChartPoint(statistic=math.nan)) == []
+
+
+def test_of_several_fields_that_differ_the_first_is_named() -> None:
+    recorded, again = ChartPoint(time_ns=1, statistic=1.0, upper_limit=3.0), ChartPoint(time_ns=1, statistic=2.0)
+    (found,) = differences(keys.CHART, recorded, again)
+    assert found[2:] == ("statistic", "1.0", "2.0")
+
+
+def test_the_same_values_in_another_order_of_the_fields_are_equal() -> None:
+    diff, message = MessageDiff(), ChartPoint(time_ns=1, statistic=2.0)
+    payload = ChartPoint(statistic=2.0).SerializeToString() + ChartPoint(time_ns=1).SerializeToString()
+    assert payload != message.SerializeToString()
+    diff.add_recorded(encode(Publication(CHART, message))._replace(payload=payload), keys.CHART)
+    diff.add_replayed([Publication(CHART, message)])
+    diff.finish()
+    assert (diff.differing, diff.counts[keys.CHART].equal) == (0, 1)
+
+
+def test_a_blank_at_the_end_of_a_text_is_a_difference() -> None:
+    (found,) = differences(keys.ALARM, Alarm(text="T is high"), Alarm(text="T is high "))
+    assert found[2:] == ("text", "'T is high'", "'T is high '")
