@@ -20,8 +20,7 @@ from monitor_node.alarms.commands import execute_command
 from monitor_node.checks.silence import SilenceCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.health import HEARD_AGAIN_NS, NODE, STALL_NS, Failures, ReceiveStats
-from monitor_node.ingest.alignment import Aligner
-from monitor_node.ingest.duplicates import ReplayFilter
+from monitor_node.ingest.alignment import Aligner, ReplayFilter
 from monitor_node.ingest.rows import Row
 from monitor_node.ingest.samples import (
     LARGEST_NUMBER,
@@ -257,7 +256,7 @@ class Monitor:
         self.stats.ticked = True
         if self.is_behind:
             self.silence.postpone(now_ns)
-        publications = self._guard("silence", self.pipeline.evaluation.signals.check_silence, now_ns)
+        publications = self._guard("silence", self.silence.check, now_ns)
         if self._republishes_baseline and self.baseline is not None:
             publications.append(Publication(keys.key(self.config.plant, keys.BASELINE, NODE), self.baseline))
         self._republishes_baseline = False

@@ -12,7 +12,7 @@ import msgspec
 
 from monitor_node.alarms.annunciator import AnnunciatorMemory
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.rows import AlignmentMemory
+from monitor_node.ingest.alignment import AlignmentMemory
 from monitor_node.ingest.samples import UnusableSamples
 from monitor_node.ingest.sequence_check import SequenceCheck
 from monitor_node.watch.pipeline_memory import PipelineMemory

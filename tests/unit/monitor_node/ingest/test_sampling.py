@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor_node.ingest.sampling import LEARN_FROM, SamplingPeriod, missing_in_intervals, regular_intervals
+from monitor_node.ingest.rows import LEARN_FROM, SamplingPeriod, missing_in_intervals, regular_intervals
 
 PERIOD_NS = 6_000_000_000
 
