@@ -76,6 +76,7 @@ def test_priorities_and_states_are_counted() -> None:
     }
     assert (figures.unacknowledged, figures.shelved, figures.suppressed, figures.out_of_service) == (1, 1, 0, 0)
     assert figures.incidents == 1
+    assert list(counts) == [f"PRIORITY_{name}" for name in ("CRITICAL", "HIGH", "MEDIUM", "LOW")]
 
 
 def test_they_are_published_at_each_minute_and_at_each_change() -> None:
