@@ -20,8 +20,8 @@ from monitor_node.checks.base import CheckTraining
 from monitor_node.checks.stage import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import SamplingPeriod
-from monitor_node.learn.arx import ArxPredictor
-from monitor_node.learn.arx_reference import ArxMemory, ArxReference
+from monitor_node.learn.arx import ArxMemory, ArxPredictor, ArxReference
+from monitor_node.learn.arx_fit import adaptive_snapshot
 from monitor_node.learn.baseline import TrainingResult
 from monitor_node.learn.black_box_reference import BlackBoxMemory
 from monitor_node.learn.process_reference import ProcessMemory
@@ -34,7 +34,7 @@ from monitor_node.watch.row_step import OrdinaryRows
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Baseline, Check
+from reactorwatch.contract.messages_pb2 import Baseline, Check, ModelSnapshot
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -322,7 +322,8 @@ class Evaluation:
         """
         inputs, outputs, reference = self._config.inputs, self._config.outputs, self.reference
         for index, (signal, predictor) in enumerate(zip(outputs, self.models.predictors, strict=True)):
-            adaptive, fitted = predictor.adaptive_snapshot(), predictor.reference_snapshot()
+            adaptive, stored = adaptive_snapshot(predictor), predictor.reference_model
+            fitted = ModelSnapshot.FromString(stored) if stored else None
             judging = None if reference is None else reference.snapshot(index, inputs, outputs)
             if fitted is not None:
                 fitted.held = True
