@@ -16,8 +16,7 @@ import numpy as np
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.charts import ChartWatch
 from monitor_node.config import ChartName, MonitorConfig
-from monitor_node.ingest.rows import MeasuredRow
-from monitor_node.ingest.sampling import Interval
+from monitor_node.ingest.rows import Interval, MeasuredRow
 from reactorwatch.spc import run_length
 from reactorwatch.spc.charts.base import SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS

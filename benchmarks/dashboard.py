@@ -87,7 +87,7 @@ def read_bare(path: Path) -> None:
 
 def draw(path: Path) -> None:
     """Draw a recording as `dashboard` does."""
-    from recorder.columns.run_reader import read_segments
+    from recorder.columns import read_segments
     from recorder.view.file import write_rrd
 
     write_rrd(read_segments(Recording(path).messages()), path.with_suffix(".rrd"))

@@ -179,7 +179,7 @@ class Monitor:
         self.stats.ticked = True
         if self.is_behind:
             self.silence.postpone(now_ns)
-        publications = self._guard("silence", self.pipeline.evaluation.signals.check_silence, now_ns)
+        publications = self._guard("silence", self.silence.check, now_ns)
         if self._republishes_baseline and self.baseline is not None:
             publications.append(Publication(keys.key(self.config.plant, keys.BASELINE, NODE), self.baseline))
         self._republishes_baseline = False

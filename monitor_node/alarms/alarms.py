@@ -9,7 +9,7 @@ ordinary, so that a value near its limit gives one alarm and not many. The remai
 `spc.m_of_n.false_alarm_rate`.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, TypeAlias
 
 import msgspec
@@ -259,8 +259,3 @@ class ChartAlarm:
         else:
             return None
         return AlarmChange(self, judgement, memory.standing, unit, time_ns)
-
-
-def update_alarms(points: Iterable[tuple[ChartAlarm, Judgement]], unit: str) -> list[AlarmChange | None]:
-    """Update alarms with one point each, see `ChartAlarm.update`."""
-    return [alarm.update(judgement, unit) for alarm, judgement in points]

@@ -111,7 +111,7 @@ class Fitter:
         if not best:
             return []
         best = [item for item in best if item.gain > (1.0 - _HOLDS) * best[0].gain - BEHIND]
-        without_fault = self.run_without_fault(window.run).innovations
+        without_fault = self.run_without_fault(window).innovations
         segment = _Segment(self, window, 0, window.time_min.size, without_fault)
         predicted = best[0].gain
         gained = segment.loss_without_fault - segment.evaluate(best[0], best[0].parameters).loss

@@ -121,7 +121,7 @@ class GlrScan:
             window.covariance,
             window.residual,
             window.used,
-            uncertainty=input_uncertainty_of(window.run, inputs),
+            uncertainty=input_uncertainty_of(window, inputs),
         )
         of_sizes = np.s_[:, :, : self._lower.size]
         return replace(
@@ -310,7 +310,7 @@ def scan_candidates(effects: Sequence[Effect], scan: Scan, window: Window) -> li
     distance = scan.onset_min[:, None] - scan.onset_min[likeliest]
     onset_sd_min = np.sqrt(np.sum(density * distance**2, axis=0) / np.maximum(np.sum(density, axis=0), 1e-300))
     values = _count_values_since(window, scan.onset_min)
-    volume = np.sum(density / np.sqrt(1.0 + values)[:, None], axis=0) / window.span_min
+    volume = np.sum(density / np.sqrt(1.0 + values)[:, None], axis=0) / window.onset_span_min
     log_volume = np.log(np.maximum(volume, 1e-300))
     end_min, candidates = float(window.time_min[scan.rows - 1]), []
     for column, row in enumerate(likeliest.tolist()):
@@ -349,7 +349,7 @@ def _count_values_since(window: Window, onset_min: Array) -> Array:
 def log_volume_of(candidate: Candidate, window: Window) -> float:
     """Logarithm of the posterior volume of a fit whose onset is about normal."""
     values = float(_count_values_since(window, np.array([candidate.onset_min]))[0])
-    return log_share(candidate.onset_sd_min, window.span_min) - 0.5 * log(1.0 + values)
+    return log_share(candidate.onset_sd_min, window.onset_span_min) - 0.5 * log(1.0 + values)
 
 
 def log_share(sd: float, span: float) -> float:

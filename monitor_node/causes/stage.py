@@ -12,29 +12,25 @@ set back, the causes found before stay, and no look follows for this incident; o
 Suspects change at looks, not at rows.
 
 The result depends on the samples alone. While the most likely cause is a sensor, its true reading is reconstructed
-(`reconstruction`).
+(`Reconstruction`).
 """
 
-from array import array
 from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
-from math import nan
-
-import msgspec
+from math import isfinite, nan, sqrt
 
 from monitor_node.alarms.alarms import STUCK_SENSOR, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.causes.isolation import Isolation, causes_of
-from monitor_node.causes.reconstruction import Reconstruction, ReconstructionMemory
 from monitor_node.causes.scan import Progress
-from monitor_node.causes.window import Row, is_break, newest_rows, rows_since_break
+from monitor_node.causes.window import MOST_PIECES, RecentRows, Row, is_break, newest_rows, rows_since_break
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.process_reference import output_indices
 from monitor_node.learn.references import PlantEquations
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Reconstruction as ReconstructionMessage
-from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
+from reactorwatch.kalman.step_budget import STEPS_PER_PREDICTION, STEPS_PER_ROW, BudgetExceededError, StepBudget
 from reactorwatch.process.effect import SensorEffect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -49,14 +45,17 @@ FEW_ROWS = 300
 ROWS_BEFORE = 400
 """Number of rows before the first alarm that late looks use."""
 
-SLACK_ROWS = 64
-"""Rows by which more are stored before the oldest are removed together: that moves all others."""
-
 LEAST = 0.01
 """Probability below which a suspect is not published."""
 
 CONVINCED = 0.5
 """Probability from which a suspected sensor is reconstructed."""
+
+MARGIN_MIN = 1.0
+"""Time before the estimated onset from which the sensor is left out."""
+
+START_STEPS, START_STEPS_A_ROW = 25_000 + STEPS_PER_PREDICTION * MOST_PIECES, STEPS_PER_ROW
+"""Filter steps for the past rows: enough for each row and a search for steady states."""
 
 
 def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[None]:
@@ -84,50 +83,20 @@ def has_causes(config: MonitorConfig, model: ProcessModel) -> bool:
     return config.isolation and bool(model.inputs and causes_of(model))
 
 
-class RecentRows(Memory):
-    """The newest rows in one array of doubles: most of the memory of a plant. The object is its own state.
+class ReconstructionMemory(Memory):
+    """Memory of a reconstruction.
 
     Attributes:
-        n_inputs: number of inputs.
-        columns: numbers of a row: time in minutes, inputs, outputs.
-        most: number of rows that are kept.
-        numbers: the rows one after the other, oldest first; up to `SLACK_ROWS` more than are kept.
+        output: output of the sensor.
+        cause: suspected cause.
+        last_inputs: last known inputs; NaN before the first.
+        filter: state of the filter; None before its first row.
     """
 
-    n_inputs: int
-    columns: int
-    most: int
-    numbers: array = msgspec.field(default_factory=partial(array, "d"))  # type: ignore[type-arg] # none before Python 3.12
-
-    def __len__(self) -> int:
-        return min(len(self.numbers) // self.columns, self.most)
-
-    def add(self, row: Sequence[float]) -> bool:
-        """Add a row: time in minutes, inputs, outputs.
-
-        Returns:
-            False if the row is not later than the newest, and all rows before it were removed.
-        """
-        is_later = not self.numbers or row[0] > self.numbers[-self.columns]
-        if not is_later:
-            del self.numbers[:]
-        self.numbers.extend(row)
-        if len(self.numbers) > (self.most + SLACK_ROWS) * self.columns:
-            self.keep(self.most)
-        return is_later
-
-    def keep(self, most: int) -> None:
-        """Keep this many rows from now on, and of those so far."""
-        del self.numbers[: -len(self) * self.columns]
-        self.most = most
-        del self.numbers[: -most * self.columns]
-
-    def rows(self) -> list[Row]:
-        """The rows, oldest first."""
-        size, inputs = self.columns, 1 + self.n_inputs
-        values = self.numbers[-len(self) * size :].tolist()
-        parts = (values[begin : begin + size] for begin in range(0, len(self) * size, size))
-        return [(part[0], part[1:inputs], part[inputs:]) for part in parts]
+    output: str
+    cause: str
+    last_inputs: list[float]
+    filter: FilterState | None = None
 
 
 class SuspicionMemory(Memory, kw_only=True):
@@ -146,6 +115,66 @@ class SuspicionMemory(Memory, kw_only=True):
     since: int | None = None
     progress: Progress | None = None
     reconstruction: ReconstructionMemory | None = None
+
+
+class Reconstruction:
+    """Reconstructs the true reading of a faulty sensor: follows the plant without it.
+
+    From the start of its fault the sensor is left out of the filter, and its true reading is predicted from the
+    balances and the other sensors. It is not corrected by the size of its fault: that would be only as good as the
+    known form of the fault, and this holds for a sensor that drifts, sticks or fails in any other way. It costs some
+    accuracy.
+
+    Args:
+        model: process model of the plant.
+        noise: noise levels of the plant and its sensors.
+        memory: the sensor, and the memory of an earlier reconstruction of it.
+    """
+
+    def __init__(self, model: ProcessModel, noise: NoiseLevels, memory: ReconstructionMemory) -> None:
+        self.memory, self._filter = memory, Filter(model, noise)
+        self._index = model.output_names.index(memory.output)
+        self._variance = noise.measurement_sd[self._index] ** 2
+        if memory.filter is not None:
+            self._filter.state = memory.filter
+
+    def start(self, rows: Iterable[Row], onset_min: float) -> None:
+        """Process the rows from before the onset on, oldest first."""
+        past = newest_rows(list(rows))
+        self._filter.budget = StepBudget(START_STEPS + START_STEPS_A_ROW * len(past))
+        try:
+            for time_min, inputs, measured in past:
+                self._step(time_min, inputs, measured, is_right=time_min < onset_min - MARGIN_MIN)
+        except BudgetExceededError:  # the filter diverges again and again: start with the next row instead
+            self._filter.restart()
+        self._filter.budget, self.memory.filter = None, self._filter.state
+
+    def update(self, time_min: float, inputs: Sequence[float], measured: Sequence[float]) -> tuple[float, float]:
+        """Process a row and return the true reading without noise and its standard deviation, in the output's unit.
+
+        Both are NaN in the row with which the filter starts.
+
+        Args:
+            time_min: time of the row.
+            inputs: one value an input; NaN if missing: the last known one then holds.
+            measured: values of all sensors; NaN where missing.
+        """
+        return self._step(time_min, inputs, measured, is_right=False)
+
+    def _step(
+        self, time_min: float, inputs: Sequence[float], measured: Sequence[float], *, is_right: bool
+    ) -> tuple[float, float]:
+        known = [now if isfinite(now) else last for now, last in zip(inputs, self.memory.last_inputs, strict=True)]
+        self.memory.last_inputs = known
+        if not all(map(isfinite, known)):
+            return nan, nan
+        seen = list(measured)
+        if not is_right:
+            seen[self._index] = nan
+        found = self._filter.update(time_min, known, seen)
+        self.memory.filter = self._filter.state
+        variance = found.sd[self._index] ** 2 - self._variance
+        return found.prediction[self._index], sqrt(max(variance, 0.0)) if variance == variance else nan
 
 
 class Suspicion:
@@ -269,7 +298,7 @@ class Suspicion:
         """Outputs of the model; NaN for those that are not monitored."""
         if self._all_watched:
             return values
-        measured = [float("nan")] * len(self._reference.equations.outputs)
+        measured = [nan] * len(self._reference.equations.outputs)
         for index, value in zip(self._indices, values, strict=True):
             measured[index] = value
         return measured

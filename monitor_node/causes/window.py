@@ -9,21 +9,24 @@ Where rows are missing and the input after them differs, the time of the change 
 `kalman.input_uncertainty`): no cause may be inferred from a lost row.
 """
 
+from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 from math import isfinite, nan
 from typing import NamedTuple, TypeAlias
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.ingest.sampling import missing_rows
+from monitor_node.ingest.rows import missing_rows
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.ekf import LONGEST_GAP_MIN, Filter, FilterState
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.kalman.input_uncertainty import InputUncertainty
+from reactorwatch.stored_state import Memory
 
 Row: TypeAlias = tuple[float, Sequence[float], Sequence[float]]
 """Time in minutes, inputs, outputs; missing values are NaN."""
@@ -45,40 +48,71 @@ apart. A filter takes some microseconds for each piece, so fewer rows are used i
 
 _CHUNK_ROWS = 16
 
+SLACK_ROWS = 64
+"""Rows by which more are stored before the oldest are removed together: that moves all others."""
 
-@dataclass(frozen=True, eq=False)
-class Window:
-    """Rows without a long gap, and the run of the filter over them.
+
+class RecentRows(Memory):
+    """The newest rows in one array of doubles: most of the memory of a plant. The object is its own state.
 
     Attributes:
-        time_min: shape (rows,).
-        inputs: shape (rows, n_u).
-        measured: shape (rows, n_y); NaN where missing or an outlier.
+        n_inputs: number of inputs.
+        columns: numbers of a row: time in minutes, inputs, outputs.
+        most: number of rows that are kept.
+        numbers: the rows one after the other, oldest first; up to `SLACK_ROWS` more than are kept.
+    """
+
+    n_inputs: int
+    columns: int
+    most: int
+    numbers: array = msgspec.field(default_factory=partial(array, "d"))  # type: ignore[type-arg] # none before Python 3.12
+
+    def __len__(self) -> int:
+        return min(len(self.numbers) // self.columns, self.most)
+
+    def add(self, row: Sequence[float]) -> bool:
+        """Add a row: time in minutes, inputs, outputs.
+
+        Returns:
+            False if the row is not later than the newest, and all rows before it were removed.
+        """
+        is_later = not self.numbers or row[0] > self.numbers[-self.columns]
+        if not is_later:
+            del self.numbers[:]
+        self.numbers.extend(row)
+        if len(self.numbers) > (self.most + SLACK_ROWS) * self.columns:
+            self.keep(self.most)
+        return is_later
+
+    def keep(self, most: int) -> None:
+        """Keep this many rows from now on, and of those so far."""
+        del self.numbers[: -len(self) * self.columns]
+        self.most = most
+        del self.numbers[: -most * self.columns]
+
+    def rows(self) -> list[Row]:
+        """The rows, oldest first."""
+        size, inputs = self.columns, 1 + self.n_inputs
+        values = self.numbers[-len(self) * size :].tolist()
+        parts = (values[begin : begin + size] for begin in range(0, len(self) * size, size))
+        return [(part[0], part[1:inputs], part[inputs:]) for part in parts]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Window(Run):
+    """Rows without a long gap, in which outliers are missing, and the run of the filter over them.
+
+    Attributes:
         residual: innovations, shape (rows, n_y); NaN where missing or an outlier.
         used: mask of values that corrected the filter, shape (rows, n_y).
         x: filtered state, shape (rows, n_x).
         covariance: covariance of the filtered state, shape (rows, n_x, n_x).
-        missing: number of missing rows before each row whose input changed at an unknown time, else 0; None: none.
     """
 
-    time_min: Array
-    inputs: Array
-    measured: Array
     residual: Array
     used: NDArray[np.bool_]
     x: Array
     covariance: Array
-    missing: NDArray[np.intp] | None = None
-
-    @cached_property
-    def run(self) -> Run:
-        """The rows as hypotheses are fitted to them."""
-        return Run(self.time_min, self.inputs, self.measured, missing=self.missing)
-
-    @property
-    def period_min(self) -> float:
-        """Median sampling period."""
-        return float(np.median(np.diff(self.time_min)))
 
     @property
     def earliest_min(self) -> float:
@@ -86,7 +120,7 @@ class Window:
         return float(self.time_min[BURN_IN_ROWS])
 
     @property
-    def span_min(self) -> float:
+    def onset_span_min(self) -> float:
         """Length of the time in which an onset is sought."""
         return float(self.time_min[-1] - self.time_min[BURN_IN_ROWS - 1])
 
@@ -107,8 +141,16 @@ def window_of(rows: Sequence[Row], kalman: Filter) -> Window | None:
     # A filter that soon follows a step leaves only its first rows far off; one of a plant that moves a lot, any row.
     outlier = _stands_out(run.residual, run.sd) & _stands_out(measured, run.sd)
     outlier[-1] = run.far[-1] & ~run.far[-2]
-    measured, residual = np.where(outlier, np.nan, measured), np.where(outlier, np.nan, run.residual)
-    return Window(times, inputs, measured, residual, run.used, run.x, run.covariance, missing)
+    return Window(
+        times,
+        inputs,
+        np.where(outlier, np.nan, measured),
+        missing=missing,
+        residual=np.where(outlier, np.nan, run.residual),
+        used=run.used,
+        x=run.x,
+        covariance=run.covariance,
+    )
 
 
 class _FilterRun(NamedTuple):

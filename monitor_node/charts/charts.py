@@ -6,7 +6,7 @@ cleared, so that false alarms do not come in clusters.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence, Sized
+from collections.abc import Callable, Sequence, Sized
 from itertools import compress, islice
 from math import nan
 from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
@@ -14,7 +14,7 @@ from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 import msgspec
 import numpy as np
 
-from monitor_node.alarms.alarms import AlarmChange, ChartAlarm, SuspectedCause, update_alarms
+from monitor_node.alarms.alarms import AlarmChange, ChartAlarm, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.chart_design import ALL, ChartDesign, alarm_names
 from monitor_node.config import MonitorConfig, PriorityName
@@ -55,6 +55,9 @@ class ChartsMemory(Memory):
 
 
 _Judgements: TypeAlias = list[Judgement | None] | None
+
+_Made: TypeAlias = Bank[CompiledChart] | list[SignalChart] | JointChart | ValueChart
+"""Charts of one name: one an output, as a bank where there is a kernel, or one of several signals."""
 
 
 class _ChartRow(NamedTuple):
@@ -115,18 +118,18 @@ class _Charts(ABC):
 class _Banked(_Charts):
     """Compiled charts, one an output."""
 
-    def __init__(self, bank: Bank[CompiledChart], kind: type[CompiledChart]) -> None:
+    def __init__(self, bank: Bank[CompiledChart]) -> None:
         super().__init__(bank.memory)
-        self._bank, self._kind = bank, kind
+        self._bank = bank
 
     def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
-        return self._bank.judge(row.e, row.present(self._kind), always=always)
+        return self._bank.judge(row.e, row.present(self._bank.kind), always=always)
 
     def restart(self, index: int) -> None:
         self._bank.restart(index)
 
     def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
-        return self._kind.explain(judgement, signals[index])
+        return self._bank.kind.explain(judgement, signals[index])
 
 
 class _OfEach(_Charts):
@@ -302,13 +305,15 @@ class ChartWatch:
         widths, passed = [designed_width(p, item) for item in learned], [item.shift_gain for item in learned]
         self.memory = ChartsMemory({}, widths, passed)
 
-        def design_charts(kind: type[Chart]) -> _Charts:
+        def design_charts(kind: type[Chart]) -> _Made:
+            if issubclass(kind, CompiledChart):
+                return Bank([kind.design(baseline.of([index])) for index in range(len(learned))])
             if issubclass(kind, SignalChart):
-                return _of_each(kind, [kind.design(baseline.of([index])) for index in range(len(learned))])
+                return [kind.design(baseline.of([index])) for index in range(len(learned))]
             if issubclass(kind, ValueChart):
-                return _OfValues(kind.design(design.value_baseline(values, arl0)), self._config)
+                return kind.design(design.value_baseline(values, arl0))
             assert issubclass(kind, JointChart)
-            return _OfAll(kind.design(baseline.of(np.flatnonzero(design.evaluated).tolist())), design.evaluated)
+            return kind.design(baseline.of(np.flatnonzero(design.evaluated).tolist()))
 
         self._watch(design_charts)
 
@@ -332,22 +337,19 @@ class ChartWatch:
         if not each <= set(stored) <= set(names) or not len(memory.widths) == len(memory.passed) == outputs:
             raise ValueError(f"there must be the charts {', '.join(names)}, got {', '.join(stored)}")
 
-        def resume_charts(kind: type[Chart]) -> _Charts:
+        def resume_charts(kind: type[Chart]) -> _Made:
             data = stored[kind.name]
-            if issubclass(kind, SignalChart) and not issubclass(kind, CompiledChart):
-                return _OfEach(
-                    [kind.resume(read_memory(item, kind.memory_type)) for item in _check_count(data, outputs)]
-                )
             if issubclass(kind, CompiledChart):
                 bank = Bank.resume(kind, read_memory(data, SignalMemory))
                 _check_count(bank.numbers.T, outputs)
-                return _Banked(bank, kind)
+                return bank
+            if issubclass(kind, SignalChart):
+                return [kind.resume(read_memory(item, kind.memory_type)) for item in _check_count(data, outputs)]
             made = kind.resume(read_memory(data, kind.memory_type))
+            assert isinstance(made, JointChart | ValueChart)
             if isinstance(made, ValueChart):
                 design.signals = made.names
-                return _OfValues(made, self._config)
-            assert isinstance(made, JointChart)
-            return _OfAll(made, design.evaluated)
+            return made
 
         self._watch(resume_charts)
 
@@ -357,14 +359,22 @@ class ChartWatch:
             for index in range(len(charts.alarms)):
                 charts.restart(index)
 
-    def _watch(self, made: Callable[[type[Chart]], _Charts]) -> None:
-        """Give the charts of each name their alarms and keys."""
-        self._watched = {name: made(chart(name)) for name in self.design.chosen}
+    def _watch(self, make: Callable[[type[Chart]], _Made]) -> None:
+        """Make the charts of each name, and give them their alarms and keys."""
+        self._watched = {name: self._charts(make(chart(name))) for name in self.design.chosen}
         self.memory.charts = {name: charts.memory for name, charts in self._watched.items()}
         for name, charts in self._watched.items():
             pairs = [pair for pair in self._alarms if pair[0] == name]
             charts.alarms = [self._alarms[pair] for pair in pairs]
             charts.keys = [keys.key(self._config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
+
+    def _charts(self, made: _Made) -> _Charts:
+        """Charts of one name as they take rows."""
+        if isinstance(made, ValueChart):
+            return _OfValues(made, self._config)
+        if isinstance(made, JointChart):
+            return _OfAll(made, self.design.evaluated)
+        return _Banked(made) if isinstance(made, Bank) else _OfEach(made)
 
     def update(
         self, row: MeasuredRow, e: list[float], withheld: tuple[bool, ...], scales: list[float], *, points: bool
@@ -379,49 +389,30 @@ class ChartWatch:
             points: True to publish the charts' points.
         """
         known = [size == size for size in e]  # NaN is not equal to itself
-        seen = _ChartRow(e, known, withheld, row.inputs, row.values)
-        judged = list[tuple[_Charts, int, ChartAlarm, Judgement]]()
+        seen, changes = _ChartRow(e, known, withheld, row.inputs, row.values), list[AlarmChange]()
         for charts in self._watched.values():
-            always = points or any(alarm.memory.standing or alarm.memory.recent for alarm in charts.alarms)
-            judgements = charts.update(seen, always=always)
-            for index, judgement in enumerate(judgements or ()):
+            always = points or not all(alarm.is_idle for alarm in charts.alarms)
+            for index, judgement in enumerate(charts.update(seen, always=always) or ()):
                 if judgement is None:
                     continue
                 if points:
                     row.publications.append(Publication(charts.keys[index], chart_point(row.time_ns, judgement)))
-                judged.append((charts, index, charts.alarms[index], judgement))
-        if not judged:
-            return []
-        changes: list[AlarmChange] = []
-        found = update_alarms([(alarm, judgement) for _, _, alarm, judgement in judged], SD)
-        for (charts, index, _, judgement), change in zip(judged, found, strict=True):
-            if change is None:
-                continue
-            if change.is_raised:
-                columns = self._config.outputs, row.units, scales, self.memory.passed
-                signals = [Shown(*item) for item in zip(*columns, strict=True)]
-                change.text, change.contributions = charts.explain(index, judgement, signals)
-                if charts.locates:
-                    change.entries = _entries(change.contributions)
-            else:
-                charts.restart(index)
-            changes.append(change)
+                change = charts.alarms[index].update(judgement, SD)
+                if change is None:
+                    continue
+                if change.is_raised:
+                    columns = self._config.outputs, row.units, scales, self.memory.passed
+                    signals = [Shown(*item) for item in zip(*columns, strict=True)]
+                    change.text, change.contributions = charts.explain(index, judgement, signals)
+                    if charts.locates:
+                        change.entries = [
+                            SuspectedCause(name, share, kind="process", text=f"the disturbance enters at {name}")
+                            for name, share in islice(change.contributions.items(), MOST_ENTRIES)
+                        ]
+                else:
+                    charts.restart(index)
+                changes.append(change)
         return changes
-
-
-def _entries(shares: Mapping[str, float]) -> list[SuspectedCause]:
-    """Signals at which a disturbance may enter, the likeliest first."""
-    return [
-        SuspectedCause(name, share, kind="process", text=f"the disturbance enters at {name}")
-        for name, share in islice(shares.items(), MOST_ENTRIES)
-    ]
-
-
-def _of_each(kind: type[SignalChart], charts: list[SignalChart]) -> _Charts:
-    """One chart an output, as a bank where there is a kernel."""
-    if issubclass(kind, CompiledChart):
-        return _Banked(Bank([item for item in charts if isinstance(item, kind)]), kind)
-    return _OfEach(charts)
 
 
 def _check_count(charts: Sized, count: int) -> Any:

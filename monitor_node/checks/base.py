@@ -1,13 +1,15 @@
-"""A check of the signals themselves: hooks on the way of a row, which return judgements for the check's alarms.
+"""A check of the signals themselves: one call a row returns findings, which raise and clear the check's alarms.
 
-A row passes the hooks in the order in which they stand here. Before the end of the training only `on_row` is called.
+The statistical method of a check is in `reactorwatch.spc`; a check feeds it, and states what it finds.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from math import nan
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from monitor_node.alarms.alarms import AlarmChange, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.signal_range import SignalRange
@@ -19,7 +21,36 @@ from reactorwatch.spc.training_errors import TrainingErrors
 PLANT = "plant"
 """Name in place of a signal for alarms of all signals together."""
 
+SENSOR = "sensor"
+"""Kind of the causes that checks suspect."""
+
+Judged: TypeAlias = Literal["signals", "outputs", "residuals"]
+"""Values that a check judges, in the order in which a row has them: all signals, inputs first; outputs; residuals.
+
+Before the end of the training only signals are judged.
+"""
+
 Flags = Sequence[bool]
+
+
+class CheckRow(NamedTuple):
+    """A row as a check sees it.
+
+    Attributes:
+        time_ns: time of the row.
+        values: values that the check judges, of residuals the prewhitened ones; NaN where there is none.
+        units: units of the outputs.
+        scales: one standard deviation of each residual, in the outputs' units; empty if none are judged.
+    """
+
+    time_ns: int
+    values: Sequence[float]
+    units: Sequence[str]
+    scales: Sequence[float] = ()
+
+    def without(self, invalid: Flags) -> list[float]:
+        """Values of the row, with NaN in place of those that are no measurements."""
+        return [nan if flag else value for value, flag in zip(self.values, invalid, strict=True)]
 
 
 class CheckTraining(NamedTuple):
@@ -70,15 +101,17 @@ class SignalCheck:
     Attributes:
         name: name of its alarms.
         cause: suspected cause of its alarms.
+        judged: the values that it judges.
         options: options of its alarms, see `Annunciator.declare`.
         can_be_false: whether chance can raise its alarms, one an output, which then share the promised false alarms.
         is_invalid_while_active: whether a value is no measurement while its alarm is active.
-        memory: all that it remembers but the alarms, as it is stored; None: nothing.
-        invalid: True for each signal of the newest row whose value is no measurement; empty if all are.
+        memory: all that it remembers but the alarms, as it is stored: changed, and never replaced; None: nothing.
+        invalid: one flag a value of the newest row: it is no measurement; empty: all are.
     """
 
     name: ClassVar[str]
     cause: ClassVar[str]
+    judged: ClassVar[Judged] = "outputs"
     options: ClassVar[Mapping[str, Any]] = {}
     can_be_false: ClassVar[bool] = False
     is_invalid_while_active: ClassVar[bool] = False
@@ -124,24 +157,25 @@ class SignalCheck:
         """
         return np.ones_like(errors.mean)
 
-    def on_row(self, time_ns: int, values: tuple[float, ...]) -> list[Finding]:
-        """Check a row, inputs first; values are NaN where missing."""
-        return []
+    def update(self, row: CheckRow) -> list[Finding]:
+        """Check a row. A finding that is out raises its alarm, another one clears it."""
+        raise NotImplementedError
 
-    def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Finding]:
-        """Check the outputs of a row."""
-        return []
+    def changes(self, findings: Sequence[Finding]) -> list[AlarmChange]:
+        """Changes of the check's alarms by its findings."""
+        changes: list[AlarmChange] = []
+        for i, judgement, unit, text, time_ns in findings:
+            change = self.alarms[i].update(judgement, unit, time_ns)
+            if change is not None:
+                if self.signals[i] != PLANT:
+                    change.contributions = {self.signals[i]: 1.0}
+                change.text, change.suspects = text, [SuspectedCause(self.cause, 1.0, kind=SENSOR)]
+                changes.append(change)
+        return changes
 
-    def on_residuals(self, time_ns: int, e: list[float], scales: list[float], units: list[str]) -> list[Finding]:
-        """Check the prewhitened residuals of a row; `invalid` are then values that must not enter a memory yet.
-
-        Args:
-            time_ns: time of the row.
-            e: prewhitened residual of each output; NaN where there is none.
-            scales: one standard deviation of each, in the outputs' units.
-            units: units of the outputs.
-        """
-        return []
+    def invalid_values(self) -> Flags:
+        """One flag a value of the newest row, after the changes of its alarms: it is no measurement; empty: all are."""
+        return [alarm.memory.standing for alarm in self.alarms] if self.is_invalid_while_active else self.invalid
 
     def on_gap(self) -> None:
         """Forget what a gap in the rows makes undecidable."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.checks.base import Finding, SignalCheck
+from monitor_node.checks.base import CheckRow, Finding, SignalCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.spc.charts.base import Judgement, format_quantity
@@ -16,16 +16,16 @@ from reactorwatch.spc.charts.base import Judgement, format_quantity
 class RangeCheck(SignalCheck):
     """Compares each input and each output with what the process can have."""
 
-    name, cause = "range", "out_of_range"
+    name, cause, judged = "range", "out_of_range", "signals"
     options: ClassVar = {"dead_band": 0.0}
 
     def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
         self._bounded = [index for index, item in enumerate(ranges) if item.is_bounded]
         super().__init__(config, board, ranges, [config.signals[index] for index in self._bounded])
 
-    def on_row(self, time_ns: int, values: tuple[float, ...]) -> list[Finding]:
+    def update(self, row: CheckRow) -> list[Finding]:
         """See `SignalCheck`."""
-        findings, invalid = list[Finding](), set[int]()
+        findings, invalid, values = list[Finding](), set[int](), row.values
         for alarm, index in enumerate(self._bounded):
             value, (lower, upper, unit) = values[index], self.ranges[index]
             if value != value:  # NaN is not equal to itself

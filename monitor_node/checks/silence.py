@@ -6,10 +6,11 @@ from typing import ClassVar
 import numpy as np
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.checks.base import PLANT, Finding, SignalCheck
+from monitor_node.checks.base import PLANT, CheckRow, Finding, SignalCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.samples import UnusableSamples
 from monitor_node.learn.signal_range import SignalRange
+from reactorwatch.contract.codec import Publication
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.silence import Change, DataTimeout, TimeoutMemory
 from reactorwatch.stored_state import place_records
@@ -29,7 +30,7 @@ class SilenceCheck(SignalCheck):
         unusable: samples of the plant that were refused since the newest usable one; the monitor counts them.
     """
 
-    name = cause = "silence"
+    name, cause, judged = "silence", "silence", "signals"
     options: ClassVar = {"without_off_delay": True, "priority": "high"}
 
     def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
@@ -65,10 +66,13 @@ class SilenceCheck(SignalCheck):
         """Take as silent what the alarms say is silent: the next sample ends it."""
         self.memory.numbers["is_active"] = [alarm.memory.standing for alarm in self.alarms]
 
-    def on_row(self, time_ns: int, values: tuple[float, ...]) -> list[Finding]:
+    def update(self, row: CheckRow) -> list[Finding]:
         """See `SignalCheck`."""
-        changes = self.of_plant.update(time_ns, values)
-        return [finding for i, change in changes for finding in self._findings(i, change)]
+        return [
+            finding
+            for i, change in self.of_plant.update(row.time_ns, row.values)
+            for finding in self._findings(i, change)
+        ]
 
     def postpone(self, now_ns: int) -> None:
         """Restart an expired timer of the plant: a monitor with messages to process cannot say what has not come."""
@@ -82,20 +86,24 @@ class SilenceCheck(SignalCheck):
         plant = self.of_plant
         return self.unusable.in_a_row >= UNUSABLE and plant.deadline_ns() is None and not plant.is_active
 
-    def check(self, now_ns: int) -> list[Finding]:
+    def check(self, now_ns: int) -> list[Publication]:
         """Check the plant's timeout in receive time."""
         if self.is_unusable:
             return self.declare_unusable(now_ns)
-        return self._findings(0, self.of_plant.check(now_ns))
+        return self._publish(now_ns, self.of_plant.check(now_ns))
 
-    def declare_unusable(self, time_ns: int) -> list[Finding]:
+    def declare_unusable(self, time_ns: int) -> list[Publication]:
         """Declare a timeout of a plant without a usable sample, at a receive time."""
         self.memory.numbers["is_active"][0] = True
-        return self._findings(0, Change(time_ns, None))
+        return self._publish(time_ns, Change(time_ns, None))
 
-    def declare_timeout(self) -> list[Finding]:
+    def declare_timeout(self, time_ns: int) -> list[Publication]:
         """Declare a timeout of the plant that was recorded, where the receive time expired it."""
-        return self._findings(0, self.of_plant.declare_timeout())
+        return self._publish(time_ns, self.of_plant.declare_timeout())
+
+    def _publish(self, time_ns: int, change: Change) -> list[Publication]:
+        """Publications of a change of the plant's timeout outside of a row."""
+        return self.board.apply(time_ns, self.changes(self._findings(0, change)))
 
     def _findings(self, index: int, change: Change) -> list[Finding]:
         """The timeout of the plant (index 0) or of a signal, if it changes."""

@@ -7,20 +7,20 @@ from typing import ClassVar
 import numpy as np
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.checks.base import CheckTraining, Finding, SignalCheck
+from monitor_node.checks.base import CheckRow, CheckTraining, Finding, SignalCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Judgement, format_quantity
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.spike import FEWEST_ROWS, Spike, SpikeRate, Spikes, spike_limit
+from reactorwatch.spc.spike import Spikes
 from reactorwatch.spc.training_errors import TrainingErrors, two_sided_tail
 
 
 class SpikeCheck(SignalCheck):
     """Raises an alarm when an output had a spike, and quarantines what may be one."""
 
-    name = cause = "spike"
+    name, cause, judged = "spike", "spike", "residuals"
     options: ClassVar = {"priority": "low", "is_transient": True}
     can_be_false = True
     memory: Spikes
@@ -37,12 +37,7 @@ class SpikeCheck(SignalCheck):
 
     def start(self, training: CheckTraining) -> None:
         """See `SignalCheck`."""
-        given = [[size for size in residuals if isfinite(size)] for residuals in training.e]
-        spikes = [Spike(spike_limit(z, training.arl0)) if len(z) >= FEWEST_ROWS else None for z in given]
-        for spike, count, e in zip(spikes, training.outliers, training.e, strict=True):
-            if spike is not None and count:
-                spike.usual = SpikeRate.learn(count, len(e), training.period_ns, training.arl0)
-        self.memory.of_outputs = spikes
+        self.memory.learn(training.e, training.outliers, training.period_ns, training.arl0)
         self._set_limits()
 
     def _set_limits(self) -> None:
@@ -62,22 +57,22 @@ class SpikeCheck(SignalCheck):
         """See `SignalCheck`."""
         return self.memory.is_ordinary
 
-    def on_residuals(self, time_ns: int, e: list[float], scales: list[float], units: list[str]) -> list[Finding]:
+    def update(self, row: CheckRow) -> list[Finding]:
         """See `SignalCheck`."""
         findings: list[Finding] = []
-        verdicts = self.memory.update(e, is_moved=self.board.has_unexplained)
+        verdicts = self.memory.update(row.values, is_moved=self.board.has_unexplained)
         self.invalid = [verdict.quarantine for verdict in verdicts]
-        for i, (verdict, alarm) in enumerate(zip(verdicts, self.alarms, strict=False)):
-            spike = self.memory.of_outputs[i]
-            if spike is None or not isfinite(e[i]) or not (verdict.spike or alarm.memory.standing):
+        for i, (verdict, spike, alarm) in enumerate(zip(verdicts, self.memory.of_outputs, self.alarms, strict=False)):
+            if spike is None or not isfinite(row.values[i]) or not (verdict.spike or alarm.memory.standing):
                 continue
-            count = 1 if spike.usual is None or not verdict.spike else spike.usual.add(time_ns)
-            is_out, size, text = verdict.spike and count > 0, 0.0, ""
+            usual, size, text = spike.usual, 0.0, ""
+            count = 1 if usual is None or not verdict.spike else usual.add(row.time_ns)
+            is_out = verdict.spike and count > 0
             if is_out:
                 size = verdict.size
-                spiked = format_quantity(size * scales[i], units[i], "+.3g")
+                spiked = format_quantity(size * row.scales[i], row.units[i], "+.3g")
                 text = f"{self.outputs[i]} had a spike of {spiked} one row before; it was left out"
-                if (usual := spike.usual) is not None:
+                if usual is not None:
                     text += f"; {count} spikes in {usual.window_min:.3g} min, where {usual.usual:.2g} are usual"
             findings.append(Finding(i, Judgement(size, 0.0, -spike.limit, spike.limit, is_out), "sd", text))
         return findings

@@ -6,14 +6,13 @@ sample is overdue.
 """
 
 from collections.abc import Mapping, Sequence
-from math import nan
 from typing import Any
 
 import numpy as np
 
-from monitor_node.alarms.alarms import AlarmChange, SuspectedCause
+from monitor_node.alarms.alarms import AlarmChange
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.checks.base import PLANT, CheckTraining, Finding, Flags, SignalCheck
+from monitor_node.checks.base import CheckRow, CheckTraining, Judged, SignalCheck
 from monitor_node.checks.range import RangeCheck
 from monitor_node.checks.silence import SilenceCheck
 from monitor_node.checks.spike import SpikeCheck
@@ -21,16 +20,12 @@ from monitor_node.checks.stuck import StuckCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.arrays import Array
-from reactorwatch.contract.codec import Publication
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.training_errors import TrainingErrors
 from reactorwatch.stored_state import Records, read_memory
 
 CHECKS: tuple[type[SignalCheck], ...] = (SilenceCheck, StuckCheck, SpikeCheck, RangeCheck)
 """The signal checks. A new one: a file beside this one, and a name here."""
-
-SENSOR = "sensor"
-"""Kind of the causes that checks suspect."""
 
 
 class SignalChecks:
@@ -59,12 +54,8 @@ class SignalChecks:
         ranges: Sequence[SignalRange],
         numbers: Records,
     ) -> None:
-        self._board, self._numbers = board, numbers
+        self._numbers = numbers
         self._checks = [check(config, board, ranges) for check in CHECKS]
-        self._row_checks, self._value_checks, self._residual_checks = (
-            [check for check in self._checks if getattr(type(check), hook) is not getattr(SignalCheck, hook)]
-            for hook in ("on_row", "on_values", "on_residuals")
-        )
         self.silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
         self._use_numbers()
 
@@ -132,58 +123,21 @@ class SignalChecks:
 
     # --- rows ------------------------------------------------------------------------------------------------
 
-    def check_row(self, time_ns: int, values: tuple[float, ...], changes: list[AlarmChange]) -> tuple[float, ...]:
-        """Check a row, inputs first; returns its values, with NaN in place of those that are no measurements.
+    def update(self, judged: Judged, row: CheckRow, changes: list[AlarmChange]) -> list[bool]:
+        """Check a row by each check of these values; returns a flag for each that is no measurement.
 
         Args:
-            time_ns: time of the row.
-            values: values of the row.
+            judged: the values of the row.
+            row: the row.
             changes: list to which changes of alarms are added.
         """
-        for check in self._row_checks:
-            invalid = self._find(check, check.on_row(time_ns, values), changes)
-            if True in invalid:
-                values = tuple(nan if is_invalid else value for value, is_invalid in zip(values, invalid, strict=True))
-        return values
-
-    def check_silence(self, now_ns: int) -> list[Publication]:
-        """Check the plant's data timeout in receive time."""
-        return self.publish(self.silence, now_ns, self.silence.check(now_ns))
-
-    def check_values(
-        self, time_ns: int, values: list[float], units: list[str], changes: list[AlarmChange]
-    ) -> list[bool]:
-        """Check the outputs of a row; returns flags of those whose readings are no measurements."""
-        checks = self._value_checks
-        flags = [self._find(check, check.on_values(time_ns, values, units), changes) for check in checks]
-        return _join(flags, len(values))
-
-    def check_residuals(
-        self, time_ns: int, e: list[float], scales: list[float], units: list[str], changes: list[AlarmChange]
-    ) -> list[bool]:
-        """Check the residuals of a row; returns flags of the outputs whose value must not enter a memory yet."""
-        checks = self._residual_checks
-        flags = [self._find(check, check.on_residuals(time_ns, e, scales, units), changes) for check in checks]
-        return _join(flags, len(e))
-
-    def publish(self, check: SignalCheck, time_ns: int, findings: Sequence[Finding]) -> list[Publication]:
-        """Alarms of a check that its findings raise or clear, outside of a row."""
-        changes: list[AlarmChange] = []
-        self._find(check, findings, changes)
-        return self._board.apply(time_ns, changes)
-
-    @staticmethod
-    def _find(check: SignalCheck, findings: Sequence[Finding], changes: list[AlarmChange]) -> Flags:
-        """Add the changes of a check's alarms; returns flags of the signals whose value is no measurement."""
-        for i, judgement, unit, text, own_time_ns in findings:
-            change = check.alarms[i].update(judgement, unit, own_time_ns)
-            if change is None:
-                continue
-            if check.signals[i] != PLANT:
-                change.contributions = {check.signals[i]: 1.0}
-            change.text, change.suspects = text, [SuspectedCause(check.cause, 1.0, kind=SENSOR)]
-            changes.append(change)
-        return [alarm.memory.standing for alarm in check.alarms] if check.is_invalid_while_active else check.invalid
+        flags = [False] * len(row.values)
+        for check in self._checks:
+            if check.judged == judged:
+                changes += check.changes(check.update(row))
+                for i, is_invalid in enumerate(check.invalid_values()):
+                    flags[i] = flags[i] or is_invalid
+        return flags
 
     def on_gap(self) -> None:
         """Forget what is quarantined, as after a gap."""
@@ -194,9 +148,3 @@ class SignalChecks:
         """Drop earlier rows: the publisher was restarted."""
         for check in self._checks:
             check.on_restart()
-
-
-def _join(flags: Sequence[Flags], count: int) -> list[bool]:
-    """Signals with a flag by any check."""
-    given = [item for item in flags if item]
-    return [any(item) for item in zip(*given, strict=True)] if given else [False] * count

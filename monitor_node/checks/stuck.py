@@ -7,14 +7,11 @@ import numpy as np
 
 from monitor_node.alarms.alarms import STUCK_SENSOR
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.checks.base import CheckTraining, Finding, SignalCheck
+from monitor_node.checks.base import CheckRow, CheckTraining, Finding, SignalCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.spc.charts.base import format_quantity
 from reactorwatch.spc.stuck import StuckSensors, quantise
-
-READINGS = "readings"
-"""Unit of the alarm."""
 
 
 class StuckCheck(SignalCheck):
@@ -46,19 +43,18 @@ class StuckCheck(SignalCheck):
             exact = np.array([quantise(reading, step) for reading in given.tolist()]) if step else given
             self.memory.learn(i, exact, training.arl0)
 
-    def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Finding]:
+    def update(self, row: CheckRow) -> list[Finding]:
         """See `SignalCheck`."""
-        findings: list[Finding] = []
         is_active = any(alarm.memory.standing for alarm in self.alarms)
-        if not (self.memory.update(np.array(values), self._resolutions) or is_active):
-            return findings
-        for i, (name, value) in enumerate(zip(self.outputs, values, strict=True)):
-            if isfinite(value):
-                judgement = self.memory.judge(i)
-                reading = format_quantity(value, units[i], ".6g")
-                text = f"{name} is stuck: it has read {reading} {judgement.statistic:.0f} times in a row"
-                findings.append(Finding(i, judgement, READINGS, text))
-        return findings
+        if not (self.memory.update(np.array(row.values), self._resolutions) or is_active):
+            return []
+        readings = enumerate(zip(row.values, row.units, strict=True))
+        return [self._find(i, format_quantity(value, unit, ".6g")) for i, (value, unit) in readings if isfinite(value)]
+
+    def _find(self, i: int, reading: str) -> Finding:
+        judgement = self.memory.judge(i)
+        text = f"{self.outputs[i]} is stuck: it has read {reading} {judgement.statistic:.0f} times in a row"
+        return Finding(i, judgement, "readings", text)
 
     def on_restart(self) -> None:
         """See `SignalCheck`. After a gap equal readings are counted on: it makes them no likelier."""

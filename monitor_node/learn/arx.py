@@ -26,7 +26,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.sampling import regular_intervals
+from monitor_node.ingest.rows import regular_intervals
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError

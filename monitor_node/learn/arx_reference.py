@@ -15,8 +15,7 @@ import msgspec
 import numpy as np
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.rows import MeasuredRow
-from monitor_node.ingest.sampling import regular_intervals
+from monitor_node.ingest.rows import MeasuredRow, regular_intervals
 from monitor_node.learn.arx import ROWS_A_PARAMETER, ArxPredictor, arx_structure, simpler_structures
 from monitor_node.learn.references import Reference, RowPrediction
 from monitor_node.learn.training_rows import RowArrays

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.sampling import regular_intervals
+from monitor_node.ingest.rows import regular_intervals
 from monitor_node.learn.arx import ROWS_A_PARAMETER, arx_structure, fewest_rows
 from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.black_box_reference import BlackBoxReference

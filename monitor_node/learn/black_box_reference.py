@@ -11,7 +11,7 @@ from math import inf, nan
 import msgspec
 import numpy as np
 
-from monitor_node.ingest.sampling import TOLERANCE, regular_intervals
+from monitor_node.ingest.rows import TOLERANCE, regular_intervals
 from monitor_node.learn.references import GATE, FilterReference, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array

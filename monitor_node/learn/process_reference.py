@@ -10,7 +10,7 @@ from math import isfinite, nan
 import msgspec
 import numpy as np
 
-from monitor_node.ingest.sampling import missing_in_intervals
+from monitor_node.ingest.rows import missing_in_intervals
 from monitor_node.learn.references import GATE, FilterReference, PlantEquations, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array

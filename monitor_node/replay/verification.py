@@ -293,14 +293,13 @@ class _Replay:
         return now_ns is not None and alarm.time_ns <= now_ns
 
     def _replay_event(self, alarm: Alarm) -> list[Publication]:
-        signals, board = self.monitor.pipeline.evaluation.signals, self.monitor.alarms
+        silence, board = self.monitor.silence, self.monitor.alarms
         if is_timeout(alarm):
-            silence = signals.silence
             if silence.is_unusable:
-                return signals.publish(silence, alarm.time_ns, silence.declare_unusable(alarm.time_ns))
+                return silence.declare_unusable(alarm.time_ns)
             if alarm.time_ns != silence.of_plant.deadline_ns():
                 return []
-            return signals.publish(silence, alarm.time_ns, silence.declare_timeout())
+            return silence.declare_timeout(alarm.time_ns)
         try:
             action: Action = "comment" if alarm.event == "comment" else Event(alarm.event)
             minutes = (alarm.shelved_until_ns - alarm.time_ns) / MINUTE_NS

@@ -14,7 +14,7 @@ from monitor_node.charts.shift import ShiftWatch
 from monitor_node.checks.base import CheckTraining
 from monitor_node.checks.stage import SignalChecks
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.sampling import SamplingPeriod
+from monitor_node.ingest.rows import SamplingPeriod
 from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.baseline import TrainingResult
 from monitor_node.learn.references import Reference

@@ -16,10 +16,10 @@ from math import isfinite, nan
 from monitor_node.alarms.alarms import AlarmChange
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.causes.stage import Suspicion
+from monitor_node.checks.base import CheckRow
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.health import NODE, Failures
-from monitor_node.ingest.rows import MeasuredRow, Row
-from monitor_node.ingest.sampling import SamplingPeriod
+from monitor_node.ingest.rows import MeasuredRow, Row, SamplingPeriod
 from monitor_node.learn.arx_reference import ArxReference
 from monitor_node.learn.baseline import NO_VALUE, TrainingResult
 from monitor_node.learn.model_update import is_command
@@ -263,8 +263,9 @@ class PlantPipeline:
             self.operation.on_restart()
         self.operation.inputs = measured.inputs
         changes: list[AlarmChange] = []
-        usable = evaluation.signals.check_row(time_ns, row.values, changes)
-        measured.inputs, measured.values = usable[: self._inputs], list(usable[self._inputs :])
+        seen = CheckRow(time_ns, row.values, measured.units)
+        usable = seen.without(evaluation.signals.update("signals", seen, changes))
+        measured.inputs, measured.values = tuple(usable[: self._inputs]), usable[self._inputs :]
         if evaluation.reference is not None and modes.is_judged:
             if row.restarted:
                 evaluation.signals.on_restart()
@@ -272,7 +273,7 @@ class PlantPipeline:
             evaluation.is_ordinary = evaluation.find_ordinary(time_ns, self._sampling)
         else:
             if not modes.is_judged and modes.is_learned:
-                evaluation.signals.check_values(time_ns, measured.values, measured.units, changes)
+                evaluation.signals.update("outputs", CheckRow(time_ns, measured.values, measured.units), changes)
             measured.publications.extend(self._board.apply(time_ns, changes))
             if modes.is_judged:
                 self._train(measured)
@@ -287,10 +288,9 @@ class PlantPipeline:
         before = len(row.publications)
         if memory.left_out:
             self._mask_signals(row, memory.left_out)
-        stuck = signals.check_values(time_ns, row.values, units, changes)
-        if True in stuck:
-            row.values = [nan if still else value for value, still in zip(row.values, stuck, strict=True)]
-        values = row.values
+        seen = CheckRow(time_ns, row.values, units)
+        stuck = signals.update("outputs", seen, changes)
+        row.values = values = seen.without(stuck)
         if row.interval.is_gap:  # the input in it is unknown
             evaluation.restart()
         predictions, sds, extrapolation = reference.update(
@@ -310,7 +310,9 @@ class PlantPipeline:
         if not self.has_judged:
             judged = (*e, *(tested if shift.is_active else ()), *(values if charts.reads_values else ()))
             self.has_judged = any(map(isfinite, judged))
-        memory.quarantined = quarantined = tuple(signals.check_residuals(time_ns, e, scales, units, changes))
+        memory.quarantined = quarantined = tuple(
+            signals.update("residuals", CheckRow(time_ns, e, units, scales), changes)
+        )
         if True in quarantined:
             for whitener, outlier in zip(evaluation.whiteners, quarantined, strict=True):
                 if outlier:

@@ -187,7 +187,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     from reactorwatch.api.diagnosis import diagnose_case
     from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, DiagnosisOptions, load_case, write_report
     from reactorwatch.diagnosis.report.words import describe_verdict
-    from recorder.columns.run_reader import read_segments
+    from recorder.columns import read_segments
     from recorder.view.file import write_rrd
 
     drawing = recording.with_suffix(".rrd")

@@ -23,7 +23,7 @@ from reactorwatch.errors import InputError
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record
-    from recorder.columns.run import RunColumns
+    from recorder.columns import RunColumns
 
 Out = Annotated[Path, Option("--out", "-o", help="The file to write.")]
 
@@ -44,7 +44,7 @@ def dashboard(
     from reactorwatch.api.files import open_messages
     from reactorwatch.cli.diagnosis import DRAWING
     from reactorwatch.cli.progress import task
-    from recorder.columns.run_reader import read_segments
+    from recorder.columns import read_segments
     from recorder.view.file import write_rrd
 
     choice = chosen.choose()

@@ -30,7 +30,7 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
 from reactorwatch.terminal import printable
-from recorder.columns.samples import measured_value
+from recorder.samples import measured_value
 
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process

@@ -2,7 +2,7 @@
 
 The covariance form of the textbooks fails in service: without excitation its forgetting divides the covariance by
 `forgetting` at every row until it overflows, and rounding makes it indefinite. Here the information matrix A is kept
-as factors R' D R (`information.py`). Three things follow.
+as factors R' D R (`rls_update`). Three things follow.
 
 *Nothing need be assumed.* D = 0 is a valid start: no prior, no "large P(0)". Without forgetting the result is the QR
 solution of the batch problem, and as accurate. A column that is dependent on those before it keeps the parameter 0
@@ -42,8 +42,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification import information
-from reactorwatch.identification.information import LARGEST_VALUE
+from reactorwatch.identification import rls_update
+from reactorwatch.identification.rls_update import LARGEST_VALUE
 from reactorwatch.stored_state import Memory
 
 DEFAULT_COVARIANCE_LIMIT = 1e6
@@ -56,7 +56,7 @@ class RlsMemory(Memory):
         parameters: number of parameters.
         forgetting: weight of a row relative to its successor.
         covariance_limit: bound on the eigenvalues of P.
-        numbers: shape (state_size(parameters),), laid out as in `information.py`.
+        numbers: shape (state_size(parameters),), laid out as in `rls_update`.
     """
 
     parameters: int
@@ -115,10 +115,10 @@ class RecursiveLeastSquares:
             covariance_limit = math.inf if forgetting == 1.0 else DEFAULT_COVARIANCE_LIMIT
         if not covariance_limit > 1.0 / LARGEST_VALUE:
             raise InputError(f"covariance_limit must be above {1.0 / LARGEST_VALUE}, got {covariance_limit}")
-        numbers = np.zeros(information.state_size(parameters))
+        numbers = np.zeros(rls_update.state_size(parameters))
         self._use(RlsMemory(parameters, float(forgetting), float(covariance_limit), numbers))
         start = 1.0 / (covariance_limit * forgetting ** (parameters - 1))
-        self._tile[2 * parameters : 3 * parameters] = start
+        self._numbers[2 * parameters : 3 * parameters] = start
 
     @classmethod
     def resume(cls, memory: RlsMemory) -> Self:
@@ -132,17 +132,14 @@ class RecursiveLeastSquares:
         return estimator
 
     def _use(self, memory: RlsMemory) -> None:
-        size = information.state_size(memory.parameters)
+        size = rls_update.state_size(memory.parameters)
         if memory.numbers.shape != (size,):
             raise ValueError(f"{memory.parameters} parameters must have {size} numbers, got {memory.numbers.size}")
         self.memory, self._parameters = memory, memory.parameters
         self._covariance_limit = memory.covariance_limit
-        self._rank_share = information.RANK_SHARE if math.isinf(self._covariance_limit) else 0.0
+        self._rank_share = rls_update.RANK_SHARE if math.isinf(self._covariance_limit) else 0.0
         self._set_forgetting(memory.forgetting)
-        # The tile includes the work space of the kernel: one argument fewer at each update.
-        self._tile = np.zeros((size + information.work_size(memory.parameters), 1))
-        self._tile[:size, 0] = memory.numbers
-        memory.numbers = self._tile[:size, 0]
+        self._numbers, self._work = memory.numbers, np.zeros(memory.parameters)
 
     @property
     def forgetting(self) -> float:
@@ -162,8 +159,8 @@ class RecursiveLeastSquares:
         row = np.ascontiguousarray(regressor, dtype=np.float64)
         if row.ndim != 1 or row.size != self._parameters:
             raise ValueError(f"regressor must have shape ({self._parameters},), got {row.shape}")
-        result = information.learn_one(
-            self._tile, row, float(output), self._forgetting, self._renewal, self._rank_share
+        result = rls_update.update(
+            self._numbers, self._work, row, float(output), self._forgetting, self._renewal, self._rank_share
         )
         if result[0] != result[0]:
             raise ValueError(_describe_invalid(row, output))
@@ -171,7 +168,7 @@ class RecursiveLeastSquares:
 
     def predict(self, regressor: ArrayLike) -> float:
         """Predict an output with the present parameters."""
-        return float(np.dot(np.asarray(regressor, dtype=np.float64), self._tile[: self._parameters, 0]))
+        return float(np.dot(np.asarray(regressor, dtype=np.float64), self._numbers[: self._parameters]))
 
     def set_parameters(self, parameters: ArrayLike) -> None:
         """Set the parameters and keep their uncertainty.
@@ -186,9 +183,9 @@ class RecursiveLeastSquares:
         if theta.shape != (self._parameters,) or not np.all(np.isfinite(theta)):
             raise ValueError(f"parameters must be {self._parameters} finite numbers, got {theta}")
         n = self._parameters
-        self._tile[:n, 0] = theta
-        self._tile[n : 2 * n, 0] = self._factor() @ theta
-        self._tile[4 * n : 5 * n, 0] = 0.0
+        self._numbers[:n] = theta
+        self._numbers[n : 2 * n] = self._factor() @ theta
+        self._numbers[4 * n : 5 * n] = 0.0
 
     def raise_information(self, factor: float) -> None:
         """Count the rows so far as more, so that rows to come change the parameters less.
@@ -202,7 +199,7 @@ class RecursiveLeastSquares:
         if not 1.0 <= factor < math.inf:
             raise ValueError(f"factor must be a number from 1 on, got {factor}")
         n = self._parameters
-        self._tile[2 * n : 3 * n, 0] *= factor
+        self._numbers[2 * n : 3 * n] *= factor
 
     def raise_forgetting(self, forgetting: float) -> None:
         """Raise the forgetting factor from here on, for a recursion that starts with poor parameters.
@@ -217,12 +214,12 @@ class RecursiveLeastSquares:
     @property
     def parameters(self) -> NDArray[np.float64]:
         """Parameters, shape (n,); 0 for one that no row has resolved yet."""
-        return self._tile[: self._parameters, 0].copy()
+        return self._numbers[: self._parameters].copy()
 
     @property
     def rows(self) -> int:
         """Number of rows learned from."""
-        return int(self._sums()[information.ROWS])
+        return int(self._sums()[rls_update.ROWS])
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -249,8 +246,8 @@ class RecursiveLeastSquares:
     def noise_variance(self) -> float:
         """Variance of the residuals; inf until there are more rows than parameters."""
         sums = self._sums()
-        free = sums[information.WEIGHT] - self._parameters * self._weight_share()
-        return float(sums[information.SQUARES] / free) if free > 0.0 else math.inf
+        free = sums[rls_update.WEIGHT] - self._parameters * self._weight_share()
+        return float(sums[rls_update.SQUARES] / free) if free > 0.0 else math.inf
 
     @property
     def parameter_covariance(self) -> NDArray[np.float64]:
@@ -285,18 +282,18 @@ class RecursiveLeastSquares:
     def _factor(self) -> NDArray[np.float64]:
         n = self._parameters
         factor = np.eye(n)
-        factor[np.triu_indices(n, 1)] = self._tile[5 * n + 5 : 5 * n + 5 + n * (n - 1) // 2, 0]
+        factor[np.triu_indices(n, 1)] = self._numbers[5 * n + 5 : 5 * n + 5 + n * (n - 1) // 2]
         return factor
 
     def _diagonal(self) -> NDArray[np.float64]:
-        return np.asarray(self._tile[2 * self._parameters : 3 * self._parameters, 0])
+        return np.asarray(self._numbers[2 * self._parameters : 3 * self._parameters])
 
     def _sums(self) -> NDArray[np.float64]:
-        return np.asarray(self._tile[5 * self._parameters : 5 * self._parameters + 5, 0])
+        return np.asarray(self._numbers[5 * self._parameters : 5 * self._parameters + 5])
 
     def _weight_share(self) -> float:
         sums = self._sums()
-        return float(sums[information.WEIGHT2] / sums[information.WEIGHT]) if sums[information.WEIGHT] > 0.0 else 1.0
+        return float(sums[rls_update.WEIGHT2] / sums[rls_update.WEIGHT]) if sums[rls_update.WEIGHT] > 0.0 else 1.0
 
 
 def _describe_invalid(regressor: NDArray[np.float64], output: float) -> str:

@@ -120,6 +120,10 @@ class Bank(Generic[Kind]):
     Args:
         charts: at least one; each with settings and memory of its own.
 
+    Attributes:
+        kind: kind of the charts.
+        memory: memory of all charts.
+
     Raises:
         InputError: there is none, or they are of several kinds.
     """
@@ -128,9 +132,9 @@ class Bank(Generic[Kind]):
         kinds = {type(chart) for chart in charts}
         if len(kinds) != 1:
             raise InputError(f"charts must be one or more of one kind, got {sorted(kind.__name__ for kind in kinds)}")
-        (self._kind,) = kinds
+        (self.kind,) = kinds
         columns = np.concatenate([chart.memory.numbers for chart in charts], axis=1)
-        self._use(self._kind, SignalMemory(self._kind.name, columns))
+        self._use(self.kind, SignalMemory(self.kind.name, columns))
 
     @classmethod
     def resume(cls, kind: type[Kind], memory: SignalMemory) -> Self:
@@ -144,7 +148,7 @@ class Bank(Generic[Kind]):
         return bank
 
     def _use(self, kind: type[Kind], memory: SignalMemory) -> None:
-        self._kind, self.memory = kind, memory
+        self.kind, self.memory = kind, memory
         self._columns = columns = columns_of(kind, memory)
         plants, self._kernel = columns.shape[1], _entry(kind)
         self._numbers = self._columns.reshape(-1).data  # all of them, one row after the other
@@ -180,7 +184,7 @@ class Bank(Generic[Kind]):
             raise ValueError(f"plant {plant}: a chart takes finite values below {LARGEST_VALUE:g}, got {x[plant]}")
         columns[X] = np.where(present, x, 0.0)
         columns[PRESENT] = present
-        self._kind.kernel(columns)
+        self.kind.kernel(columns)
         points = columns[STATISTIC:OUT].copy()
         points[:, ~present] = np.nan
         return Judgements(points[0], points[1], points[2], points[3], present & (columns[OUT] > 0.0))
@@ -209,7 +213,7 @@ class Bank(Generic[Kind]):
 
     def restart(self, plants: NDArray[np.bool_] | int | None = None) -> None:
         """Forget the values seen: of all plants, of those that are True, or of one by its index."""
-        _restart(self._columns, self._kind.memories, slice(None) if plants is None else plants)
+        _restart(self._columns, self.kind.memories, slice(None) if plants is None else plants)
 
     def chart(self, plant: int) -> Kind:
         """A copy of one plant's chart, in the single form.
@@ -219,7 +223,7 @@ class Bank(Generic[Kind]):
         """
         if not 0 <= plant < self._columns.shape[1]:
             raise IndexError(f"plant must be in 0..{self._columns.shape[1] - 1}, got {plant}")
-        return self._kind.resume(SignalMemory(self._kind.name, self._columns[SETTINGS:, plant : plant + 1].copy()))
+        return self.kind.resume(SignalMemory(self.kind.name, self._columns[SETTINGS:, plant : plant + 1].copy()))
 
 
 @cache

@@ -39,7 +39,7 @@ alarm at each.
 """
 
 from collections.abc import Sequence
-from math import ceil, log, sqrt
+from math import ceil, isfinite, log, sqrt
 from statistics import median
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -256,6 +256,23 @@ class Spikes(Memory):
     """
 
     of_outputs: list[Spike | None] = field(default_factory=list)
+
+    def learn(self, e: Sequence[Sequence[float]], outliers: Sequence[int], period_ns: float, arl0: float) -> None:
+        """Learn from a training; an output with too few residuals has no method.
+
+        Args:
+            e: standardised residuals of each output in order of time; NaN where there is none.
+            outliers: number of outliers of each output.
+            period_ns: sampling period.
+            arl0: least mean number of rows between two false alarms of an output.
+        """
+        self.of_outputs = []
+        for residuals, count in zip(e, outliers, strict=True):
+            z = [size for size in residuals if isfinite(size)]
+            spike = Spike(spike_limit(z, arl0)) if len(z) >= FEWEST_ROWS else None
+            if spike is not None and count:
+                spike.usual = SpikeRate.learn(count, len(residuals), period_ns, arl0)
+            self.of_outputs.append(spike)
 
     @property
     def is_ordinary(self) -> bool:

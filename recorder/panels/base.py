@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.columns.run import RunColumns
+from recorder.columns import RunColumns
 
 
 class Colour(NamedTuple):

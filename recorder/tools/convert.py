@@ -23,11 +23,11 @@ from reactorwatch.records.several_files import join_files
 from reactorwatch.records.source_text import is_table
 from reactorwatch.records.write_table import write_table
 from recorder import RecordedMessage
-from recorder.columns.run import signal_roles
-from recorder.columns.samples import ContinuousTime, SampleSeries, decode_messages
+from recorder.columns import signal_roles
 from recorder.files.metadata import CLOCK, NO_CLOCK, PROCESS, ZERO_NS, process_metadata
 from recorder.files.recording import Recording, has_clock, zero_from
 from recorder.files.writer import RecordingWriter
+from recorder.samples import RunSplitter, SampleSeries, decode_messages
 from recorder.tools.player import samples_of
 
 
@@ -71,7 +71,7 @@ def import_csv(
         metadata[CLOCK] = NO_CLOCK
         zero_ns = record.stored_zero_ns
     _check_times(files[0], record, zero_ns)
-    received = ContinuousTime()
+    received = RunSplitter()
     with (
         atomic_write(mcap) as temporary,
         RecordingWriter(temporary, {**metadata, ZERO_NS: str(zero_ns)}) as writer,

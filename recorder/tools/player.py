@@ -3,7 +3,7 @@
 The rate refers to sample times, not to times of receipt: CSV records have only those, and a recording of an accelerated
 plant is that of the same plant. Messages are published in the order of receipt; one with an older sample than the one
 before is published at once. After the plant's clock stepped back, the next run follows one row after the run before
-(`ContinuousTime`).
+(`RunSplitter.continuous_ns`).
 """
 
 import math
@@ -17,8 +17,8 @@ from reactorwatch.contract.codec import Body, Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS, Record, to_time_ns
 from recorder import RecordedMessage
-from recorder.columns.samples import ContinuousTime, decode_messages
 from recorder.keep import STATES
+from recorder.samples import RunSplitter, decode_messages
 
 LONG_WAIT_NS = MINUTE_NS
 JUMP = 2.0
@@ -125,7 +125,7 @@ def filter_time(publications: Iterable[Publication], from_ns: int, to_ns: int) -
 
 def _schedule(tape: Iterable[Publication]) -> Iterator[tuple[Publication, int]]:
     """Add to each publication its time, continuous over the runs of its plant."""
-    clocks = defaultdict[str, ContinuousTime](ContinuousTime)
+    clocks = defaultdict[str, RunSplitter](RunSplitter)
     first: list[Publication] | None = []  # latched messages before all else: they are due with what follows them
     for publication in tape:
         if first is not None and type(publication.message) in STATES:

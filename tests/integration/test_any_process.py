@@ -17,7 +17,7 @@ from reactorwatch.contract.codec import decode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate
 from reactorwatch.description.find import find_process
 from reactorwatch.runtime.loopback import free_endpoint
-from recorder.columns.run_reader import read_segments
+from recorder.columns import read_segments
 from recorder.files.recording import Recording
 from recorder.panels import signals
 from recorder.panels.base import TimePlot

@@ -22,8 +22,7 @@ from reactorwatch.process import MODELS
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
 from reactorwatch.spc.charts.base import format_quantity
-from recorder.columns.run import find_model, signal_title
-from recorder.columns.run_reader import read_run
+from recorder.columns import find_model, read_run, signal_title
 from recorder.files.recording import Recording
 from recorder.panels.signals import OVERVIEW
 from recorder.tools.convert import import_csv, read_record

@@ -24,7 +24,7 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record
 from reactorwatch.records.write_table import write_table
 from reactorwatch.runtime.model_file import write_extended_model
-from recorder.columns.run_reader import read_run
+from recorder.columns import read_run
 from recorder.tools.convert import import_csv, read_record
 from recorder.tools.inspect import inspect
 

@@ -55,7 +55,7 @@ def health_message(said: list[Publication], plant: str) -> Health:
     [
         (PlantPipeline, "update", "row"),
         (ChartWatch, "update", "row"),
-        (SilenceCheck, "on_row", "row"),
+        (SilenceCheck, "update", "row"),
         (Annunciator, "end_row", "row"),
         (PlantPipeline, "snapshots", "models"),
     ],
@@ -177,10 +177,10 @@ def test_no_hypothesis_that_overflowed_is_followed() -> None:
         times,
         times[:, None],
         np.zeros((30, 2)),
-        np.zeros((30, 2)),
-        np.ones((30, 2), bool),
-        times[:, None],
-        times[:, None, None],
+        residual=np.zeros((30, 2)),
+        used=np.ones((30, 2), bool),
+        x=times[:, None],
+        covariance=times[:, None, None],
     )
     assert scan_candidates(CAUSES, scan, window) == []
 

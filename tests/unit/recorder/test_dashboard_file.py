@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from reactorwatch.errors import InputError
-from recorder.columns.run import RunColumns, SampleColumns
-from recorder.columns.run_reader import read_run, read_segments
+from recorder.columns import RunColumns, SampleColumns, read_run, read_segments
 from recorder.panels import PANELS
 from recorder.panels.base import (
     MEASURED,
@@ -28,8 +27,8 @@ from recorder.panels.base import (
     View,
     ViewReference,
 )
+from recorder.view.drawing import BATCH_ROWS, RUN_TIME, SAMPLE_TIME
 from recorder.view.file import read_time_plots, write_rrd, write_views
-from recorder.view.stream import BATCH_ROWS, RUN_TIME, SAMPLE_TIME
 from recorder.view.viewer import viewer_program
 from tests.unit.recorder import golden
 

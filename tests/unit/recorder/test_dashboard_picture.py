@@ -14,7 +14,7 @@ from PIL import Image
 
 from docs.pictures.picture import count_coloured, render_tabs
 from reactorwatch.errors import InputError
-from recorder.columns.run_reader import read_run
+from recorder.columns import read_run
 from recorder.panels.base import ALARM, INPUT, MEASURED, PREDICTED, RESIDUAL, UNSTABLE, Colour, Series, TimePlot
 from recorder.view.file import write_rrd, write_views
 from tests.unit.recorder import golden

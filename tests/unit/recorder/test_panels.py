@@ -13,7 +13,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
-from recorder.columns.run import (
+from recorder.columns import (
     ADAPTIVE,
     EQUATIONS,
     FROZEN,
@@ -21,9 +21,11 @@ from recorder.columns.run import (
     ChartColumns,
     ReconstructionColumns,
     RunColumns,
+    RunReader,
     SampleColumns,
+    read_run,
+    read_segments,
 )
-from recorder.columns.run_reader import RunReader, read_run, read_segments
 from recorder.panels import PANELS, phase_plane, signals, status
 from recorder.panels.base import ALARM, EventLog, Panel, PlanePlot, StateLines, TimePlot, View, ViewReference
 from tests.unit.recorder import golden

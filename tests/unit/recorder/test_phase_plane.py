@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, steady_states
-from recorder.columns.run import RunColumns, SampleColumns, SignalStatistics
-from recorder.columns.run_reader import read_run, read_segments
+from recorder.columns import RunColumns, SampleColumns, SignalStatistics, read_run, read_segments
 from recorder.panels import phase_plane
 from recorder.panels.base import STABLE, UNSTABLE, PlanePlot
 from tests.tables import UNITS

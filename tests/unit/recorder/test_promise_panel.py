@@ -5,7 +5,7 @@ import numpy as np
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Power, Promise
-from recorder.columns.run_reader import read_run
+from recorder.columns import read_run
 from recorder.panels.base import ALARM, EventLog, TimePlot
 from recorder.panels.status import PROMISE
 

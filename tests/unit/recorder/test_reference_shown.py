@@ -6,8 +6,7 @@ import pytest
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, encode
 from recorder import RecordedMessage
-from recorder.columns.run import ADAPTIVE, RunColumns
-from recorder.columns.run_reader import read_run, read_segments
+from recorder.columns import ADAPTIVE, RunColumns, read_run, read_segments
 from recorder.panels import signals
 from recorder.panels.base import TimePlot
 

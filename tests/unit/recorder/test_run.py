@@ -7,8 +7,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
-from recorder.columns.run import ADAPTIVE, EQUATIONS, FROZEN, REFERENCE, RunColumns, SegmentContext
-from recorder.columns.run_reader import read_run, read_segments
+from recorder.columns import ADAPTIVE, EQUATIONS, FROZEN, REFERENCE, RunColumns, SegmentContext, read_run, read_segments
 from tests.unit.recorder import golden
 
 

@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
-from recorder.columns.samples import ContinuousTime, RunSplitter
+from recorder.samples import RunSplitter
 
 PERIOD = 6_000_000_000
 SIGNALS = ("qc", "C", "T")
@@ -97,7 +97,7 @@ def test_a_publisher_without_sequence_numbers_has_one_run_while_its_clock_advanc
 
 @given(sessions())
 def test_continuous_times_increase_and_keep_the_spacing_of_rows(runs: list[Session]) -> None:
-    clock = ContinuousTime()
+    clock = RunSplitter()
     found = [
         (run, clock.continuous_ns(signal, Sample(sequence=n, time_ns=t)), t) for run, signal, n, t in samples(runs, 0)
     ]
@@ -110,7 +110,7 @@ def test_continuous_times_increase_and_keep_the_spacing_of_rows(runs: list[Sessi
 
 
 def test_messages_about_the_run_before_stay_with_it() -> None:
-    clock = ContinuousTime()
+    clock = RunSplitter()
     for number in range(10):
         clock.continuous_ns(T, Sample(sequence=number, time_ns=number * PERIOD))
     assert clock.continuous_ns(T, Sample(sequence=0, time_ns=2 * PERIOD)) == 10 * PERIOD

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.columns.samples import SampleSeries
+from recorder.samples import SampleSeries
 
 PERIOD = 6_000_000_000
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.columns.samples import MAX_GAPS, SequenceCounter
+from recorder.samples import MAX_GAPS, SequenceCounter
 
 
 def counted(sequences: list[int]) -> tuple[int, int, int]:

@@ -9,7 +9,7 @@ from reactorwatch.cli.recording_reports import info_object, info_text
 from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import Record
 from recorder import RecordedMessage
-from recorder.columns.run_reader import read_run
+from recorder.columns import read_run
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import export_csv, read_record

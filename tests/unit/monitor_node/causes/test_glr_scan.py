@@ -49,7 +49,7 @@ def check_promise(effect: Effect, profile: type[FittedProfile], window: Window, 
     span = float(window.time_min[-1]) - onset_min if profile is Ramp else 1.0
     little = 0.02 / np.sqrt(b)
     sizes = (0.0, little, -little) if effect.lower < 0 else (0.0, little)
-    found = [hypothesis.evaluate(window.run, (np.array([by * span, onset_min]),)) for by in sizes]
+    found = [hypothesis.evaluate(window, (np.array([by * span, onset_min]),)) for by in sizes]
     none, up = (np.nan_to_num(item.w) for item in found[:2])
     down = np.nan_to_num(found[2].w) if effect.lower < 0 else 2 * none - up
     signature = (down - up) / (2 * little)

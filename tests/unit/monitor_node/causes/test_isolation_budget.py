@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from monitor_node.alarms.annunciator import STOPPED
 from monitor_node.causes.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, UNKNOWN, Isolation
-from monitor_node.causes.reconstruction import START_STEPS, START_STEPS_A_ROW, Reconstruction, ReconstructionMemory
+from monitor_node.causes.stage import START_STEPS, START_STEPS_A_ROW, Reconstruction, ReconstructionMemory
 from monitor_node.causes.window import Row
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor

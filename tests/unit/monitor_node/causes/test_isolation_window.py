@@ -94,7 +94,7 @@ def test_where_the_input_is_missing_it_is_as_it_was(rows: list[Row]) -> None:
 
 
 def test_nothing_sets_in_while_the_filter_settles(rows: list[Row]) -> None:
-    assert settled(rows).span_min == pytest.approx(rows[-1][0] - rows[BURN_IN_ROWS - 1][0])
+    assert settled(rows).onset_span_min == pytest.approx(rows[-1][0] - rows[BURN_IN_ROWS - 1][0])
     assert window_of(rows[:BURN_IN_ROWS], Filter(cstr(), SENSORS)) is None
     assert window_of([], Filter(cstr(), SENSORS)) is None
 

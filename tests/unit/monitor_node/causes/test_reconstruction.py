@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from monitor_node.causes.reconstruction import Reconstruction, ReconstructionMemory
+from monitor_node.causes.stage import Reconstruction, ReconstructionMemory
 from monitor_node.causes.window import Row
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import NoiseLevels

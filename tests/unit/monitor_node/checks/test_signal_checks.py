@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.checks.base import CheckTraining
+from monitor_node.checks.base import CheckRow, CheckTraining
 from monitor_node.checks.stage import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -130,9 +130,9 @@ def test_rows_change_neither_a_memory_that_was_stored_before_nor_one_that_was_re
     checks[1].resume(kept.signals, 0)
     for check in checks:
         for row in range(1, 30):
-            check.check_row(row * 10**9, (1.0, *values), [])
-            check.check_values(row * 10**9, values, units, [])
-            check.check_residuals(row * 10**9, [9.0 * (row % 3), 0.1], [1.0, 1.0], units, [])
+            check.update("signals", CheckRow(row * 10**9, (1.0, *values), units), [])
+            check.update("outputs", CheckRow(row * 10**9, values, units), [])
+            check.update("residuals", CheckRow(row * 10**9, [9.0 * (row % 3), 0.1], units, [1.0, 1.0]), [])
     after = [ChecksMemory(check.memory).to_bytes() for check in checks]
     assert after[0] == after[1] != before
     assert kept.to_bytes() == before

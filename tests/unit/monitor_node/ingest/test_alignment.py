@@ -153,3 +153,128 @@ def test_memory_is_bounded_whatever_comes() -> None:
 def test_a_reordering_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match=r"reorder_rows must be at least 1, got 0"):
         Aligner(SIGNALS, 0)
+
+
+def test_every_row_is_counted() -> None:
+    aligner = Aligner(SIGNALS, 1)
+    rows = feed(aligner, [item for item in in_order(6) if item != ("T", 2)]) + aligner.flush()
+    assert aligner.memory.counts.rows == len(rows) == 6
+
+
+def test_the_end_of_a_record_gives_the_pending_rows_in_the_order_of_time() -> None:
+    aligner = Aligner(SIGNALS, 8)
+    feed(aligner, [*in_order(1), ("qc", 3), ("qc", 1), ("qc", 2)])
+    assert numbers(aligner.flush()) == [1, 2, 3]
+    assert aligner.flush() == []
+
+
+def test_a_row_is_never_ahead_of_an_older_one_that_is_pending() -> None:
+    """T is published in every second row, so the next T is no evidence that the row before it is complete."""
+    aligner, rows = Aligner(SIGNALS, 3), list[Row]()
+    for number in range(20):
+        for signal in SIGNALS[: 2 + (number + 1) % 2]:
+            sequence = number // 2 if signal == "T" else number
+            rows += aligner.update(signal, number * PERIOD, sequence, 0.0)
+    rows += aligner.flush()
+    assert numbers(rows) == list(range(20))
+    assert aligner.memory.counts.incomplete_rows == 10
+
+
+def test_after_an_incomplete_row_a_row_that_is_lost_is_waited_for() -> None:
+    """The number that is missing in a row is the one after that of the row before."""
+    aligner = Aligner(SIGNALS, 2)
+    before = [("qc", 1), ("C", 1), ("qc", 2), ("qc", 3)]
+    assert numbers(feed(aligner, [*in_order(1), *before])) == [0, 1]
+    assert numbers(feed(aligner, [("C", 2), ("C", 3), ("T", 3)])) == []
+    assert numbers(feed(aligner, [("T", 2)])) == [2, 3]
+    again = Aligner(SIGNALS, 2)
+    assert numbers(feed(again, [*in_order(1), ("qc", 1), ("C", 1), ("qc", 3), ("qc", 4)])) == [0, 1]
+    assert numbers(feed(again, [("C", 3), ("T", 3)])) == []
+    assert numbers(feed(again, [("qc", 2), ("C", 2), ("T", 2)])) == [2, 3]
+
+
+def test_after_an_incomplete_row_behind_a_lost_one_the_next_row_is_ready_at_once() -> None:
+    aligner = Aligner(SIGNALS, 2)
+    rows = feed(aligner, [*in_order(1), ("qc", 2), ("C", 2), ("qc", 3), ("qc", 4)])
+    assert numbers(rows) == [0, 2]
+    assert numbers(feed(aligner, [("C", 3), ("T", 3)])) == [3]
+
+
+def test_a_sample_of_the_incomplete_row_emitted_last_is_late() -> None:
+    aligner = Aligner(SIGNALS, 1)
+    assert numbers(feed(aligner, [*in_order(1), ("qc", 1), ("qc", 2)])) == [0, 1]
+    assert feed(aligner, [("C", 1)]) == []
+    assert aligner.memory.counts.late == 1
+    assert numbers(feed(aligner, [("C", 2), ("T", 2)])) == [2]
+
+
+def test_another_number_at_the_time_of_the_newest_sample_is_a_duplicate_and_no_restart() -> None:
+    aligner = Aligner(SIGNALS, 2)
+    feed(aligner, in_order(5))
+    assert aligner.update("T", 4 * PERIOD, 5, 0.0) == []
+    assert numbers(feed(aligner, [(signal, 5) for signal in SIGNALS])) == [5]
+    counts = aligner.memory.counts
+    assert (counts.restarts, counts.duplicated, counts.lost) == (0, 1, 0)
+
+
+@pytest.mark.parametrize(("sequence", "restarts"), [(42, 0), (41, 1)])
+def test_a_step_back_is_a_restart_if_it_is_more_than_four_times_the_reordering(sequence: int, restarts: int) -> None:
+    aligner = Aligner(SIGNALS, 2)
+    feed(aligner, in_order(50))
+    aligner.update("T", sequence * PERIOD - 1, sequence, 0.0)
+    assert aligner.memory.counts.restarts == restarts
+
+
+@pytest.mark.parametrize(("first", "restarts"), [(0, 1), (1, 0), (2, 0)])
+def test_a_small_step_back_at_a_later_time_is_a_restart_if_it_is_to_zero(first: int, restarts: int) -> None:
+    aligner = Aligner(SIGNALS, 4)
+    feed(aligner, in_order(3))
+    rows = [
+        row for number in range(3) for signal in SIGNALS
+        for row in aligner.update(signal, (10 + number) * PERIOD, first + number, 1.0)
+    ]  # fmt: skip
+    assert numbers(rows + aligner.flush()) == [10, 11, 12]
+    assert aligner.memory.counts.restarts == restarts
+    assert aligner.memory.counts.lost == 0
+
+
+def test_a_clock_that_is_set_back_starts_a_run_though_the_numbers_continue() -> None:
+    aligner = Aligner(SIGNALS, 2)
+    feed(aligner, in_order(50))
+    rows = [
+        row for number in range(3) for signal in SIGNALS
+        for row in aligner.update(signal, (10 + number) * PERIOD, 50 + number, 1.0)
+    ]  # fmt: skip
+    assert numbers(rows) == [10, 11, 12]
+    assert [row.restarted for row in rows] == [True, False, False]
+    assert aligner.memory.counts.restarts == 1
+
+
+def test_numbers_that_are_used_again_at_later_times_are_in_order_by_their_times() -> None:
+    aligner = Aligner(("T",), 4)
+    for number in range(10):
+        aligner.update("T", number * PERIOD, number, 0.0)
+    for time, sequence in ((10, 5), (12, 7), (11, 6)):
+        aligner.update("T", time * PERIOD, sequence, 0.0)
+    assert aligner.memory.counts.out_of_order == 1
+    assert aligner.memory.counts.restarts == 0
+
+
+def test_a_sample_ahead_of_the_first_is_out_of_order_and_was_never_lost() -> None:
+    aligner = Aligner(SIGNALS, 4)
+    feed(aligner, [("qc", 1), ("qc", 0)])
+    assert aligner.memory.counts.out_of_order == 1
+    assert aligner.memory.counts.lost == 0
+
+
+def test_the_count_of_lost_samples_fits_into_a_message_whatever_the_numbers_are() -> None:
+    aligner = Aligner(SIGNALS, 4)
+    for run in range(4):
+        aligner.update("T", 2 * run * PERIOD, 0, 0.0)
+        aligner.update("T", (2 * run + 1) * PERIOD, 2**62 - 1, 0.0)
+        assert 2**62 - 2 <= aligner.memory.counts.lost < 2**63
+    assert aligner.memory.counts.restarts == 3
+
+
+def test_a_reordering_of_one_row_is_accepted() -> None:
+    assert numbers(feed(Aligner(SIGNALS, 1), in_order(3))) == [0, 1, 2]

@@ -158,3 +158,184 @@ def test_memory_is_bounded() -> None:
     for _ in range(10_000):
         run.update(HeldSample(draw.randrange(2**40), draw.randrange(1000), 0.0, "K"), REORDER_ROWS)
         assert len(run.held) < CONFIRMED
+
+
+def uneven(off: float, count: int = 100) -> list[HeldSample]:
+    """A plant whose periods are longer and shorter by a share, in turn."""
+    return [
+        HeldSample(round((row + off * (row % 2 - 0.5)) * PERIOD), row, float(row), "K") for row in range(count)
+    ]  # fmt: skip
+
+
+def delays(samples: list[HeldSample], more: list[HeldSample]) -> list[int]:
+    """Number of samples after each of `more` before it is accepted, where all are."""
+    run = SequenceCheck()
+    taken(samples, run)
+    arrived, accepted = dict[HeldSample, int](), dict[HeldSample, int]()
+    for index, sample in enumerate(more):
+        arrived[sample] = index
+        of_run, strange = run.update(sample, REORDER_ROWS)
+        assert not strange
+        accepted |= dict.fromkeys(of_run, index)
+    return [accepted[sample] - arrived[sample] for sample in accepted]
+
+
+@pytest.mark.parametrize(
+    ("more", "longest"),
+    [
+        (regular(100, 9, 100 * PERIOD), 0),
+        (regular(100, 9, 1000 * PERIOD), 1),
+        (regular(100, 9, -1000 * PERIOD), 2),
+        (regular(0, 9, 1000 * PERIOD), 7),
+        (regular(0, 9, -1000 * PERIOD), 7),
+    ],
+    ids=["none", "pause", "clock set back", "restart", "restart with the clock set back"],
+)
+def test_a_pause_delays_one_sample_a_set_clock_two_and_a_restart_seven(more: list[HeldSample], longest: int) -> None:
+    found = delays(regular(0, 100), more)
+    assert len(found) == len(more)
+    assert found == [*range(longest, 0, -1), *[0] * (len(more) - longest)]
+
+
+@pytest.mark.parametrize("off", [0.0, 0.1])
+def test_the_next_sample_follows_within_a_quarter_of_the_spacing_and_four_mean_deviations(off: float) -> None:
+    samples = uneven(off)
+    for share, follows in ((0.999, True), (1.001, False)):
+        for sign in (-1, 1):
+            run = SequenceCheck()
+            taken(samples, run)
+            usual = run.spacing
+            assert usual.mean_ns == pytest.approx(PERIOD, rel=0.02)
+            assert usual.deviation_ns == pytest.approx(off * PERIOD, rel=0.1)
+            allowed_ns = 0.25 * usual.mean_ns + 4.0 * usual.deviation_ns
+            time_ns = round(samples[-1].time_ns + usual.mean_ns + sign * share * allowed_ns)
+            assert run.accept_next(100, time_ns) is follows
+
+
+@pytest.mark.parametrize(("late", "is_learned"), [(0.005, False), (-0.005, False), (0.02, True), (-0.02, True)])
+def test_only_a_spacing_that_deviates_by_more_than_a_hundredth_updates_the_mean(late: float, is_learned: bool) -> None:
+    run = SequenceCheck()
+    taken(regular(0, 100), run)
+    before = run.spacing.mean_ns
+    assert run.accept_next(100, round((100 + late) * PERIOD))
+    assert (run.spacing.mean_ns - before) / PERIOD == pytest.approx(late / 16 if is_learned else 0.0)
+
+
+def test_the_spacing_is_learned_for_each_number_where_samples_are_missing() -> None:
+    run = SequenceCheck()
+    taken(regular(0, 100)[::3], run)
+    assert run.spacing.mean_ns == PERIOD
+
+
+def test_a_sample_that_is_sent_twice_is_of_the_run_both_times() -> None:
+    """The alignment counts it as a duplicate."""
+    samples = regular(0, 100)
+    twice = [sample for sample in samples for _ in range(2)]
+    assert taken(twice) == (twice, [])
+
+
+@pytest.mark.parametrize(("rows", "follows"), [(32, True), (33, False)])
+def test_a_late_sample_follows_backwards_as_far_as_rows_are_remembered(rows: int, follows: bool) -> None:
+    samples, after = regular(0, 100), regular(100, 3, 100 * PERIOD)
+    late = samples.pop(99 - rows)
+    expected = ([*samples, late, *after], []) if follows else ([*samples, *after], [late])
+    assert taken([*samples, late, *after]) == expected
+
+
+@pytest.mark.parametrize(("periods", "follows"), [(0, False), (-1, False), (1, True), (4, True), (5, False)])
+def test_before_the_spacing_is_known_a_sample_follows_within_four_times_its_mean(periods: int, follows: bool) -> None:
+    samples = regular(0, 6)
+    run = SequenceCheck()
+    taken(samples, run)
+    sample = HeldSample(samples[-1].time_ns + periods * PERIOD, 6, 0.0, "K")
+    assert run.update(sample, REORDER_ROWS) == (([sample] if follows else []), [])
+
+
+def test_a_sample_at_the_time_of_its_predecessor_is_refused_however_irregular_the_run_is() -> None:
+    """Four mean deviations are then more than a spacing."""
+    samples = uneven(0.9)
+    run = SequenceCheck()
+    taken(samples, run)
+    assert 4.0 * run.spacing.deviation_ns > run.spacing.mean_ns
+    assert not run.accept_next(100, samples[-1].time_ns)
+    assert not run.accept_next(100, samples[-1].time_ns - 1)
+    same = HeldSample(samples[-1].time_ns, 100, 0.0, "K")
+    following = HeldSample(100 * PERIOD, 100, 100.0, "K")
+    assert taken([*samples, same, following]) == ([*samples, following], [same])
+
+
+@pytest.mark.parametrize(
+    "strange",
+    [
+        [(101, 1100)],  # its time is far beyond
+        [(100, 99)],  # that of the newest
+        [(101, 103)],  # that of the sample which shows it
+        [(103, 101)],  # its number is that of the sample
+        [(99, 101)],  # or of the newest
+        [(5000, -300), (5001, -299), (70, 4000)],  # two that follow each other, and one more
+        [(100, 1100), (150, 1101)],  # the first has the next number
+        [(5000, -300), (5000, -300)],  # twice the same
+        [(5000, -300), (5004, -300)],  # two of one time
+        [(100, 1100), (101, 1100)],  # two with the next numbers and of one time, which is no pause
+    ],
+)
+def test_held_samples_are_refused_but_those_between_the_run_and_the_sample_that_follows_it(
+    strange: list[tuple[int, int]],
+) -> None:
+    held = [HeldSample(periods * PERIOD, number, 0.0, "K") for number, periods in strange]
+    before, after = regular(0, 100), regular(103, 3, 103 * PERIOD)
+    assert taken([*before, *held, *after]) == ([*before, *after], held)
+
+
+def test_an_early_sample_is_accepted_with_the_one_that_shows_that_it_came_early() -> None:
+    """It is too early to follow by itself, and between the run and the next sample in number and time."""
+    early = HeldSample(round(100.9 * PERIOD), 100, 100.0, "K")
+    samples = [*regular(0, 100), early, *regular(101, 3, 101 * PERIOD)]
+    assert taken(samples) == (samples, [])
+
+
+@pytest.mark.parametrize(
+    ("off", "steps", "is_run"),
+    [
+        (0.0, [(1, 1.0)] * 7, True),
+        (0.0, [(1, 1.0), (1, 0.8)] * 3, False),  # one too few
+        (0.0, [(1, 1.0), (1, 0.8)] * 4, True),
+        (0.0, [(1, 1.0), (1, 0.7)] * 4, False),
+        (0.0, [(1, 1.0), (2, 2.0)] * 4, True),
+        (0.1, [(1, 1.0), (1, 0.4)] * 4, True),
+        (0.1, [(1, 1.0), (1, 0.2)] * 4, False),
+        (0.0, [(32, 32.0)] * 7, True),
+        (0.0, [(33, 33.0)] * 7, False),
+        (0.0, [*[(1, 1.0)] * 3, (33, 33.0), *[(1, 1.0)] * 3], False),
+        (0.0, [(1, -1.0)] * 7, False),
+        (0.0, [(0, 0.0)] * 7, False),
+    ],
+)
+def test_eight_samples_are_a_restart_if_they_follow_each_other_as_evenly_as_the_run(
+    off: float, steps: list[tuple[int, float]], is_run: bool
+) -> None:
+    run = SequenceCheck()
+    taken(uneven(off), run)
+    samples = [HeldSample(-9000 * PERIOD, 7000, 0.0, "K")]
+    for numbers, periods in steps:
+        last = samples[-1]
+        samples.append(HeldSample(last.time_ns + round(periods * PERIOD), last.number + numbers, 0.0, "K"))
+    accepted = [item for sample in samples for item in run.update(sample, REORDER_ROWS)[0]]
+    assert accepted == (samples if is_run else [])
+
+
+def test_samples_whose_times_fall_as_their_numbers_rise_are_no_run_at_the_start_either() -> None:
+    run = SequenceCheck()
+    taken(regular(0, 6), run)
+    falling = [HeldSample(-row * PERIOD, 7000 + row, 0.0, "K") for row in range(20)]
+    assert [item for sample in falling for item in run.update(sample, REORDER_ROWS)[0]] == []
+
+
+@pytest.mark.parametrize("count", [6, 100])
+@pytest.mark.parametrize(("reorder_rows", "confirmed"), [(1, 3), (5, 5), (8, 8), (20, 8)])
+def test_a_restart_takes_fewer_samples_with_a_smaller_reordering(count: int, reorder_rows: int, confirmed: int) -> None:
+    run = SequenceCheck()
+    taken(regular(0, count), run)
+    samples = regular(7000, confirmed, -9000 * PERIOD)
+    accepted = [run.update(sample, reorder_rows)[0] for sample in samples]
+    assert accepted == [*[[]] * (confirmed - 1), samples]

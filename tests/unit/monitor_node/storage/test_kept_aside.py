@@ -266,8 +266,7 @@ def test_a_silence_that_stood_ends_with_the_next_sample(tmp_path: Path, rows: li
     node = start_node(settings_, 0)
     for message in rows[:150]:
         node.on_message(message, 0)
-    signals = own(node).pipeline.evaluation.signals
-    signals.publish(signals.silence, 0, signals.silence.declare_timeout())
+    own(node).silence.declare_timeout(0)
     node.on_stop(0)
     again = start_node(config(tmp_path, order=2), 0)
     assert stands(own(again).alarms.alarm("silence/plant"))

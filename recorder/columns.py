@@ -1,19 +1,24 @@
-"""Convert messages into the columns of a run, at once or segment by segment. Pure.
+"""Messages of a run as columns of numbers, for drawing: the full run, or segment by segment. Pure.
 
-After the plant's clock stepped back, times are shifted to follow the earlier run (`ContinuousTime`).
+Segments allow to draw a recording larger than memory and a run that has not ended. A segment therefore carries the
+context of earlier segments that panels need. After the plant's clock stepped back, times are shifted to follow the
+earlier run (`RunSplitter.continuous_ns`). Numbers are collected in arrays, which take a few bytes a number instead of
+an object, and are cleared after each segment.
 
-Numbers are collected in arrays, which take a few bytes a number instead of an object, and are cleared after each
-segment.
+Signals have meanings and roles from their process, or from the catalogue of processes.
 """
 
+import sys
 from array import array
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
 from operator import attrgetter
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from google.protobuf.message import Message
+from numpy.typing import NDArray
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
@@ -21,22 +26,217 @@ from reactorwatch.contract.alarm_text import NewSuspects
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
+from reactorwatch.process import MODELS
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.units import conversion
 from recorder import RecordedMessage
-from recorder.columns.run import (
-    ADAPTIVE,
-    EQUATIONS,
-    FROZEN,
-    REFERENCE,
-    ChartColumns,
-    EstimateColumns,
-    ReconstructionColumns,
-    RunColumns,
-    SampleColumns,
-    SegmentContext,
-    SignalStatistics,
-)
-from recorder.columns.samples import ContinuousTime, content_of, measured_value
+from recorder.samples import RunSplitter, content_of, measured_value
+
+Times = NDArray[np.int64]
+Values = NDArray[np.float64]
+
+
+class SampleColumns(NamedTuple):
+    """Samples of a signal, each array of shape (samples,), in order of time; NaN where not measured."""
+
+    time_ns: Times
+    value: Values
+
+
+class EstimateColumns(NamedTuple):
+    """Predictions of a signal, each array of shape (estimates,); limits are NaN during training."""
+
+    time_ns: Times
+    prediction: Values
+    residual: Values
+    lower_limit: Values
+    upper_limit: Values
+
+    @property
+    def residual_limits(self) -> tuple[Values, Values]:
+        """Lower and upper limit of the residual."""
+        return self.lower_limit - self.prediction, self.upper_limit - self.prediction
+
+
+class ChartColumns(NamedTuple):
+    """Points of a control chart, each array of shape (points,); `out` is 1 outside the limits, else 0."""
+
+    time_ns: Times
+    statistic: Values
+    centre: Values
+    lower_limit: Values
+    upper_limit: Values
+    out: Values
+
+
+class ReconstructionColumns(NamedTuple):
+    """Reconstructed signal while its sensor is suspected, each array of shape (points,)."""
+
+    time_ns: Times
+    value: Values
+    sd: Values
+
+
+ADAPTIVE, FROZEN, REFERENCE, EQUATIONS = "adaptive", "frozen", "reference", "equations"
+"""Purposes of a model: adaptive; frozen since the training and compared with the adaptive one; reference of the charts;
+equations as the reference, with noise levels as parameters."""
+
+
+class SignalStatistics(NamedTuple):
+    """Number, mean and range of a signal's values so far."""
+
+    rows: int
+    mean: float
+    lowest: float
+    highest: float
+
+
+@dataclass(frozen=True)
+class SegmentContext:
+    """Data of earlier segments.
+
+    Attributes:
+        first_ns: time of the first sample; None if there was none.
+        last_samples: newest two samples by signal, as samples of one time may be in two segments.
+        alarm_states: state of each alarm that was published.
+        onset_ns: onset of the first fault; None if there was none.
+        reference: reference by which rows are judged; empty if unknown.
+        levels: mean of each signal in the first segment that has it: the steady states of a run are computed there.
+    """
+
+    first_ns: int | None = None
+    last_samples: Mapping[str, SampleColumns] = field(default_factory=dict)
+    alarm_states: Mapping[str, int] = field(default_factory=dict)
+    onset_ns: int | None = None
+    reference: str = ""
+    levels: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RunColumns:
+    """Run of one plant, or a segment of it.
+
+    Messages that are drawn one by one have the time of the run as `time_ns`. That of a health report is the time of the
+    newest sample when it was received: reports carry clock time, which is unrelated to sample time for an accelerated
+    plant.
+
+    Attributes:
+        plant: name of the plant; empty without messages.
+        units: units by signal.
+        samples: samples by signal.
+        estimates: predictions by signal, of the reference that judges.
+        estimates_beside: predictions by the recursive ARX model beside it, by signal.
+        charts: chart points by chart and signal, such as `ewma/T`.
+        alarms: changes of alarms in order of time.
+        incidents: incidents with new suspects in order of time.
+        faults: changes of faults in order of time.
+        reconstructions: reconstructed signals.
+        models: snapshots in order of time, by signal and purpose of the model, such as `ADAPTIVE`.
+        health: health reports in order of time, by node.
+        promises: promises of false alarms in order of time.
+        statistics: statistics of each signal up to the end of the segment.
+        context: data of earlier segments.
+        given_zero_ns: time that minutes count from; None for the first sample.
+        process: process of the plant, with the roles of its signals; None: unknown.
+    """
+
+    plant: str
+    units: dict[str, str]
+    samples: dict[str, SampleColumns]
+    estimates: dict[str, EstimateColumns]
+    charts: dict[str, ChartColumns]
+    alarms: tuple[messages.Alarm, ...]
+    faults: tuple[messages.Fault, ...]
+    incidents: tuple[messages.Incident, ...] = ()
+    reconstructions: dict[str, ReconstructionColumns] = field(default_factory=dict)
+    models: dict[tuple[str, str], tuple[messages.ModelSnapshot, ...]] = field(default_factory=dict)
+    health: dict[str, tuple[messages.Health, ...]] = field(default_factory=dict)
+    promises: tuple[messages.Promise, ...] = ()
+    statistics: dict[str, SignalStatistics] = field(default_factory=dict)
+    context: SegmentContext = SegmentContext()
+    given_zero_ns: int | None = None
+    process: Process | None = None
+    estimates_beside: dict[str, EstimateColumns] = field(default_factory=dict)
+
+    @property
+    def reference(self) -> str:
+        """Reference by which the newest rows are judged: `equations`, `black-box` or `arx`; empty if unknown."""
+        named = [item.reference for item in self.health.get("monitor", ()) if item.reference]
+        return named[-1] if named else self.context.reference
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Times of the first and the last sample of the segment; (0, 0) if there is none."""
+        series = [item.time_ns for item in self.samples.values()]
+        return (min(int(t[0]) for t in series), max(int(t[-1]) for t in series)) if series else (0, 0)
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the first sample of the run, earlier segments included; 0 if there is none."""
+        return self.span_ns[0] if self.context.first_ns is None else self.context.first_ns
+
+    @property
+    def zero_ns(self) -> int:
+        """Time that minutes count from."""
+        return self.first_ns if self.given_zero_ns is None else self.given_zero_ns
+
+
+def signal_title(name: str, unit: str, process: Process | None = None) -> str:
+    """Name of a signal, with its meaning if its process has a variable of that name.
+
+    Without a process, it is any of the catalogue whose variable has this unit, too.
+    """
+    for model in _models_of(process):
+        for item in (*model.inputs, *model.states):
+            if item.name == name and (item.unit == unit or process is not None):
+                return f"{name}: {item.meaning}" if item.meaning else name
+    return name
+
+
+def signal_roles(units: Mapping[str, str], process: Process | None = None) -> dict[str, str]:
+    """Roles of signals by name: those of the process in its order, then all others as outputs.
+
+    Args:
+        units: units of the signals, by name; empty: unknown.
+        process: process of the signals; None: the one of the catalogue that has all of them, or all of whose signals
+            are there.
+    """
+    if process is not None:
+        roles = {signal.name: signal.role for signal in process.signals}
+    elif (model := find_model(units) or _find_model_with(units)) is not None:
+        roles = {name: "input" if name in model.input_names else "output" for name in model.units}
+    else:
+        roles = {}
+    known = {name: role for name, role in roles.items() if name in units}
+    return known | {name: "output" for name in units if name not in roles}
+
+
+def find_model(units: Mapping[str, str], process: Process | None = None) -> ProcessModel | None:
+    """Equations, of the catalogue without a process, whose inputs and outputs are all present with the same units."""
+    return next((model for model in _models_of(process) if model.units.items() <= units.items()), None)
+
+
+def _find_model_with(units: Mapping[str, str]) -> ProcessModel | None:
+    """Model of the catalogue that has all of the signals, none of them in another unit."""
+    for model in _models():
+        if all(name in model.units and unit in ("", model.units[name]) for name, unit in units.items()):
+            return model
+    return None
+
+
+def _models_of(process: Process | None) -> tuple[ProcessModel, ...]:
+    """Equations of a process; without its own, those of the catalogue under its name."""
+    if process is None:
+        return _models()
+    if process.model is not None:
+        return (process.model,)
+    return tuple(model for model in _models() if model.name == process.name)
+
+
+@cache
+def _models() -> tuple[ProcessModel, ...]:
+    return tuple(build() for build in MODELS)
+
 
 SEGMENT_MESSAGES = 100_000
 """Messages in a segment, which take about 20 MB while they are drawn."""
@@ -60,10 +260,8 @@ def read_run(recording: Iterable[RecordedMessage | Encoded]) -> RunColumns:
     Raises:
         InputError: the messages are of several plants.
     """
-    reader = RunReader()
-    for entry in recording:
-        reader.add(entry)
-    return reader.next_segment()
+    (run,) = read_segments(recording, sys.maxsize)
+    return run
 
 
 def read_segments(
@@ -92,12 +290,7 @@ def read_segments(
 
 
 class RunReader:
-    """Collects messages and returns them as segments.
-
-    Args:
-        given_zero_ns: see `RunColumns`.
-        process: see `RunColumns`.
-    """
+    """Collects messages and returns them as segments, with the zero and the process of `RunColumns`."""
 
     def __init__(self, given_zero_ns: int | None = None, process: Process | None = None) -> None:
         self._given_zero_ns, self._process = given_zero_ns, process
@@ -106,7 +299,7 @@ class RunReader:
         self._newest_changes: dict[str, tuple[object, ...]] = {}
         self._suspects = NewSuspects()
         self._newest_ns: int | None = None
-        self._clock = ContinuousTime()
+        self._clock = RunSplitter()
         self._statistics: dict[str, SignalStatistics] = {}
         self._context = SegmentContext()
 
@@ -140,16 +333,13 @@ class RunReader:
             time_ns = self._newest_ns
         else:
             time_ns = self._clock.continuous_ns(key, message)
-        if into.kind.numbers is not None:
-            into.append(message, time_ns)
-            if kind == keys.SAMPLE and (self._newest_ns is None or time_ns > self._newest_ns):
-                self._newest_ns = time_ns
-            return
         if kind == keys.ALARM and message.event == SUSPECTED:
             kind, message = keys.INCIDENT, messages.Incident(number=message.incident, suspects=message.suspects)
             topic = keys.Topic(self._plant, kind, str(message.number))
             into = self._keys[keys.key(*topic)] = self._keys.get(keys.key(*topic)) or _Key(topic, _KINDS[kind])
-        if kind == keys.INCIDENT:
+        if kind == keys.SAMPLE:
+            self._newest_ns = time_ns if self._newest_ns is None else max(self._newest_ns, time_ns)
+        elif kind == keys.INCIDENT:
             if not self._suspects.update(message.number, message.suspects):
                 return
         elif kind == keys.ALARM:
@@ -159,8 +349,7 @@ class RunReader:
             self._newest_changes[message.alarm] = change
         elif kind == keys.FAULT:
             message.onset_ns += time_ns - message.time_ns
-        message.time_ns = time_ns
-        into.messages.append(message)
+        into.add(message, time_ns)
 
     def set_zero(self, time_ns: int) -> None:
         """Set the time that minutes count from, before the first segment."""
@@ -232,8 +421,7 @@ def _next_context(run: RunColumns) -> SegmentContext:
     before = run.context
     newest = {name: _newest(before.last_samples.get(name), item) for name, item in run.samples.items()}
     onsets = (change.onset_ns for change in run.faults if change.active)
-    return replace(
-        before,
+    return SegmentContext(
         first_ns=run.first_ns if run.samples or before.first_ns is not None else None,
         last_samples={**before.last_samples, **newest},
         alarm_states={**before.alarm_states, **{change.alarm: change.state for change in run.alarms}},
@@ -265,10 +453,12 @@ def _update_statistics(before: SignalStatistics | None, item: SampleColumns) -> 
     )
 
 
-_Dated = TypeVar("_Dated", messages.ModelSnapshot, messages.Health, messages.Promise)
+def times_of(items: Iterable[Any]) -> Times:
+    """Times of messages."""
+    return np.array([item.time_ns for item in items], np.int64)
 
 
-def _last_of_each_time(items: list[_Dated]) -> tuple[_Dated, ...]:
+def _last_of_each_time(items: list[Any]) -> tuple[Any, ...]:
     """Items in order of time; the last one of equal times counts."""
     newest = {item.time_ns: item for item in items}
     return tuple(newest[time_ns] for time_ns in sorted(newest))
@@ -326,10 +516,12 @@ class _Key:
         self.times, self._numbers = array("q"), array("d")  # numbers are row by row
         self.messages: list[Any] = []
 
-    def append(self, message: Any, time_ns: int) -> None:
-        """Add the numbers of a message, if any, at a time."""
-        numbers = self.kind.numbers(message) if self.kind.numbers is not None else ()
-        if numbers:
+    def add(self, message: Any, time_ns: int) -> None:
+        """Add a message, or its numbers if it has any, at a time."""
+        if self.kind.numbers is None:
+            message.time_ns = time_ns
+            self.messages.append(message)
+        elif numbers := self.kind.numbers(message):
             self.unit = self.unit or getattr(message, "unit", "")
             self.times.append(time_ns)
             self._numbers.extend(numbers)

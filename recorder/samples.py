@@ -8,6 +8,7 @@ run.
 import math
 from array import array
 from bisect import bisect_left
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
@@ -72,6 +73,9 @@ class RunTransition(Enum):
     AFTER_STRAY = "continues the run before the last sample, which was a stray"
 
 
+SAME_RUN = RunTransition.SAME_RUN  # looking it up in the class takes a third of the usual update
+
+
 class _Checkpoint(NamedTuple):
     """State of a counter before its newest sample, restored if that was a stray; `gaps` is a number of gaps."""
 
@@ -122,10 +126,10 @@ class SequenceCounter(GapTracker):
             points.append((sequence, time_ns))
             if len(points) > MAX_POINTS:
                 del points[1 : MAX_POINTS // 2 : 2]
-            return RunTransition.SAME_RUN
+            return SAME_RUN
         if expected is None:
             self.advance(sequence, time_ns)
-            return RunTransition.SAME_RUN
+            return SAME_RUN
         if self._checkpoint is None and len(points) > 1:
             number, then_ns = points[-2]
             self._checkpoint = self._checkpoint_at(number + 1, then_ns)
@@ -214,12 +218,14 @@ class Run:
         last_ns: time of the last sample.
         period_ns: latest sampling period.
         samples: number of samples, strays excluded.
+        shift_ns: shift of its times in `RunSplitter.continuous_ns`.
     """
 
     first_ns: int
     last_ns: int
     period_ns: int = 0
     samples: int = 0
+    shift_ns: int = 0
 
     def add(self, time_ns: int) -> None:
         """Add a sample."""
@@ -249,6 +255,7 @@ class RunSplitter:
         self.current = self.strays = 0
         self._runs: list[Run] = []
         self._last: dict[str, list[tuple[int, int]]] = {}  # run and time of the newest two samples, by signal
+        self._newest_ns, self._period_ns = -(2**63), 0  # newest continuous time, and from the one before to it
 
     @property
     def runs(self) -> list[Run]:
@@ -283,9 +290,37 @@ class RunSplitter:
             del last[0]
         return number
 
-    def run(self, number: int) -> Run:
-        """Run of an index, which `update` returned."""
-        return self._runs[number - 1]
+    def continuous_ns(self, signal: str, message: Any) -> int:
+        """Time of the next message on one axis over all runs.
+
+        A run that starts before the end of the run before is shifted to start one sampling period after it. Samples
+        are assigned to runs by `update`; other messages are about an earlier sample.
+        """
+        time_ns: int = message.time_ns
+        if not isinstance(message, Sample):
+            return time_ns + self._shift_ns(time_ns)
+        runs = len(self._runs)
+        run = self._runs[self.update(signal, message.sequence, time_ns) - 1]
+        starts = len(self._runs) > runs
+        if starts and runs:
+            run.shift_ns = self._runs[-2].shift_ns
+            if time_ns + run.shift_ns <= self._newest_ns:
+                run.shift_ns = self._newest_ns + self._period_ns - time_ns
+        shifted_ns = time_ns + run.shift_ns
+        if shifted_ns > self._newest_ns:
+            if not starts:
+                self._period_ns = shifted_ns - self._newest_ns
+            self._newest_ns = shifted_ns
+        return shifted_ns
+
+    def _shift_ns(self, time_ns: int) -> int:
+        """Shift of a message about an earlier sample."""
+        if not self.current:
+            return 0
+        run = self._runs[self.current - 1]
+        if self.current > 1 and run.last_ns < time_ns <= self._runs[self.current - 2].last_ns:
+            run = self._runs[self.current - 2]  # it concerns the run before
+        return run.shift_ns
 
     def _drop_stray(self, last: list[tuple[int, int]]) -> int:
         """Remove the newest sample of a signal from its run; returns the run of the sample before."""
@@ -301,50 +336,6 @@ class RunSplitter:
         return number
 
 
-class ContinuousTime:
-    """Times of one plant's messages that increase over all runs, for one time axis.
-
-    A run that starts before the end of the run before is shifted to start one sampling period after it.
-    """
-
-    def __init__(self) -> None:
-        self._splitter = RunSplitter()
-        self._shifts_ns: list[int] = []
-        self._newest_ns: int | None = None
-        self._period_ns = 0
-
-    def continuous_ns(self, key: str, message: Any) -> int:
-        """Continuous time of a message; messages must be passed in the order of receipt."""
-        if isinstance(message, Sample):
-            return self._sample_ns(key, message.sequence, message.time_ns)
-        time_ns: int = message.time_ns
-        return time_ns + self.shift_ns(time_ns)
-
-    def _sample_ns(self, signal: str, sequence: int, time_ns: int) -> int:
-        number, newest_ns = self._splitter.update(signal, sequence, time_ns), self._newest_ns
-        starts = number > len(self._shifts_ns)
-        if starts:
-            shift_ns = self._shifts_ns[self._splitter.current - 2] if self._shifts_ns else 0
-            if newest_ns is not None and time_ns + shift_ns <= newest_ns:
-                shift_ns = newest_ns + self._period_ns - time_ns
-            self._shifts_ns.append(shift_ns)
-        shifted_ns = time_ns + self._shifts_ns[number - 1]
-        if newest_ns is None or shifted_ns > newest_ns:
-            if newest_ns is not None and not starts:
-                self._period_ns = shifted_ns - newest_ns
-            self._newest_ns = shifted_ns
-        return shifted_ns
-
-    def shift_ns(self, time_ns: int) -> int:
-        """Shift of a message about an earlier sample."""
-        number = self._splitter.current
-        if not number:
-            return 0
-        if number > 1 and self._splitter.run(number).last_ns < time_ns <= self._splitter.run(number - 1).last_ns:
-            return self._shifts_ns[number - 2]  # it concerns the run before
-        return self._shifts_ns[number - 1]
-
-
 class SampleSeries:
     """Collects the samples of one plant, in the order of receipt.
 
@@ -355,7 +346,7 @@ class SampleSeries:
     """
 
     def __init__(self) -> None:
-        self.runs: list[dict[str, tuple[array[int], array[float]]]] = []
+        self.runs: list[defaultdict[str, tuple[array[int], array[float]]]] = []
         self.units: dict[str, str] = {}
         self.splitter = RunSplitter()
         self._newest: dict[str, tuple[array[int], array[float]]] = {}  # columns of the newest sample, by signal
@@ -365,19 +356,15 @@ class SampleSeries:
         value = measured_value(sample)
         if value is None:
             return
-        splitter, time_ns = self.splitter, sample.time_ns
-        strays = splitter.strays
-        number = splitter.update(signal, sample.sequence, time_ns)
-        if splitter.strays > strays:
+        strays = self.splitter.strays
+        number = self.splitter.update(signal, sample.sequence, sample.time_ns)
+        if self.splitter.strays > strays:
             for column in self._newest[signal]:
                 column.pop()
         if sample.unit:
             self.units.setdefault(signal, sample.unit)
         if number > len(self.runs):
-            self.runs.append({})
-        series = self.runs[number - 1].get(signal)
-        if series is None:
-            series = self.runs[number - 1][signal] = (array("q"), array("d"))
-        self._newest[signal] = series
-        series[0].append(time_ns)
-        series[1].append(value)
+            self.runs.append(defaultdict(lambda: (array("q"), array("d"))))
+        times, values = self._newest[signal] = self.runs[number - 1][signal]
+        times.append(sample.time_ns)
+        values.append(value)

@@ -1,1 +1,0 @@
-"""A recording's messages as columns of numbers, for drawing."""
