@@ -10,7 +10,8 @@ import numpy as np
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
-from monitor_node.learn.arx import arx_structure, fewest_rows
+from monitor_node.learn.arx import arx_structure
+from monitor_node.learn.arx_fit import fewest_rows
 from monitor_node.learn.baseline import FEWEST_ROWS
 from monitor_node.monitor_state import MonitorMemory
 from monitor_node.watch.pipeline_memory import PipelineMemory
