@@ -121,7 +121,7 @@ def record(path: Path, sent: list[Encoded]) -> None:
         for number, message in enumerate(sent):
             kept = core.on_message(message, number)
             assert kept is not None
-            writer.write(kept.recorded, readable=kept.message is not None, sequence=kept.sequence)
+            writer.append(kept)
 
 
 def exhaust(items: Iterable[Any]) -> None:

@@ -10,24 +10,24 @@ must stay visible.
 
 from collections import Counter
 from collections.abc import Collection, Mapping
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import structlog
+from google.protobuf.message import DecodeError as ProtobufDecodeError
 from google.protobuf.message import Message
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.alarm_states import CODES, Event, State, next_state
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.codec import MAX_PAYLOAD, DecodeError, Encoded, Publication, decode, encoding_of
 from reactorwatch.contract.commands import check_signature, decode_command
 from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from reactorwatch.version import version
-from recorder import RecordedMessage
-from recorder.keep import Channel
-from recorder.samples import SequenceCounter, content_of
+from recorder import Channel, StoredMessage
+from recorder.keep import channel_of
+from recorder.samples import SequenceCounter
 
 log = structlog.get_logger()
 
@@ -53,36 +53,20 @@ LOG_INTERVAL_NS = 60_000_000_000
 MAX_QUOTE = 200
 """Characters of a key in a text: publishers control it."""
 
-_new = tuple.__new__  # builds a named tuple in half the time of its constructor, for each message
+_SAMPLE = encoding_of(messages.Sample)
 _NO_SAMPLE = messages.QUALITY_UNSPECIFIED  # which protobuf reads out of bytes that hold something else
 _LARGEST_COUNT = 2**64 - 1  # a sequence number may be any nonsense; the sum of what it skips must still fit its field
 
 
-class ReceivedMessage(NamedTuple):
-    """A received message with its decoded content.
+class ReceivedMessage(StoredMessage, gc=False):
+    """A received message with its decoded content; None for a sample, and if it is not what its encoding names."""
 
-    Attributes:
-        recorded: the message as it is recorded.
-        message: decoded content; None if the payload is not what its encoding names.
-        channel: channel of the file that the message belongs to.
-        sequence: sequence number of a sample; 0 for other messages.
-    """
-
-    recorded: RecordedMessage
-    message: Message | None
-    channel: Channel
-    sequence: int = 0
+    message: Message | None = None
 
 
 def fingerprint(key: str, payload: bytes) -> int:
     """Hash of a message; differs between processes."""
     return hash((key, payload))
-
-
-@lru_cache(maxsize=MAX_COUNTERS)
-def channel_of(key: str, encoding: str, is_readable: bool) -> Channel:
-    """Channel of the messages of a key and an encoding, readable or not."""
-    return Channel(key, encoding, is_readable and keys.parse(key) is not None)
 
 
 class Recorder:
@@ -114,7 +98,8 @@ class Recorder:
         self._refused: Counter[str] = Counter()
         self.is_stopped = False
         self.alarms = OwnAlarms(plant)
-        self._counters: dict[str, SequenceCounter] = {}  # by key, in the order of their last samples
+        self._counters: dict[str, tuple[Channel, SequenceCounter]] = {}  # by key, the least recently used first
+        self._sample = messages.Sample()  # each sample is decoded into it, as none is held
         self._evicted = SequenceCounter()  # counts of evicted keys
         self._no_room_ns = 0  # time of the last rejected message
         self._logged_ns: int | None = None  # time of the last log line about it
@@ -127,65 +112,71 @@ class Recorder:
         """
         key, payload, encoding, received_ns = message
         self._received += 1
-        received_ns = received_ns or now_ns
-        if now_ns - received_ns > self._longest_lag_ns:
+        if not received_ns:
+            received_ns = now_ns
+        elif now_ns - received_ns > self._longest_lag_ns:
             self._longest_lag_ns = now_ns - received_ns
-        if self._fingerprints and self._is_recorded(key, payload, now_ns):
-            self._count_recorded(message)
-            return None
+        is_recorded = self._fingerprints and self._is_recorded(key, payload, now_ns)
         if received_ns < self._last_ns:
             received_ns = self._last_ns
         self._last_ns = received_ns
+        counted = None
+        if encoding == _SAMPLE and len(payload) <= MAX_PAYLOAD:
+            counted = self._counters.pop(key, None) or self._new_counter(key)
+        if counted is None:
+            return None if is_recorded else self._receive_other(key, payload, encoding, received_ns)
+        self._counters[key] = counted
+        channel, counter = counted
+        sample = self._sample
+        try:
+            sample.ParseFromString(payload)
+        except ProtobufDecodeError:
+            return None if is_recorded else self._receive_other(key, payload, encoding, received_ns)
+        time_ns, sequence = sample.time_ns, sample.sequence
+        if time_ns < 0:
+            time_ns = self._correct_time(received_ns)
+        elif not sample.quality:  # it is unspecified
+            self._refused["payload"] += 1
+        else:  # one that an earlier file holds as well: those around it in this file are not lost
+            counter.update(sequence, time_ns)
+        return None if is_recorded else ReceivedMessage(channel, sequence, received_ns, time_ns, payload)
+
+    def _receive_other(self, key: str, payload: bytes, encoding: str, received_ns: int) -> ReceivedMessage:
+        """Decode a message that is not a sample of the product, or not one that can be read."""
         try:
             decoded: Any = decode(payload, encoding)
         except DecodeError as error:
             self._refused[error.reason] += 1
-            recorded = RecordedMessage(key, payload, encoding, received_ns, received_ns)
-            return ReceivedMessage(recorded, None, channel_of(key, encoding, False))
-        channel = channel_of(key, encoding, True)
+            channel = channel_of(key, encoding, is_readable=False)
+            return ReceivedMessage(channel, 0, received_ns, received_ns, payload)
+        channel = channel_of(key, encoding, is_readable=True)
         if not channel.is_product:
             self._refused["key"] += 1
-        sequence = 0
+        time_ns, sequence = getattr(decoded, "time_ns", received_ns), 0
         if isinstance(decoded, messages.Sample):
-            time_ns, sequence = decoded.time_ns, decoded.sequence
+            sequence = decoded.sequence
             if time_ns >= 0 and decoded.quality == _NO_SAMPLE:
                 self._refused["payload"] += 1
-            elif time_ns >= 0 and channel.is_product:
-                self._counter(key).update(sequence, time_ns)
-        else:
-            time_ns = getattr(decoded, "time_ns", received_ns)
-        if time_ns < 0:  # before 1970, which MCAP cannot represent
-            self._refused["time"] += 1
-            time_ns = received_ns
-        recorded = _new(RecordedMessage, (key, payload, encoding, received_ns, time_ns, False))
-        return _new(ReceivedMessage, (recorded, decoded, channel, sequence))
+        if time_ns < 0:
+            time_ns = self._correct_time(received_ns)
+        return ReceivedMessage(channel, sequence, received_ns, time_ns, payload, decoded)
 
-    def _count_recorded(self, message: Encoded) -> None:
-        """Count a sample that an earlier file holds, so that those around it in this file do not count as lost."""
-        if (topic := keys.parse(message.key)) is None or topic.kind != keys.SAMPLE:
-            return  # nothing else is counted, nor needs to be decoded
-        sample = content_of(message)
-        if not isinstance(sample, messages.Sample) or sample.quality == _NO_SAMPLE or sample.time_ns < 0:
-            return
-        if channel_of(message.key, message.encoding, True).is_product:
-            self._counter(message.key).update(sample.sequence, sample.time_ns)
+    def _correct_time(self, received_ns: int) -> int:
+        """Count a time before 1970, which MCAP cannot represent; the time of receipt replaces it."""
+        self._refused["time"] += 1
+        return received_ns
 
-    def _counter(self, key: str) -> SequenceCounter:
-        """Counter of a key, which becomes the most recently used one."""
-        counter = self._counters.pop(key, None)
-        if counter is None:
-            counter = self._new_counter()
-        self._counters[key] = counter
-        return counter
-
-    def _new_counter(self) -> SequenceCounter:
-        """Counter of a new key, for which the least recently used one is evicted if there are too many."""
+    def _new_counter(self, key: str) -> tuple[Channel, SequenceCounter] | None:
+        """Channel and counter of a new key of samples; None if it is not one of the product."""
+        channel = channel_of(key, _SAMPLE, is_readable=True)
+        if not channel.is_product:
+            return None
         if len(self._counters) >= MAX_COUNTERS:
-            evicted = self._counters.pop(next(iter(self._counters)))
+            _, evicted = self._counters.pop(next(iter(self._counters)))
             self._evicted.lost += evicted.lost
             self._evicted.duplicated += evicted.duplicated
             self._evicted.out_of_order += evicted.out_of_order
-        return SequenceCounter()
+        return channel, SequenceCounter()
 
     def _is_recorded(self, key: str, payload: bytes, now_ns: int) -> bool:
         """True if an earlier file holds the message; each fingerprint matches once."""
@@ -215,7 +206,7 @@ class Recorder:
         """Count a message whose key has no channel in the file, and raise the alarm."""
         self._refused["too many keys"] += 1
         self._no_room_ns = now_ns
-        key = received.recorded.key[:MAX_QUOTE]
+        key = received.channel.key[:MAX_QUOTE]
         kind = "of this software" if received.channel.is_product else "of other programs"
         if self._logged_ns is None or now_ns - self._logged_ns >= LOG_INTERVAL_NS:
             self._logged_ns = now_ns
@@ -253,7 +244,7 @@ class Recorder:
             phase: phase to report; empty derives it from the state.
         """
         phase = phase or ("not recording" if self.is_stopped else "recording")
-        checks = [self._evicted, *self._counters.values()]
+        checks = [self._evicted, *(counter for _, counter in self._counters.values())]
         self._reports += 1
         health = messages.Health(
             time_ns=now_ns,

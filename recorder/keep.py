@@ -28,13 +28,14 @@ from datetime import UTC, datetime
 from math import inf
 from pathlib import Path
 from typing import Literal, NamedTuple
+from weakref import WeakValueDictionary
 
 from google.protobuf.message import Message
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.records.record import NEVER_NS
-from recorder import RecordedMessage
+from recorder import Channel, RecordedMessage
 
 ENDING = ".mcap"
 _MOMENT = "%Y%m%dT%H%M%SZ"
@@ -343,18 +344,17 @@ INACTIVE_SHARE = 0.1
 CHECK_INTERVAL_NS = 5_000_000_000
 
 
-class Channel(NamedTuple):
-    """Channel of a file.
+_CHANNELS: WeakValueDictionary[tuple[str, str, bool, bool], Channel] = WeakValueDictionary()
 
-    Attributes:
-        key: key that its messages were published on.
-        encoding: encoding that its messages claim.
-        is_product: True for messages of the product on a key of the product.
-    """
 
-    key: str
-    encoding: str
-    is_product: bool
+def channel_of(key: str, encoding: str, *, is_readable: bool, latched: bool = False) -> Channel:
+    """Channel of the messages of a key and an encoding: one object as long as it is in use."""
+    name = key, encoding, is_readable, latched
+    channel = _CHANNELS.get(name)
+    if channel is None:
+        is_product = is_readable and keys.parse(key) is not None
+        channel = _CHANNELS[name] = Channel(key, encoding, is_product, is_readable, latched)
+    return channel
 
 
 class ChannelBudget:

@@ -69,8 +69,8 @@ class RecorderNode:
         published = self._write(received, now_ns)
         content = received.message
         if content is not None and type(content) in STATES and self._channels.has(received.channel):
-            self._latched.update(received.recorded, content)
-            ended = self._black_box.on_message(content, received.recorded.log_time_ns)
+            self._latched.update(received.recorded_message, content)
+            ended = self._black_box.on_message(content, received.log_time_ns)
             published += self._save_black_box(ended, now_ns)
         return published
 
@@ -142,7 +142,7 @@ class RecorderNode:
         try:
             channels_full = not channels.has(channel) and channels.needs_new_file(channel, now_ns)
             if channels_full or self._rotation.is_full(now_ns, self._files.size_bytes):
-                self._start_file(received.recorded.log_time_ns, now_ns)
+                self._start_file(received.log_time_ns, now_ns)
             if not channels.admit(channel, now_ns):
                 return self._core.reject_key(received, now_ns)
             self._files.write(received)

@@ -24,7 +24,7 @@ from reactorwatch.description.plants import PlantProcesses
 from reactorwatch.errors import InputError
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder import RecordedMessage
+from recorder import RecordedMessage, StoredMessage
 from recorder.config import MB, RecorderConfig
 from recorder.core import ReceivedMessage, fingerprint
 from recorder.files.ages import Ages, BootClock, read_boot_clock
@@ -32,7 +32,7 @@ from recorder.files.copies import Window, cut, find_orphans, list_damaged, repai
 from recorder.files.index import read_summary, span_ns
 from recorder.files.metadata import FILE_INDEX, GAP, PROCESS, gap_metadata, process_metadata
 from recorder.files.part_file import PART, PartFile, is_locked
-from recorder.files.reader import Reader, StoredMessage, Wanted
+from recorder.files.reader import Reader, Wanted
 from recorder.files.writer import RecordingWriter, check_free, part_of
 from recorder.keep import (
     DAY_NS,
@@ -164,11 +164,11 @@ class RecordingFiles:
             WriteError: the file cannot be written; see `abandon`.
         """
         assert self._writer is not None, "a file was started"
-        recorded = received.recorded
-        if recorded.key not in self._keys:
-            self._describe_plant(recorded.key)
-        self._writer.write(recorded, readable=received.message is not None, sequence=received.sequence)
-        self._last_ns = recorded.log_time_ns
+        key = received.channel.key
+        if key not in self._keys:
+            self._describe_plant(key)
+        self._writer.append(received)
+        self._last_ns = received.log_time_ns
 
     def _describe_plant(self, key: str) -> None:
         """Describe the process of a plant at the first of its samples in the file."""

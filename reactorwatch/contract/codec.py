@@ -15,11 +15,6 @@ from reactorwatch.contract import messages_pb2 as messages
 
 PREFIX = "application/protobuf;"
 
-_TIME, _SEQUENCE = 0x09, 0x10
-"""Field and wire type of the first fields of a `Sample`."""
-
-MAX_VARINT = 10
-"""Bytes of protobuf's longest number."""
 PACKAGE, VERSION = "reactorwatch.", "reactorwatch.v1"
 OTHER_VERSION = "version"
 """Reason of a `DecodeError` for messages of this software in another version of their schema."""
@@ -130,20 +125,3 @@ def decode(payload: bytes, encoding: str) -> Message:
     except ProtobufDecodeError as error:
         name = encoding.removeprefix(PREFIX)
         raise DecodeError("payload", f"{len(payload)} bytes are not a {name}: {error}") from error
-
-
-def read_sequence(payload: bytes) -> int:
-    """Read the sequence number of one sample without parsing the rest; 0 for bytes in another form."""
-    try:
-        at = 9 if payload[0] == _TIME else 0  # the time takes eight bytes, or none if it is zero
-        if payload[at] != _SEQUENCE:
-            return 0
-        byte = payload[at + 1]
-        number, shift = byte & 0x7F, 7
-        while byte >= 0x80 and shift < 7 * MAX_VARINT:
-            byte = payload[at + 1 + shift // 7]
-            number |= (byte & 0x7F) << shift
-            shift += 7
-    except IndexError:
-        return 0
-    return number if byte < 0x80 else 0

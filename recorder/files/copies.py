@@ -19,11 +19,11 @@ from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.output import refuse_source
-from recorder import RecordedMessage
+from recorder import RecordedMessage, StoredMessage
 from recorder.files.index import LATEST_NS
 from recorder.files.metadata import METADATA, own_metadata, parse_gap
 from recorder.files.part_file import PART, is_locked, lock_orphan
-from recorder.files.reader import Damage, Reader, StoredMessage, read_start
+from recorder.files.reader import Damage, Reader, read_start
 from recorder.files.recording import SourceFile, merge_messages, open_sources
 from recorder.files.writer import RecordingWriter
 from recorder.keep import LATCHED_KINDS, FileNames, LatchedMessages
@@ -91,7 +91,7 @@ def recover(path: Path, out: Path) -> RecoveryResult:
     with atomic_write(out) as temporary:
         with RecordingWriter(temporary, own_metadata(start.metadata), profile=start.profile) as writer:
             for stored in reader:
-                writer.copy(stored)
+                writer.append(stored)
                 topics[stored.channel.key] += 1
                 first_ns, last_ns = min(first_ns, stored.log_time_ns), max(last_ns, stored.log_time_ns)
             for attachment in reader.attachments():
@@ -247,7 +247,7 @@ def cut(
             if not count:
                 for entry in _latched_messages(files, window, stored.log_time_ns):
                     writer.write(entry)
-            writer.copy(stored)
+            writer.append(stored)
             count += 1
         if not count:
             raise InputError(f"{sources[0]}: holds no message of that time")

@@ -14,13 +14,15 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
+from mcap.records import Attachment, Chunk, Header, Metadata, Schema
+from mcap.records import Channel as ChannelRecord
 from mcap.summary import Summary
 from mcap.well_known import MessageEncoding
 from mcap.writer import MCAP0_MAGIC
@@ -28,7 +30,7 @@ from mcap.writer import MCAP0_MAGIC
 from reactorwatch.contract.codec import PREFIX
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import wrap_read_errors
-from recorder import RecordedMessage
+from recorder import Channel, StoredMessage
 from recorder.files.index import (
     DAMAGE,
     FIRST_PRIVATE,
@@ -60,30 +62,12 @@ _INDEX = struct.Struct("<HI")  # channel of a message index, length of the rest
 _CHECKSUM = struct.Struct("<I")
 
 
-class StoredChannel(NamedTuple):
-    """Channel of a file, with the fields that its messages share; see `RecordedMessage`."""
+@dataclass(slots=True, eq=False, kw_only=True)
+class StoredChannel(Channel):
+    """Channel of a file that any program wrote, as it is described there."""
 
-    key: str
-    encoding: str
-    latched: bool
-    record: Channel
+    record: ChannelRecord
     schema: Schema | None
-
-
-class StoredMessage(NamedTuple):
-    """A message of a file, written by any program."""
-
-    channel: StoredChannel
-    sequence: int
-    log_time_ns: int
-    publish_time_ns: int
-    payload: bytes
-
-    @property
-    def recorded_message(self) -> RecordedMessage:
-        """The message as the recorder writes it."""
-        channel, _, log_time_ns, publish_time_ns, payload = self
-        return RecordedMessage(channel.key, payload, channel.encoding, log_time_ns, publish_time_ns, channel.latched)
 
 
 class Damage(NamedTuple):
@@ -160,7 +144,7 @@ class Reader:
         }
         # the index describes the channels and schemas of a damaged chunk as well
         self._described: dict[type, dict[int, Any]] = {
-            Channel: dict(self.summary.channels),
+            ChannelRecord: dict(self.summary.channels),
             Schema: dict(self.summary.schemas),
         }
         self._verified = {(kind, number) for kind, records in self._described.items() for number in records}
@@ -294,7 +278,7 @@ class Reader:
             opcode, end = self._record_at(at)
             if opcode != Opcode.MESSAGE_INDEX or end is None:
                 break
-            channel = self._described[Channel].get(_INDEX.unpack_from(self._bytes, at + RECORD.size)[0])
+            channel = self._described[ChannelRecord].get(_INDEX.unpack_from(self._bytes, at + RECORD.size)[0])
             if channel is None or self._wanted(channel.topic):
                 return True
             is_indexed, at = True, end
@@ -304,7 +288,7 @@ class Reader:
         """Messages of records that follow each other; channels and schemas among them are registered."""
         found: list[StoredMessage] = []
         channels = self._channels
-        append, new, unpack = found.append, tuple.__new__, _MESSAGE.unpack_from  # this runs for each message
+        append, unpack = found.append, _MESSAGE.unpack_from  # this runs for each message
         at, end = 0, len(data)
         while at < end:
             opcode = data[at]
@@ -315,14 +299,14 @@ class Reader:
                 channel = channels.get(number)
                 if channel is not None:
                     payload = data[at + _MESSAGE.size : at + RECORD.size + length]
-                    append(new(StoredMessage, (channel, sequence, log_time, publish_time, payload)))
+                    append(StoredMessage(channel, sequence, log_time, publish_time, payload))
             else:
                 _, length = RECORD.unpack_from(data, at)
                 content = data[at + RECORD.size : at + RECORD.size + length]
                 if not opcode:
                     raise ValueError("the chunk holds a record of kind 0, which the format does not know")
                 if opcode == Opcode.CHANNEL:
-                    channel_record = Channel.read(_stream(content))
+                    channel_record = ChannelRecord.read(_stream(content))
                     self._register(channel_record.id, channel_record, verified=verified)
                 elif opcode == Opcode.SCHEMA:
                     schema = Schema.read(_stream(content))
@@ -334,7 +318,7 @@ class Reader:
 
     def _find_channel(self, number: int) -> None:
         """Add the channel of a message to `_channels`; if it is described nowhere, the message is an orphan."""
-        record = self._described[Channel].get(number)
+        record = self._described[ChannelRecord].get(number)
         schema = self._described[Schema].get(record.schema_id) if record else None
         if record is None or (record.schema_id and schema is None):
             if not self._tolerant:
@@ -346,9 +330,12 @@ class Reader:
             encoding = record.message_encoding
             if encoding == MessageEncoding.Protobuf and schema is not None:
                 encoding = PREFIX + schema.name
-            self._channels[number] = StoredChannel(record.topic, encoding, LATCHED in record.metadata, record, schema)
+            latched = LATCHED in record.metadata
+            self._channels[number] = StoredChannel(
+                key=record.topic, encoding=encoding, latched=latched, record=record, schema=schema
+            )
 
-    def _register(self, number: int, record: Channel | Schema, *, verified: bool) -> None:
+    def _register(self, number: int, record: ChannelRecord | Schema, *, verified: bool) -> None:
         """Register a channel or a schema; one confirmed by a checksum is not replaced by one that is not."""
         kind = type(record)
         known = self._described[kind]

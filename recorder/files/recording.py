@@ -23,11 +23,11 @@ from reactorwatch.contract import keys
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import list_files
-from recorder import RecordedMessage
+from recorder import RecordedMessage, StoredMessage
 from recorder.files.index import LATEST_NS, read_summary, span_ns
 from recorder.files.metadata import CLOCK, NO_CLOCK, ZERO_NS, own_metadata, processes_in
 from recorder.files.part_file import PART, is_locked
-from recorder.files.reader import Reader, StoredMessage, Wanted, metadata_records
+from recorder.files.reader import Reader, Wanted, metadata_records
 
 MAX_TOPICS = 5
 """Topics of other programs that an error names."""

@@ -14,19 +14,21 @@ from typing import Self
 
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from mcap.data_stream import RecordBuilder
-from mcap.records import Attachment, Channel, Schema
+from mcap.records import Attachment, Schema
+from mcap.records import Channel as ChannelRecord
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import encoding_of, message_type, read_sequence
+from reactorwatch.contract.codec import encoding_of, message_type
 from reactorwatch.errors import InputError
 from reactorwatch.version import build_metadata, this_build
-from recorder import RecordedMessage
+from recorder import Channel, RecordedMessage, StoredMessage
 from recorder.files.metadata import METADATA
 from recorder.files.part_file import PART, PartFile, is_locked
-from recorder.files.reader import LATCHED, StoredChannel, StoredMessage
-from recorder.keep import MAX_CHANNELS
+from recorder.files.reader import LATCHED, StoredChannel
+from recorder.keep import MAX_CHANNELS, channel_of
+from recorder.samples import content_of
 
 MAX_SEQUENCE = 2**32 - 1
 """Largest sequence number in MCAP; larger ones wrap around to 0."""
@@ -64,9 +66,8 @@ class RecordingWriter:
     ) -> None:
         self.path = path
         self._part = part_of(path)
-        self._channels: dict[tuple[str, str, bool, bool], int] = {}
+        self._channels: dict[Channel, int] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._copied: dict[int, tuple[StoredChannel, int]] = {}  # by identity, stable as the channel is held here
         self._copies: dict[tuple[object, ...], int] = {}
         self._channel_count = 0
         self._in_chunk = 0  # messages in the current chunk
@@ -76,6 +77,7 @@ class RecordingWriter:
         with self._write_errors():
             self._stream = open_part(self._part)
         self._writer = Writer(self._stream)  # type: ignore[arg-type]
+        self._add_message = self._writer.add_message
         self._writer.start(profile, f"reactorwatch {this_build()}")
         build = {} if "version" in metadata else build_metadata()  # a copy keeps that of its source
         self._writer.add_metadata(METADATA, {**build, **metadata})
@@ -91,37 +93,39 @@ class RecordingWriter:
         """Bytes written, without the current chunk."""
         return self._stream.tell()
 
-    def write(self, message: RecordedMessage, *, readable: bool = True, sequence: int | None = None) -> None:
+    def write(self, message: RecordedMessage, *, readable: bool = True) -> None:
         """Append a message; the sequence number of a sample becomes that of the MCAP message.
 
         Args:
             message: the message.
             readable: False writes the payload without the schema that its encoding names.
-            sequence: sequence number of a sample, else 0, where it is known; None: it is read from the payload.
+
+        Raises:
+            WriteError: as `append`.
+        """
+        key, payload, encoding, log_time_ns, publish_time_ns, latched = message
+        sample = content_of(message) if readable and encoding == _SAMPLE else None
+        sequence = sample.sequence if isinstance(sample, messages.Sample) else 0
+        channel = channel_of(key, encoding, is_readable=readable, latched=latched)
+        self.append(StoredMessage(channel, sequence, log_time_ns, publish_time_ns, payload))
+
+    def append(self, stored: StoredMessage) -> None:
+        """Append a received message, or one of another file unchanged, with its channel.
 
         Raises:
             WriteError: the file cannot be written, for example because the disk is full.
         """
-        key, payload, encoding, log_time_ns, publish_time_ns, latched = message
-        name = (key, encoding, readable, latched)
-        channel = self._channels.get(name)
-        if channel is None:
-            channel = self._channels[name] = self._register(message, readable=readable)
-        if sequence is None:
-            sequence = read_sequence(payload) if readable and encoding == _SAMPLE else 0
-        self._append(channel, log_time_ns, payload, publish_time_ns, sequence & MAX_SEQUENCE)
-
-    def copy(self, stored: StoredMessage) -> None:
-        """Append a message of another file unchanged, with its channel.
-
-        Raises:
-            WriteError: as `write`.
-        """
-        channel, sequence, log_time_ns, publish_time_ns, payload = stored
-        copied = self._copied.get(id(channel))
-        if copied is None:
-            copied = self._copied[id(channel)] = channel, self._copy_channel(channel)
-        self._append(copied[1], log_time_ns, payload, publish_time_ns, sequence)
+        channel = stored.channel
+        number = self._channels.get(channel)
+        if number is None:
+            number = self._channels[channel] = self._register(channel)
+        sequence = stored.sequence & MAX_SEQUENCE
+        self._add_message(number, stored.log_time_ns, stored.payload, stored.publish_time_ns, sequence)
+        self._in_chunk += 1
+        if self._stream.chunk_end != self._chunk_end:  # the chunk was full
+            self._note_chunk()
+            with self._write_errors():
+                self._stream.drain()
 
     def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
         """Append a metadata record, outside of any chunk.
@@ -196,14 +200,6 @@ class RecordingWriter:
     ) -> None:
         self.close()
 
-    def _append(self, channel: int, log_time_ns: int, payload: bytes, publish_time_ns: int, sequence: int) -> None:
-        self._writer.add_message(channel, log_time_ns, payload, publish_time_ns, sequence)
-        self._in_chunk += 1
-        if self._stream.chunk_end != self._chunk_end:  # the chunk was full
-            self._note_chunk()
-            with self._write_errors():
-                self._stream.drain()
-
     def _note_chunk(self) -> None:
         """Note the end of a chunk and its messages, if it has ended."""
         if self._stream.chunk_end != self._chunk_end:
@@ -211,13 +207,15 @@ class RecordingWriter:
             self._undrained.append((self._chunk_end, self._in_chunk))
             self._in_chunk = 0
 
-    def _register(self, message: RecordedMessage, *, readable: bool) -> int:
-        metadata = {LATCHED: "true"} if message.latched else {}
-        kind = message_type(message.encoding) if readable else None
+    def _register(self, channel: Channel) -> int:
+        if isinstance(channel, StoredChannel):
+            return self._copy_channel(channel)
+        metadata = {LATCHED: "true"} if channel.latched else {}
+        kind = message_type(channel.encoding) if channel.is_readable else None
         if kind is None:
-            return self._add_channel(message.key, message.encoding, 0, metadata)
+            return self._add_channel(channel.key, channel.encoding, 0, metadata)
         schema = self._schema(kind.DESCRIPTOR.full_name, SchemaEncoding.Protobuf, _descriptors())
-        return self._add_channel(message.key, MessageEncoding.Protobuf, schema, metadata)
+        return self._add_channel(channel.key, MessageEncoding.Protobuf, schema, metadata)
 
     def _add_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
         """Add a channel, unless the format has no number left."""
@@ -226,7 +224,7 @@ class RecordingWriter:
             raise WriteError(f"recording {self.path}: {reason}", reason)
         self._channel_count += 1
         number = self._writer.register_channel(topic, encoding, schema, metadata)
-        self._write_outside(Channel(number, topic, encoding, metadata, schema))
+        self._write_outside(ChannelRecord(number, topic, encoding, metadata, schema))
         return number
 
     def _copy_channel(self, channel: StoredChannel) -> int:
@@ -245,7 +243,7 @@ class RecordingWriter:
             self._write_outside(Schema(data=data, encoding=encoding, id=number, name=name))
         return number
 
-    def _write_outside(self, record: Channel | Schema) -> None:
+    def _write_outside(self, record: ChannelRecord | Schema) -> None:
         self._note_chunk()  # the record may have filled it
         builder = RecordBuilder()
         record.write(builder)

@@ -20,7 +20,6 @@ from reactorwatch.contract.codec import (
     encode,
     encoding_of,
     message_type,
-    read_sequence,
 )
 
 FOLDER = Path(reactorwatch.contract.__file__).parent
@@ -156,21 +155,3 @@ def test_a_payload_of_ten_megabytes_is_not_read() -> None:
     with pytest.raises(DecodeError, match="a payload must have at most 1048576 bytes, got 100000") as refused:
         decode(sample.SerializeToString(), encoding_of(messages.Sample))
     assert refused.value.reason == "too_large"
-
-
-@given(
-    time_ns=st.integers(-(2**63), 2**63 - 1),
-    sequence=st.integers(0, 2**64 - 1),
-    value=st.floats(),
-    quality=st.sampled_from(list(messages.Quality.values())),
-)
-def test_the_number_of_one_sample_is_read_from_its_bytes(
-    time_ns: int, sequence: int, value: float, quality: messages.Quality
-) -> None:
-    sample = messages.Sample(time_ns=time_ns, sequence=sequence, value=value, quality=quality, unit="K")
-    assert read_sequence(sample.SerializeToString()) == sequence
-
-
-@given(st.binary(max_size=40))
-def test_any_other_bytes_have_a_number_or_none(data: bytes) -> None:
-    assert read_sequence(data) >= 0

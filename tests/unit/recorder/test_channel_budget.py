@@ -8,11 +8,11 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from recorder import RecordedMessage, keep
+from recorder import Channel, RecordedMessage, keep
 from recorder.core import KEYS_ALARM
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter, WriteError
-from recorder.keep import MAX_OTHER_CHANNELS, Channel, ChannelBudget
+from recorder.keep import MAX_OTHER_CHANNELS, ChannelBudget
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import SECOND, Fed, recorder
 

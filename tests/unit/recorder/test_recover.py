@@ -14,9 +14,9 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from reactorwatch.errors import InputError
-from recorder import RecordedMessage
+from recorder import RecordedMessage, StoredMessage
 from recorder.files.copies import RecoveryResult, recover
-from recorder.files.reader import Reader, StoredMessage, metadata_records
+from recorder.files.reader import Reader, metadata_records
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from tests.unit.recorder import golden
