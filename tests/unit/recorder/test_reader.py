@@ -194,3 +194,18 @@ def test_the_start_of_a_file_has_its_first_metadata_and_its_writer(path: Path) -
     assert len(list(reader)) == 4
     assert [record.name for record in reader.metadata] == ["notes", "late"]
     assert (reader.profile, reader.library) == ("", "")
+
+
+def test_an_index_that_names_a_chunk_where_there_is_none_is_damage(path: Path) -> None:
+    claimed = b"".join(number.to_bytes(8, "little") for number in (1, 4, HEADER_END))
+    at = WHOLE.rindex(claimed) + 16
+    for offset in (HEADER_END + 1, 8):  # within the chunk; the header
+        path.write_bytes(WHOLE[:at] + offset.to_bytes(8, "little") + WHOLE[at + 8 :])
+        with pytest.raises(InputError, match=f"the index names a chunk where there is none at byte {offset}"):
+            list(Reader(path).in_order())
+
+
+def test_last_bytes_that_are_not_those_of_a_recording_are_damage(path: Path) -> None:
+    messages, (damage,) = read(path, WHOLE[:-1] + b"?")
+    assert messages == [1, 4, 5, 9]
+    assert "the last bytes are not those of a recording" in damage
