@@ -14,6 +14,7 @@ from monitor_node.charts.charts import chart_point
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import MeasuredRow
 from monitor_node.learn.arx import JUDGING_FORGETTING, ArxPredictor, arx_structure
+from monitor_node.learn.arx_fit import start_drift_chart
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
@@ -102,7 +103,7 @@ class DriftWatch:
             return notes
         for signal, predictor in compress(zip(self._outputs, predictors, strict=True), evaluated):
             try:
-                predictor.start_drift_chart(arl0)
+                start_drift_chart(predictor, arl0)
             except InputError as error:
                 notes.append(f"the drift of {signal} is not watched: {error}")
         return notes

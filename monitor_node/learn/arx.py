@@ -1,17 +1,20 @@
-"""Recursive ARX model of an output: its update with a row, and the same model as the training left it.
+"""Identified models of a plant: a recursive ARX model of each output, updated row by row.
 
 The adaptive model is updated with every row by recursive least squares; the prediction is that before the update. The
-reference is fitted to the whole training at its end (`arx_reference`) and then frozen: the adaptive model's distance
-from it is charted.
+model as fitted to the whole training at its end (`arx_fit`) is then frozen: the adaptive model's distance from it is
+charted.
 
-Where the adaptive model judges, it starts from the reference, and learns while nothing is wrong: not from a row whose
+The models are the reference of a plant whose other references predict no better, and otherwise adapt beside another
+one. They serve any plant, but only within the inputs of their training; other rows are not evaluated.
+
+Where the adaptive model judges, it starts from the fitted one, and learns while nothing is wrong: not from a row whose
 residual is beyond `GATE` standard deviations, and not while an alarm is active. It forgets a row after `MEMORY` others,
 and the training counts as so many: a model that learned faster would learn a fault before the charts see it. What it
 learned shortly before an alarm is taken back: its state becomes that of a copy that is `COPY_ROWS` to twice as many
 rows old.
 
-If the training has too few rows for the parameters, the models get a simpler structure (`simpler_structures`), and the
-adaptive model is updated with the rows of the training again.
+Where the rows of many signals need predictions for the signal checks only, the models judge as fitted, and one product
+of matrices predicts all outputs: a call for each output would cost more than all else.
 
 Signals are scaled by mean and spread of the first rows, so that the estimator works with numbers of the order of one.
 Snapshots are in the signals' own units.
@@ -26,28 +29,19 @@ import numpy as np
 from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.rows import regular_intervals
+from monitor_node.ingest.rows import MeasuredRow
+from monitor_node.learn.references import GATE, Reference, RowPrediction
 from reactorwatch.arrays import Array
-from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
-from reactorwatch.errors import InputError
-from reactorwatch.identification.linear_model import standard_deviations
-from reactorwatch.identification.regressor import RegressorBuffer, Rows
+from reactorwatch.identification.regressor import Rows
 from reactorwatch.identification.rls import RecursiveLeastSquares, RlsMemory
 from reactorwatch.identification.structure import Scaling, Structure
-from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.parameter_drift import learn
 from reactorwatch.stored_state import Memory, copy_of
-
-ROWS_A_PARAMETER = 10
-"""Least number of rows per parameter of the reference."""
 
 SCALING_ROWS = 50
 """Rows from which the scaling is made; there is no prediction before."""
-
-GATE = 6.0
-"""Standard deviations of a residual beyond which a row teaches an adaptive model that judges nothing."""
 
 MEMORY = 10_000
 """Rows after which an adaptive model that judges has forgotten a row."""
@@ -80,45 +74,84 @@ def simpler_structures(structure: Structure) -> Iterator[Structure]:
         yield replace(structure, output_lags=lags)
 
 
-def fewest_rows(structure: Structure) -> int:
-    """Least number of consecutive rows for a reference of a structure."""
-    return structure.history + ROWS_A_PARAMETER * structure.parameters
+class LaggedRows(Memory, dict=True):
+    """The complete rows before the next one, from which its regressor is made. The object is its own state.
 
+    >>> rows = LaggedRows(Structure.of_order(1))
+    >>> rows.update([10.0], 1.0) is None  # no row before the first
+    True
+    >>> rows.update([20.0], 2.0)  # y[k-1], u[k-1], 1
+    array([ 1., 10.,  1.])
 
-def input_columns(structure: Structure) -> slice:
-    """Columns of the inputs in a regressor."""
-    first = structure.output_lags
-    return slice(first, first + structure.input_lags * structure.inputs)
+    Attributes:
+        structure: structure of the model.
+        outputs: outputs that the next regressor needs, newest first; fewer while there are too few rows.
+        inputs: inputs of the same rows, one row after the other.
+    """
+
+    structure: Structure
+    # Flat lists: a regressor is a dozen numbers, and slicing a list of a dozen takes a fraction of the overhead of a
+    # NumPy call.
+    outputs: list[float] = msgspec.field(default_factory=list)
+    inputs: list[float] = msgspec.field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        structure = self.structure
+        self._history = structure.history
+        if len(self.inputs) != len(self.outputs) * structure.inputs or len(self.outputs) > self._history:
+            raise ValueError(f"there must be at most {self._history} equal rows, got {len(self.outputs)}")
+        first = structure.delay - 1
+        self._lags = slice(first * structure.inputs, (first + structure.input_lags) * structure.inputs)
+
+    def restart(self) -> None:
+        """Forget the rows, as after a gap."""
+        self.outputs, self.inputs = [], []
+
+    def update(self, inputs: list[float], output: float) -> Array | None:
+        """Add a row; returns its regressor, shape (parameters,).
+
+        None if it cannot be predicted, as there are too few complete rows just before it, or misses a value.
+
+        Args:
+            inputs: one value an input; NaN if missing.
+            output: value of the output; NaN if missing.
+        """
+        if not (isfinite(output) and all(map(isfinite, inputs))):
+            self.restart()
+            return None
+        regressor, before = None, self._history - 1
+        if len(self.outputs) > before:
+            values = self.outputs[: self.structure.output_lags] + self.inputs[self._lags]
+            regressor = np.array([*values, 1.0] if self.structure.offset else values)
+        self.outputs = [output, *self.outputs[:before]]
+        self.inputs = inputs + self.inputs[: before * self.structure.inputs]
+        return regressor
 
 
 class ArxPredictor(Memory, dict=True):
     """Predicts one output. The object is its own state.
 
     Attributes:
-        wanted: structure of the models that the settings ask for.
-        forgetting: forgetting factor of the adaptive model.
         structure: structure of the models.
         rls: the adaptive model.
-        regressors: rows of the next regressor.
+        lagged: rows before the next one.
         first_rows: rows from which the scaling will be made, the inputs and the output of each.
         scaling: scaling of the signals; None before it is known.
-        reference: parameters of the reference; None before the fit.
-        reference_model: snapshot of the reference, a serialized `ModelSnapshot`; empty where none is published.
+        reference: parameters of the fitted model; None before the fit.
+        reference_model: snapshot of the fitted model, a serialized `ModelSnapshot`; empty where none is published.
         drift_chart: chart of the models' difference; None without one.
         newest_drift: newest point of that chart.
-        ranges: smallest, then largest value of each input of the reference's regressor in the training, scaled, shape
-            (2, inputs); None before the fit and without inputs.
+        ranges: smallest, then largest value of each input of the fitted model's regressor in the training, scaled,
+            shape (2, inputs); None before the fit and without inputs.
         copies: the older and the newer copy of an adaptive model that judges; empty where it does not.
         copied_rows: rows since the newer one.
         learning: False while an adaptive model that judges does not learn.
         weight: rows for which a row of the training counts in an adaptive model that judges.
     """
 
-    wanted: Structure
-    forgetting: float
     structure: Structure
     rls: RecursiveLeastSquares
-    regressors: RegressorBuffer
+    lagged: LaggedRows
     first_rows: list[tuple[float, ...]] = msgspec.field(default_factory=list)
     scaling: Scaling | None = None
     reference: Array | None = None
@@ -132,10 +165,8 @@ class ArxPredictor(Memory, dict=True):
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        self._fitted: Rows | None = None
-        self._input_scales: list[tuple[float, float]] = []
-        self._output_scale = 0.0, 1.0
-        self._inputs = input_columns(self.structure)
+        self.fitted_rows: Rows | None = None
+        """Scaled rows to which the fitted model was fitted, until there is a drift chart."""
         self.extrapolation_sd = 1.0
         """Standard deviation of the newest residual as a multiple of the usual one: what inputs beyond their range in
         the training add to the prediction counts as uncertain as it is large."""
@@ -144,28 +175,24 @@ class ArxPredictor(Memory, dict=True):
 
     @classmethod
     def of(cls, structure: Structure, forgetting: float) -> Self:
-        """Predictor that knows nothing; arguments as the attributes."""
-        rls, regressors = RecursiveLeastSquares(structure.parameters, forgetting), RegressorBuffer(structure)
-        return cls(structure, forgetting, structure, rls, regressors)
+        """Predictor that knows nothing.
+
+        Args:
+            structure: structure of the models.
+            forgetting: forgetting factor of the adaptive model.
+        """
+        return cls(structure, RecursiveLeastSquares(structure.parameters, forgetting), LaggedRows(structure))
 
     @property
-    def simplification(self) -> str:
-        """Terms that the models lack because the training had too few rows; empty: none."""
-        has, wanted = self.structure, self.wanted
-        parts = []
-        if has.output_lags < wanted.output_lags:
-            parts.append(f"{has.output_lags} instead of {wanted.output_lags} lags of the output")
-        if has.inputs < wanted.inputs:
-            parts.append("no input")
-        elif has.inputs and has.input_lags < wanted.input_lags:
-            parts.append(f"{has.input_lags} instead of {wanted.input_lags} lags of the inputs")
-        return " and ".join(parts)
+    def input_columns(self) -> slice:
+        """Columns of the inputs in a regressor."""
+        first = self.structure.output_lags
+        return slice(first, first + self.structure.input_lags * self.structure.inputs)
 
-    def update(self, time_ns: int, inputs: Sequence[float], value: float, *, follows: bool) -> float:
+    def update(self, inputs: Sequence[float], value: float, *, follows: bool) -> float:
         """Update with a row; returns the prediction made before it, NaN if there is none.
 
         Args:
-            time_ns: time of the row; later than the last row's if it follows.
             inputs: one value an input; NaN if missing.
             value: output; NaN if missing.
             follows: True if the row before was one period ago.
@@ -175,10 +202,10 @@ class ArxPredictor(Memory, dict=True):
             return nan
         centre, spread = self._output_scale
         if not follows:
-            self.regressors.restart()
+            self.lagged.restart()
         scaled = (value - centre) / spread
         scales = zip(inputs, self._input_scales, strict=False)  # all inputs, or none of a simpler structure
-        regressor = self.regressors.update(time_ns, [(u - middle) / size for u, (middle, size) in scales], [scaled])
+        regressor = self.lagged.update([(u - middle) / size for u, (middle, size) in scales], scaled)
         if regressor is None:
             return nan
         if self.copies:
@@ -190,20 +217,32 @@ class ArxPredictor(Memory, dict=True):
             self.newest_drift = self.drift_chart.update(self.rls.parameters - self.reference, regressor)
         return centre + spread * prediction
 
+    def _learn_scaling(self, inputs: Sequence[float], value: float) -> None:
+        row = (*inputs[: self.structure.inputs], value)
+        if not all(map(isfinite, row)):
+            return
+        self.first_rows.append(row)
+        if len(self.first_rows) == SCALING_ROWS:
+            rows = np.array(self.first_rows)
+            self._scale(Scaling.of(rows[:, :-1], rows[:, -1]))
+            self.first_rows.clear()
+
+    def _scale(self, scaling: Scaling) -> None:
+        self.scaling = scaling
+        self._input_scales = list(zip(scaling.input_centres, scaling.input_spreads, strict=True))
+        self._output_scale = scaling.output_centres[0], scaling.output_spreads[0]
+
+    # --- judging ---------------------------------------------------------------------------------------------
+
     def start_judging(self) -> None:
-        """Judge rows from now on; the adaptive model starts from the reference."""
+        """Judge rows from now on; the adaptive model starts from the fitted one."""
         if self.reference is not None:
-            rows = min(self.rls.rows, 1.0 / max(1.0 - self.forgetting, 1e-12))
+            rows = min(self.rls.rows, 1.0 / max(1.0 - self.rls.forgetting, 1e-12))
             self.rls.set_parameters(self.reference)
             self.weight = max(MEMORY / max(rows, 1.0), 1.0)
             self.rls.raise_information(self.weight)
             self.rls.raise_forgetting(max(JUDGING_FORGETTING, self.rls.forgetting))
             self.copies, self.copied_rows, self.learning = [copy_of(self.rls.memory)] * 2, 0, True
-
-    @property
-    def judges(self) -> bool:
-        """True if rows are judged by the adaptive model."""
-        return bool(self.copies)
 
     def set_learning(self, learning: bool) -> None:
         """Learn from the rows to come or not; the end of learning takes back what was learned last."""
@@ -224,79 +263,22 @@ class ArxPredictor(Memory, dict=True):
                 self.copies, self.copied_rows = [self.copies[1], copy_of(self.rls.memory)], 0
         return prediction
 
-    def set_reference(self, parameters: Array, rows: Rows) -> None:
-        """Set the reference.
-
-        Args:
-            parameters: parameters of the model of scaled signals, shape (parameters,).
-            rows: scaled rows of the training that they were fitted to.
-        """
-        self.reference, self._fitted = parameters, rows
-        given = rows.regressors[:, self._inputs]
-        self.ranges = np.array([given.min(axis=0), given.max(axis=0)]) if given.shape[1] else None
-
     def _extrapolation_sd(self, regressor: Array) -> float:
         if self.ranges is None or self.reference is None:
             return 1.0
-        given = regressor[self._inputs]
+        given = regressor[self.input_columns]
         beyond = given - np.clip(given, *self.ranges)
         if not beyond.any():
             return 1.0
-        added = float(self.reference[self._inputs] @ beyond)
+        added = float(self.reference[self.input_columns] @ beyond)
         return sqrt(1.0 + added * added / max(self.rls.noise_variance, 1e-30))
 
-    def step_response(self, rows: int) -> Array:
-        """Response of the reference's residual to a lasting step of one unit of the output, shape (rows,).
+    # --- what is published -----------------------------------------------------------------------------------
 
-        NaN without a reference.
-
-        Args:
-            rows: number of rows from the onset on.
-        """
-        if self.reference is None:
-            return np.full(rows, nan)
-        response, lags = np.ones(rows), self.structure.output_lags
-        for lag, coefficient in enumerate(self.reference[:lags].tolist(), start=1):
-            response[lag:] -= coefficient
-        return response
-
-    def learn_again(self, structure: Structure, time_min: Array, inputs: Array, outputs: Array) -> None:
-        """Update a new adaptive model, of a structure, with the rows of a training.
-
-        Args:
-            structure: structure of the models from now on.
-            time_min: times in minutes, shape (n,).
-            inputs: input values, shape (n, inputs); NaN if missing.
-            outputs: output values, shape (n,); NaN if missing.
-        """
-        self.structure, self._inputs = structure, input_columns(structure)
-        self.rls = RecursiveLeastSquares(structure.parameters, self.forgetting)
-        self.regressors, self.first_rows, self.scaling = RegressorBuffer(structure), [], None
-        follows = [False, *regular_intervals(time_min).tolist()]
-        times_ns = [round(minutes * MINUTE_NS) for minutes in time_min.tolist()]
-        for row in zip(times_ns, inputs.tolist(), outputs.tolist(), follows, strict=True):
-            self.update(*row[:3], follows=row[3])
-
-    def restart(self) -> None:
-        """Forget the rows of the next regressor; the models stay."""
-        self.regressors.restart()
-
-    def start_drift_chart(self, arl0: float) -> None:
-        """Start the chart of the difference between the parameters of the adaptive model and the reference.
-
-        Args:
-            arl0: in-control run length of the chart, in rows.
-
-        Raises:
-            InputError: the training was too short for that, or the model does not forget.
-        """
-        rows, self._fitted = self._fitted, None
-        if rows is None:
-            raise InputError("there is no reference to compare with")
-        assert self.reference is not None
-        names, lags = self.structure.parameter_names(), self.structure.output_lags
-        residual = rows.outputs[:, 0] - rows.regressors @ self.reference
-        self.drift_chart = learn(rows.regressors, residual, self.rls.forgetting, len(residual), arl0, names, lags)
+    @property
+    def judges(self) -> bool:
+        """True if rows are judged by the adaptive model."""
+        return bool(self.copies)
 
     def drift(self) -> tuple[Judgement, dict[str, float]] | None:
         """Newest point of the drift chart, and each parameter's contribution; None without a chart."""
@@ -305,60 +287,192 @@ class ArxPredictor(Memory, dict=True):
         parts = self.drift_chart.contributions(self.rls.parameters - self.reference)
         return self.newest_drift, dict(zip(self.drift_chart.names, parts.tolist(), strict=True))
 
-    def adaptive_snapshot(self) -> ModelSnapshot | None:
-        """Snapshot of the adaptive model, without a time; None before its first update."""
-        rls = self.rls
-        if not rls.rows:
-            return None
-        covariance = self.weight * rls.parameter_covariance
-        return self.snapshot(rls.parameters, covariance, rls.condition, rls.rows, rls.forgetting)
 
-    def reference_snapshot(self) -> ModelSnapshot | None:
-        """Snapshot of the reference, without a time; None before the fit."""
-        return ModelSnapshot.FromString(self.reference_model) if self.reference_model else None
+class ArxMemory(Memory, tag="arx"):
+    """Memory of the identified models as reference, beside the models.
 
-    def snapshot(
-        self, parameters: Array, covariance: Array, condition: float, rows: int, forgetting: float
-    ) -> ModelSnapshot:
-        """Snapshot of a model in the signals' units, without a time.
+    Attributes:
+        low: lower end of the range in which the models hold, one an input.
+        high: upper end of it.
+        past: where the models stay as fitted, signals of the rows before the next one, the inputs first and the newest
+            row first, shape (rows, signals), NaN where missing; None elsewhere.
+    """
+
+    low: list[float] = msgspec.field(default_factory=list)
+    high: list[float] = msgspec.field(default_factory=list)
+    past: Array | None = None
+
+    def reference(
+        self, equations: ProcessModel | None, outputs: tuple[str, ...], models: "ArxReference"
+    ) -> "ArxReference":
+        """The identified models, which judge from now on as this memory has it.
+
+        Raises:
+            ValueError: the memory is of other settings.
+        """
+        models.judge_by(copy_of(self))
+        return models
+
+
+class ArxReference(Reference):
+    """Identified models of one plant, one an output.
+
+    Args:
+        config: settings of the monitor.
+        points: True to publish predictions.
+
+    Attributes:
+        config: settings of the monitor.
+        points: True to publish predictions.
+        structure: structure of the models that the settings ask for.
+        predictors: the models, one an output; always the same list.
+    """
+
+    kind = "arx"
+    is_identified = True
+    learns = True
+
+    def __init__(self, config: MonitorConfig, *, points: bool) -> None:
+        self.config, self.points, self.structure = config, points, arx_structure(config)
+        self._sds = [1.0] * len(config.outputs)
+        self.predictors: list[ArxPredictor] = []
+        self.forget()
+
+    def forget(self) -> None:
+        """Start models that know nothing."""
+        self.predictors[:] = [ArxPredictor.of(self.structure, self.config.forgetting) for _ in self.config.outputs]
+        self.judge_by(ArxMemory())
+
+    def resume(self, predictors: Sequence[ArxPredictor], *, follows: bool) -> None:
+        """Resume from models of the same settings.
 
         Args:
-            parameters: parameters of the model of scaled signals, shape (parameters,).
-            covariance: covariance of `parameters`, shape (parameters, parameters).
-            condition: condition number of the regressors.
-            rows: number of rows that the model has learned from.
-            forgetting: forgetting factor.
+            predictors: the models, which are copied.
+            follows: True if the next row follows the ones before.
+
+        Raises:
+            ValueError: the models are of other settings.
         """
-        assert self.scaling is not None
-        structure, (matrix, shift) = self.structure, self.scaling.unscaling(self.structure)
-        deviations = standard_deviations(covariance, matrix)
-        return ModelSnapshot(
-            structure="arx",
-            order=structure.output_lags,
-            delay=structure.delay,
-            parameters=[
-                Parameter(name=name, value=value, sd=sd)
-                for name, value, sd in zip(
-                    structure.parameter_names(), matrix @ parameters + shift, deviations, strict=True
-                )
-            ],
-            rows=rows,
-            forgetting=forgetting,
-            excitation=1.0 / condition,
-            condition=condition,
-        )
+        for predictor in predictors:
+            if predictor.structure not in (self.structure, *simpler_structures(self.structure)):
+                raise ValueError(f"the state must be of {self.structure}, got {predictor.structure}")
+        self.predictors[:] = map(copy_of, predictors)
+        self.judge_by(ArxMemory())
+        if not follows:
+            self.restart()
 
-    def _learn_scaling(self, inputs: Sequence[float], value: float) -> None:
-        row = (*inputs[: self.structure.inputs], value)
-        if not all(map(isfinite, row)):
-            return
-        self.first_rows.append(row)
-        if len(self.first_rows) == SCALING_ROWS:
-            rows = np.array(self.first_rows)
-            self._scale(Scaling.of(rows[:, :-1], rows[:, -1]))
-            self.first_rows.clear()
+    def judge_by(self, memory: ArxMemory) -> None:
+        """Take over the ranges in which the models hold, and the rows before the next one.
 
-    def _scale(self, scaling: Scaling) -> None:
-        self.scaling = scaling
-        self._input_scales = list(zip(scaling.input_centres, scaling.input_spreads, strict=True))
-        self._output_scale = scaling.output_centres[0], scaling.output_spreads[0]
+        Raises:
+            ValueError: the memory is of other settings.
+        """
+        shape = self.structure.history, len(self.config.signals)
+        if memory.past is not None and memory.past.shape != shape:
+            raise ValueError(f"rows before must have shape {shape}, got {memory.past.shape}")
+        self._memory, self.obstacles = memory, {}
+        self._uses_inputs = np.array([predictor.structure.inputs > 0 for predictor in self.predictors])
+        ranges = zip(memory.low, memory.high, strict=True)
+        self._ranges = list(enumerate(ranges)) if self._uses_inputs.any() else []
+        if memory.past is not None:
+            self._set_matrices(*shape)
+
+    def copy(self) -> "ArxReference":
+        """Models that stand where these do, and judge nothing."""
+        copy = ArxReference(self.config, points=self.points)
+        copy.resume(self.predictors, follows=True)
+        return copy
+
+    @property
+    def memory(self) -> ArxMemory:
+        """See `Reference`; the models are stored beside it."""
+        return self._memory
+
+    @property
+    def typical_sd(self) -> list[float]:
+        """See `Reference`."""
+        return self._sds
+
+    # --- rows ------------------------------------------------------------------------------------------------
+
+    def adapt(self, row: MeasuredRow) -> list[float]:
+        """Update with a row that the adaptive models do not judge; returns their predictions if they are published."""
+        found = self._update_adaptive(row)
+        return found if self.points else []
+
+    def _update_adaptive(self, row: MeasuredRow) -> list[float]:
+        pairs = zip(self.predictors, row.values, strict=True)
+        return [predictor.update(row.inputs, value, follows=row.follows) for predictor, value in pairs]
+
+    def update(self, row: MeasuredRow, accept: tuple[bool, ...]) -> RowPrediction:
+        """See `Reference`. Predictions with an input beyond the training are extrapolations."""
+        predictions = self._predict_by_matrix(row) if self.stays_as_fitted else self._update_adaptive(row)
+        extrapolation = predictions, [predictor.extrapolation_sd for predictor in self.predictors]
+        outside = (i for i, (low, high) in self._ranges if row.inputs[i] < low or row.inputs[i] > high)
+        beyond = [self.config.inputs[i] for i in outside]
+        text = "is beyond its range in the training: the identified model does not hold there"
+        self.obstacles = {name: f"rows are not judged while {name} {text}" for name in beyond}
+        judged = np.where(self._uses_inputs, nan, predictions).tolist() if beyond else predictions
+        return RowPrediction(judged, self._sds, extrapolation)
+
+    def restart(self) -> None:
+        """See `Reference`; what the models have learned stays."""
+        for predictor in self.predictors:
+            predictor.lagged.restart()
+        if self._memory.past is not None:
+            self._memory.past = np.full(self._memory.past.shape, nan)
+
+    def set_learning(self, learning: bool) -> None:
+        """See `Reference`."""
+        for predictor in self.predictors:
+            predictor.set_learning(learning)
+
+    def step_responses(self, rows: int) -> Array:
+        """See `Reference`; those of the fitted models."""
+        responses = np.ones((len(self.predictors), rows))
+        for response, predictor in zip(responses, self.predictors, strict=True):
+            if predictor.reference is None:
+                response[:] = nan
+                continue
+            lagged = predictor.reference[: predictor.structure.output_lags]
+            for lag, coefficient in enumerate(lagged.tolist(), start=1):
+                response[lag:] -= coefficient
+        return responses
+
+    # --- models as fitted ------------------------------------------------------------------------------------
+
+    @property
+    def stays_as_fitted(self) -> bool:
+        """True if the models judge as fitted; the adaptive ones are then updated by `adapt`."""
+        return self._memory.past is not None
+
+    def _set_matrices(self, rows: int, signals: int) -> None:
+        """Make the matrix of the fitted models, and that of the signals before a row that each of them needs."""
+        outputs, inputs = len(self.predictors), signals - len(self.predictors)
+        theta, needed = np.zeros((outputs, rows, signals)), np.zeros((outputs, rows, signals))
+        self._offsets = np.full(outputs, nan)
+        for i, predictor in enumerate(self.predictors):
+            if predictor.reference is None or predictor.scaling is None:
+                continue
+            structure, (matrix, shift) = predictor.structure, predictor.scaling.unscaling(predictor.structure)
+            parameters, lags = matrix @ predictor.reference + shift, structure.output_lags
+            theta[i, :lags, inputs + i], self._offsets[i] = parameters[:lags], parameters[-1]
+            needed[i, : structure.history, inputs + i] = 1.0
+            if structure.inputs:
+                moved = slice(structure.delay - 1, structure.delay - 1 + structure.input_lags)
+                theta[i, moved, :inputs] = parameters[lags:-1].reshape(structure.input_lags, inputs)
+                needed[i, : structure.history, :inputs] = 1.0
+        self._theta, self._needed = theta.reshape(outputs, -1), needed.reshape(outputs, -1)
+
+    def _predict_by_matrix(self, row: MeasuredRow) -> list[float]:
+        """Predict all outputs of a row from the rows before; NaN where there is no prediction."""
+        past, signals, inputs = self._memory.past, np.array([*row.inputs, *row.values]), len(row.inputs)
+        assert past is not None
+        before = past.ravel() if row.follows else np.full(past.size, nan)
+        known, present = np.isfinite(before), np.isfinite(signals)
+        complete = present[inputs:] & (present[:inputs].all() | ~self._uses_inputs)
+        complete &= self._needed @ ~known == 0.0
+        self._memory.past = np.concatenate([signals, before[: -signals.size]]).reshape(past.shape)
+        predicted = self._theta @ np.where(known, before, 0.0) + self._offsets
+        predictions: list[float] = np.where(complete, predicted, nan).tolist()
+        return predictions

@@ -17,8 +17,8 @@ from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import regular_intervals
-from monitor_node.learn.arx import ROWS_A_PARAMETER, arx_structure, fewest_rows
-from monitor_node.learn.arx_reference import ArxReference
+from monitor_node.learn import arx_fit
+from monitor_node.learn.arx import ArxReference, arx_structure
 from monitor_node.learn.black_box_reference import BlackBoxReference
 from monitor_node.learn.process_reference import ProcessReference
 from monitor_node.learn.references import Reference
@@ -34,6 +34,7 @@ from monitor_node.learn.training_rows import (
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.errors import InputError
+from reactorwatch.identification.structure import Structure
 from reactorwatch.kalman.resolution import resolution_sd
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc.prewhitening import Prewhitening, learn
@@ -129,7 +130,7 @@ def fewest_values(config: MonitorConfig, model: ProcessModel | None) -> int:
     """
     structure = arx_structure(config)
     of_one_input = replace(structure, inputs=min(structure.inputs, 1))
-    return FEWEST_ROWS if model is not None else max(fewest_rows(of_one_input), FEWEST_ROWS)
+    return FEWEST_ROWS if model is not None else max(arx_fit.fewest_rows(of_one_input), FEWEST_ROWS)
 
 
 def learn_baseline(
@@ -179,7 +180,7 @@ def learn_baseline(
     if choice.without_black_box and config.reference == "black-box":
         found[BlackBoxReference.kind].append(f"the ARX models judge: {choice.without_black_box}")
     if reference.is_identified:
-        models.start_judging(choice.given)
+        arx_fit.start_judging(models, choice.given)
         found["model"] = _simplifications(outputs, models, evaluated)
     found["signals"] = [f"{name} is left out: {why}" for name, why in left_out.items()]
     inputs = np.where([name not in left_out for name in config.inputs], inputs, np.nan)
@@ -250,8 +251,8 @@ class _Choice:
         """Fit the references that the settings allow, and choose one."""
         wanted, models = self._config.reference, self._models
         if not self._has_all_inputs:
-            models.learn_again(self.given)
-        identified = self._fit(lambda rows: (models, models.fit(rows)), self.given)
+            arx_fit.learn_again(models, self.given)
+        identified = self._fit(lambda rows: (models, arx_fit.fit_models(models, rows)), self.given)
         equations = self._fit_equations(model) if model is not None and self._has_all_inputs else None
         if equations is not None and (wanted == "equations" or _predicts_as_well(equations, identified)):
             return equations
@@ -320,12 +321,25 @@ def _simplifications(outputs: tuple[str, ...], models: ArxReference, evaluated: 
     """Terms that the identified models lack, each with the outputs."""
     lacking: dict[str, list[str]] = {}
     for name, predictor in compress(zip(outputs, models.predictors, strict=True), evaluated):
-        lacking.setdefault(predictor.simplification, []).append(name)
+        lacking.setdefault(_simplification(predictor.structure, models.structure), []).append(name)
+    least = arx_fit.ROWS_A_PARAMETER
     return [
-        f"{', '.join(names)}: predicted with {text}, as there are fewer than {ROWS_A_PARAMETER} rows a parameter"
+        f"{', '.join(names)}: predicted with {text}, as there are fewer than {least} rows a parameter"
         for text, names in lacking.items()
         if text
     ]
+
+
+def _simplification(has: Structure, wanted: Structure) -> str:
+    """Terms that a structure lacks; empty: none."""
+    parts = []
+    if has.output_lags < wanted.output_lags:
+        parts.append(f"{has.output_lags} instead of {wanted.output_lags} lags of the output")
+    if has.inputs < wanted.inputs:
+        parts.append("no input")
+    elif has.inputs and has.input_lags < wanted.input_lags:
+        parts.append(f"{has.input_lags} instead of {wanted.input_lags} lags of the inputs")
+    return " and ".join(parts)
 
 
 def _few_moves(names: tuple[str, ...], inputs: Array) -> str:

@@ -5,13 +5,12 @@ active it learns nothing, and what it learned shortly before is taken back: its 
 is `COPY_ROWS` to twice as many rows old, so a fault that was not noticed at once is not part of them.
 """
 
-from collections.abc import Iterator, Sequence
 from math import inf, nan
 
 import msgspec
 import numpy as np
 
-from monitor_node.ingest.rows import TOLERANCE, regular_intervals
+from monitor_node.ingest.rows import TOLERANCE, MeasuredRow, regular_intervals
 from monitor_node.learn.references import GATE, FilterReference, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
@@ -32,6 +31,11 @@ COPY_ROWS = 250
 
 UNCERTAIN = 0.2
 """Standard deviation of a coefficient of the dynamics above which the training did not determine them."""
+
+UNFAMILIAR = {
+    "black-box": "rows are not judged while inputs have values that the black box has not learned, and teach it"
+}
+"""Obstacle once there was a row at an unfamiliar point of operation."""
 
 
 class BlackBoxMemory(Memory, tag="black-box"):
@@ -85,12 +89,15 @@ class BlackBoxReference(FilterReference):
     """
 
     kind = "black-box"
+    learns = True
 
     def __init__(self, memory: BlackBoxMemory) -> None:
         self._memory, self.model = memory, memory.model
         self._filter = BlackBoxFilter(memory.model, memory.filter)
         memory.filter = self._filter.memory
         self._outputs, self._count, self.period_min = memory.outputs, memory.count, memory.period_min
+        if memory.unfamiliar_rows:
+            self.obstacles = UNFAMILIAR
         if not memory.copies:
             memory.copies = [self._parameters()] * 2
 
@@ -188,12 +195,6 @@ class BlackBoxReference(FilterReference):
             "more than promised; train over more set points"
         )
 
-    def obstacles(self, inputs: Sequence[str]) -> Iterator[tuple[str, str]]:
-        """See `Reference`."""
-        if self._memory.unfamiliar_rows:
-            text = "rows are not judged while inputs have values that the black box has not learned, and teach it"
-            yield self.kind, text
-
     def row_filter(self, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> RowFilter:
         """See `Reference`."""
         belief, constants = self.numbers
@@ -210,24 +211,15 @@ class BlackBoxReference(FilterReference):
             self._filter.reset_parameters((numbers[0], numbers[1:]))
         self._memory.copies = [self._parameters()] * 2
 
-    def update(
-        self,
-        time_ns: int,
-        inputs: Sequence[float],
-        values: list[float],
-        accept: tuple[bool, ...],
-        missing: int = 0,
-        *,
-        follows: bool = True,
-    ) -> RowPrediction:
+    def update(self, row: MeasuredRow, accept: tuple[bool, ...]) -> RowPrediction:
         """See `Reference`. There is no prediction just after a missing row."""
-        time_min, before = time_ns / MINUTE_NS, self._memory.time_min
+        time_min, before = row.time_ns / MINUTE_NS, self._memory.time_min
         if before is None or abs(time_min - before - self.period_min) > TOLERANCE * self.period_min:
             self._filter.restart()
-        measured = [values[i] for i in self._outputs]
+        measured = [row.values[i] for i in self._outputs]
         limits = [inf if accept[i] else GATE for i in self._outputs]
-        predicted = self._filter.update(inputs, measured, limits)
-        self.accept_row(time_min, tuple(inputs))
+        predicted = self._filter.update(row.inputs, measured, limits)
+        self.accept_row(time_min, row.inputs)
         prediction, sd = [nan] * self._count, [1.0] * self._count
         if predicted is None:
             return RowPrediction(prediction, sd)
@@ -236,6 +228,7 @@ class BlackBoxReference(FilterReference):
         if predicted.judged:
             return RowPrediction(prediction, sd)
         self._memory.unfamiliar_rows += 1
+        self.obstacles = UNFAMILIAR
         return RowPrediction([nan] * self._count, sd, (prediction, sd))
 
     def step_responses(self, rows: int) -> Array:

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from monitor_node.config import MonitorConfig
-from monitor_node.learn.arx_reference import ArxReference
+from monitor_node.learn.arx import ArxReference
 from monitor_node.learn.baseline import TrainingResult, learn_baseline
 from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding, equations_text, read_equations
 from monitor_node.learn.training_rows import TrainingRows

@@ -3,14 +3,13 @@
 It is nonlinear, so inputs beyond the training and irregular rows are no problem.
 """
 
-from collections.abc import Sequence
 from functools import lru_cache
 from math import isfinite, nan
 
 import msgspec
 import numpy as np
 
-from monitor_node.ingest.rows import missing_in_intervals
+from monitor_node.ingest.rows import NO_INTERVAL, MeasuredRow, missing_in_intervals
 from monitor_node.learn.references import GATE, FilterReference, PlantEquations, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
@@ -171,45 +170,37 @@ class ProcessReference(FilterReference):
             "states": {name: self._memory.noise.process_sd[i] for i, name in states if i not in constant},
         }
 
-    def update(
-        self,
-        time_ns: int,
-        inputs: Sequence[float],
-        values: list[float],
-        accept: tuple[bool, ...],
-        missing: int = 0,
-        *,
-        follows: bool = True,
-    ) -> RowPrediction:
+    def update(self, row: MeasuredRow, accept: tuple[bool, ...]) -> RowPrediction:
         """See `Reference`.
 
         An input is held until the next row. So where a row or one of its inputs is missing, there is no prediction
         until the next row with all inputs. After one such row the prediction includes the uncertainty of the inputs:
         they were as before or as after, one of them plus or minus its largest pulse of one row in the training.
         """
-        memory, time_min, changes = self._memory, time_ns / MINUTE_NS, list[tuple[float, tuple[float, ...]]]()
+        memory, time_min, changes = self._memory, row.time_ns / MINUTE_NS, list[tuple[float, tuple[float, ...]]]()
+        inputs, missing = row.inputs, row.interval.missing
         unknown = any(memory.guessed) + memory.held_rows + missing
         if all(map(isfinite, inputs)):
             if unknown > MOST_UNKNOWN:
                 self._filter.interrupt()
             elif unknown:
-                changes = self._possible_changes(time_min, tuple(inputs))
-            memory.last_inputs, memory.guessed, memory.held_rows = tuple(inputs), self._all_known, 0
+                changes = self._possible_changes(time_min, inputs)
+            memory.last_inputs, memory.guessed, memory.held_rows = inputs, self._all_known, 0
         elif unknown or not all(map(isfinite, memory.last_inputs)):
             pairs = zip(inputs, memory.last_inputs, strict=True)
             if not all(map(isfinite, memory.last_inputs)):
                 memory.last_inputs = tuple(value if isfinite(value) else last for value, last in pairs)
             memory.held_rows += missing + 1
-            unknown_values = [nan] * len(values)
+            unknown_values = [nan] * len(row.values)
             return RowPrediction(unknown_values, unknown_values)
         else:
             pairs = zip(inputs, memory.last_inputs, strict=True)
             memory.guessed = tuple(not isfinite(value) for value in inputs)
             memory.last_inputs = tuple(value if isfinite(value) else last for value, last in pairs)
-        measured, accepted = values, list(accept)
+        measured, accepted = row.values, list(accept)
         if not self._accept_all:
             measured, accepted = [nan] * self._count, [False] * self._count
-            for i, value, is_accepted in zip(self._indices, values, accept, strict=True):
+            for i, value, is_accepted in zip(self._indices, row.values, accept, strict=True):
                 measured[i], accepted[i] = value, is_accepted
         step = self._filter.update(time_min, memory.last_inputs, measured, gate=GATE, accept=accepted, changes=changes)
         if self._accept_all:
@@ -285,14 +276,15 @@ class ProcessReference(FilterReference):
             self._filter.restart()
         z, sds = np.full(measured.shape, np.nan), np.full(measured.shape, np.nan)
         accept, missing = (False,) * measured.shape[1], [0, *missing_in_intervals(time_min).tolist()]
-        for row, values in enumerate(measured.tolist()):
-            if missing[row]:
+        times_ns = np.round(time_min * MINUTE_NS).astype(np.int64).tolist()
+        for i, (time_ns, given, values) in enumerate(zip(times_ns, inputs.tolist(), measured.tolist(), strict=True)):
+            if missing[i]:
                 self.restart()
-            predicted = self.update(round(time_min[row] * MINUTE_NS), inputs[row].tolist(), values, accept)
+            predicted = self.update(MeasuredRow(time_ns, tuple(given), values, [], NO_INTERVAL, False, []), accept)
             residual = [value - prediction for value, prediction in zip(values, predicted.prediction, strict=True)]
-            sds[row] = predicted.sd
-            z[row] = [size / sd for size, sd in zip(residual, predicted.sd, strict=True)]
-            accept = tuple(abs(size) > GATE for size in z[row].tolist())
+            sds[i] = predicted.sd
+            z[i] = [size / sd for size, sd in zip(residual, predicted.sd, strict=True)]
+            accept = tuple(abs(size) > GATE for size in z[i].tolist())
         memory.typical_sd = _median_sds(sds)
         return z
 

@@ -1,13 +1,15 @@
 """References: models that predict the rows of a plant; residuals are taken against the predictions.
 
 There are three: the extended Kalman filter of a process model (`process_reference`), a black box of few signals
-(`black_box_reference`), and the identified models, recursive ARX models (`arx_reference`).
+(`black_box_reference`), and the identified models, recursive ARX models (`arx`).
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
+from monitor_node.ingest.rows import MeasuredRow
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
@@ -68,10 +70,14 @@ class Reference(ABC):
     Attributes:
         kind: `equations`, `black-box` or `arx`, as published.
         is_identified: True if the identified models predict, which are then not updated beside it.
+        learns: True if it learns the plant from the rows that it judges.
+        obstacles: reasons why rows are not judged now, each with what it is about.
     """
 
     kind: ClassVar[str]
     is_identified: ClassVar[bool] = False
+    learns: ClassVar[bool] = False
+    obstacles: Mapping[str, str] = MappingProxyType({})
 
     @property
     @abstractmethod
@@ -91,46 +97,29 @@ class Reference(ABC):
     # --- rows ------------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def update(
-        self,
-        time_ns: int,
-        inputs: Sequence[float],
-        values: list[float],
-        accept: tuple[bool, ...],
-        missing: int = 0,
-        *,
-        follows: bool = True,
-    ) -> RowPrediction:
+    def update(self, row: MeasuredRow, accept: tuple[bool, ...]) -> RowPrediction:
         """Predict a row, then update with it.
 
         Args:
-            time_ns: time of the row.
-            inputs: one value an input; NaN if missing.
-            values: outputs; NaN if missing.
-            accept: outputs that correct the reference whatever their residual.
-            missing: number of rows missing just before this one.
-            follows: True if the row before was one period ago.
+            row: the row.
+            accept: one flag an output: it corrects the reference whatever its residual.
         """
 
     @abstractmethod
     def restart(self) -> None:
         """Restart with the next row: the plant's clock was set, or there was a gap."""
 
-    def set_learning(self, learning: bool) -> None:  # noqa: B027 # without memory of the plant there is nothing to do
-        """Learn from the rows to come, or not: while nothing is wrong, or a fault would be learned as ordinary."""
+    def set_learning(self, learning: bool) -> None:
+        """Learn from the rows to come, or not: while nothing is wrong, or a fault would be learned as ordinary.
+
+        It is called only where the reference `learns`.
+        """
+        raise NotImplementedError
 
     @property
     def weakness(self) -> str:
         """Reason why the promise may not hold at set points that the training has not seen; empty if it does."""
         return ""
-
-    def obstacles(self, inputs: Sequence[str]) -> Iterator[tuple[str, str]]:
-        """Reasons why rows are not judged now, each with what it is about.
-
-        Args:
-            inputs: names of the inputs.
-        """
-        yield from ()
 
     # --- what is known of the plant --------------------------------------------------------------------------
 

@@ -10,7 +10,8 @@ from operator import not_
 
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import MeasuredRow
-from monitor_node.learn.arx_reference import ArxReference
+from monitor_node.learn import arx_fit
+from monitor_node.learn.arx import ArxReference
 from monitor_node.learn.baseline import TrainingResult, fewest_values, learn_baseline
 from monitor_node.learn.training_rows import TrainingRows
 from reactorwatch.errors import UnfitRecordError
@@ -85,7 +86,7 @@ class Training:
     def take_over(self, rows: TrainingRows) -> None:
         """Train on with the rows of an incident, by which the identified models are updated."""
         self.memory.rows, self.memory.began_ns = rows, rows.times_ns[0]
-        self._models.learn_again(rows.arrays)
+        arx_fit.learn_again(self._models, rows.arrays)
 
     def open(self) -> None:
         """Train until the caller ends it, on all rows until then."""

@@ -10,7 +10,8 @@ import numpy as np
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
-from monitor_node.learn.arx import arx_structure, fewest_rows
+from monitor_node.learn.arx import arx_structure
+from monitor_node.learn.arx_fit import fewest_rows
 from monitor_node.learn.baseline import FEWEST_ROWS
 from monitor_node.monitor_state import MonitorMemory
 from monitor_node.watch.pipeline_memory import PipelineMemory
@@ -236,12 +237,12 @@ def run(
         first_ns=first_ns or 0,
         last_ns=monitor.memory.last_ns or 0,
         span_ns=monitor.span_ns,
-        runs=1 + monitor.aligner.memory.counts.restarts,
+        runs=1 + monitor.intake.aligner.memory.counts.restarts,
         watching_since_ns=monitor.memory.watching_since_ns,
         expected_false_alarms=monitor.pipeline.expected_false_alarms,
         alarm_messages=alarms,
         incident_messages=incidents,
-        refused=dict(monitor.rejects.by_reason),
+        refused=dict(monitor.intake.rejects.by_reason),
         notes=[*(trained.notes if trained is not None else ()), *monitor.notes],
         left_out=monitor.excluded_signals,
         reference=monitor.pipeline.newest_reference or None,

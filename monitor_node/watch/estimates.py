@@ -7,10 +7,11 @@ from math import isfinite, nan
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import MeasuredRow
 from monitor_node.learn.arx import ArxPredictor
+from monitor_node.learn.arx_fit import adaptive_snapshot
 from monitor_node.learn.references import Reference
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Check, Estimate
+from reactorwatch.contract.messages_pb2 import Check, Estimate, ModelSnapshot
 
 NO_LIMITS = 0.0, nan, nan
 
@@ -92,7 +93,8 @@ def model_snapshots(
         checks: checks of the training.
     """
     for index, (signal, predictor) in enumerate(zip(config.outputs, predictors, strict=True)):
-        adaptive, fitted = predictor.adaptive_snapshot(), predictor.reference_snapshot()
+        adaptive, stored = adaptive_snapshot(predictor), predictor.reference_model
+        fitted = ModelSnapshot.FromString(stored) if stored else None
         judging = None if reference is None else reference.snapshot(index, config.inputs, config.outputs)
         if fitted is not None:
             fitted.held = True

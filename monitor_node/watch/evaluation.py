@@ -15,7 +15,7 @@ from monitor_node.checks.base import CheckTraining
 from monitor_node.checks.stage import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import SamplingPeriod
-from monitor_node.learn.arx_reference import ArxReference
+from monitor_node.learn.arx import ArxReference
 from monitor_node.learn.baseline import TrainingResult
 from monitor_node.learn.references import Reference
 from monitor_node.learn.signal_range import possible_ranges, stated_ranges

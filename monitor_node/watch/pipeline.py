@@ -20,7 +20,7 @@ from monitor_node.checks.base import CheckRow
 from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
 from monitor_node.health import NODE, Failures
 from monitor_node.ingest.rows import MeasuredRow, Row, SamplingPeriod
-from monitor_node.learn.arx_reference import ArxReference
+from monitor_node.learn.arx import ArxReference
 from monitor_node.learn.baseline import NO_VALUE, TrainingResult
 from monitor_node.learn.model_update import is_command
 from monitor_node.learn.signal_range import input_bounds
@@ -293,9 +293,7 @@ class PlantPipeline:
         row.values = values = seen.without(stuck)
         if row.interval.is_gap:  # the input in it is unknown
             evaluation.restart()
-        predictions, sds, extrapolation = reference.update(
-            time_ns, row.inputs, values, memory.quarantined, row.interval.missing, follows=row.follows
-        )
+        predictions, sds, extrapolation = reference.update(row, memory.quarantined)
         z = [(value - prediction) / sd for value, prediction, sd in zip(values, predictions, sds, strict=True)]
         tested = z
         if extrapolation is not None:
@@ -321,7 +319,7 @@ class PlantPipeline:
         if shift.is_active:
             changes += shift.update(row, tested, points=self._points)
         self._end_row(row, changes, before, stuck)
-        for about, text in reference.obstacles(self._config.inputs):
+        for about, text in reference.obstacles.items():
             if about not in self._noted:
                 self._noted.add(about)
                 evaluation.notes.append(text)
@@ -352,7 +350,8 @@ class PlantPipeline:
         if stuck is not None and evaluation.suspicion is not None:
             publications.extend(self._search_causes(evaluation.suspicion, row, stuck))
         if stuck is not None or board.has_unexplained:
-            reference.set_learning(not board.has_unexplained)
+            if reference.learns:
+                reference.set_learning(not board.has_unexplained)
             if not board.has_unexplained:
                 memory.incident = None
             else:

@@ -7,8 +7,7 @@ import msgspec
 from monitor_node.causes.stage import SuspicionMemory
 from monitor_node.charts.charts import ChartsMemory
 from monitor_node.ingest.rows import SamplingPeriod
-from monitor_node.learn.arx import ArxPredictor
-from monitor_node.learn.arx_reference import ArxMemory
+from monitor_node.learn.arx import ArxMemory, ArxPredictor
 from monitor_node.learn.black_box_reference import BlackBoxMemory
 from monitor_node.learn.process_reference import ProcessMemory
 from monitor_node.learn.training import TrainingMemory

@@ -1,6 +1,6 @@
 """Structure of a linear model: orders, delay, scaling, and choice of rows."""
 
-from typing import Any, Self, overload
+from typing import Self
 
 import msgspec
 import numpy as np
@@ -116,15 +116,9 @@ class RowChoice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.every < 1:
             raise InputError(f"every must be at least 1, got {self.every}")
 
-    @overload
-    def takes(self, row: int) -> bool: ...
-
-    @overload
-    def takes(self, row: NDArray[np.intp]) -> NDArray[np.bool_]: ...
-
-    def takes(self, row: Any) -> Any:
-        """True if the row of this index, from 0, is fitted; of many, one flag each."""
-        return (row >= self.skip) & ((row - self.skip) % self.every == 0)
+    def takes(self, row: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Flags of the rows, by their index from 0, that are fitted."""
+        return np.asarray((row >= self.skip) & ((row - self.skip) % self.every == 0))
 
 
 ALL_ROWS = RowChoice()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from monitor_node.causes.isolation import UNKNOWN, Isolation
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.ingest.rows import missing_rows
+from monitor_node.ingest.rows import Interval, MeasuredRow, missing_rows
 from monitor_node.learn.process_reference import ProcessMemory, ProcessReference, input_reach
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
@@ -180,22 +180,29 @@ def test_where_nothing_is_lost_no_prediction_is_any_less_certain(
         raised(trained["process", name], "process", [m for at, m in enumerate(messages) if at % 30 not in (1, 2)])
 
 
+def measured_row(
+    row: int, flow: float, values: tuple[float, float] = (0.097, 439.0), *, missing: int = 0
+) -> MeasuredRow:
+    interval = Interval(not missing, False, missing)
+    return MeasuredRow(row * 6 * 10**9, (flow,), list(values), [], interval, interval.follows, [])
+
+
 def reference_with_rows(held: float = 100.0) -> ProcessReference:
     """A reference that has settled, with an input that is held."""
     reference = ProcessReference(cstr(), ("C", "T"), ProcessMemory(SENSORS))
     for row in range(50):
-        reference.update(row * 6 * 10**9, [held], [0.097, 439.0], (True, True))
+        reference.update(measured_row(row, held), (True, True))
     return reference
 
 
 def test_while_the_input_does_not_show_nothing_is_predicted() -> None:
     """The row whose input is missing is predicted, as the input before it is known; those after it are not."""
     reference = reference_with_rows()
-    rows = [reference.update(row * 6 * 10**9, [nan], [0.097, 439.0], (False, False)) for row in range(50, 54)]
+    rows = [reference.update(measured_row(row, nan), (False, False)) for row in range(50, 54)]
     assert [bool(np.isfinite(row.prediction).all()) for row in rows] == [True, False, False, False]
-    begun = reference.update(54 * 6 * 10**9, [100.0], [0.097, 439.0], (False, False))
+    begun = reference.update(measured_row(54, 100.0), (False, False))
     assert not np.isfinite(begun.prediction).any()
-    assert np.isfinite(reference.update(55 * 6 * 10**9, [100.0], [0.097, 439.0], (False, False)).prediction).all()
+    assert np.isfinite(reference.update(measured_row(55, 100.0), (False, False)).prediction).all()
 
 
 @pytest.mark.parametrize(("input_value", "wider"), [(100.0, False), (110.0, True)])
@@ -204,9 +211,9 @@ def test_behind_a_lost_row_the_prediction_is_as_uncertain_as_the_input_was(input
     ends = []
     for flow in (100.0, input_value):
         known = reference_with_rows()
-        known.update(50 * 6 * 10**9, [flow], [nan, nan], (False, False))
-        ends.append(known.update(51 * 6 * 10**9, [input_value], [0.097, 439.0], (False, False)))
-    lost = reference_with_rows().update(51 * 6 * 10**9, [input_value], [0.097, 439.0], (False, False), 1)
+        known.update(measured_row(50, flow, (nan, nan)), (False, False))
+        ends.append(known.update(measured_row(51, input_value), (False, False)))
+    lost = reference_with_rows().update(measured_row(51, input_value, missing=1), (False, False))
     assert (lost.sd[1] > 1.2 * ends[0].sd[1]) is wider
     middle = 0.5 * (ends[0].prediction[1] + ends[1].prediction[1])
     assert lost.prediction[1] == pytest.approx(middle, abs=1e-6)

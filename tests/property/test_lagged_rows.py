@@ -4,7 +4,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reactorwatch.identification.regressor import RegressorBuffer, rows_of
+from monitor_node.learn.arx import LaggedRows
+from reactorwatch.identification.regressor import rows_of
 from reactorwatch.identification.structure import Structure
 
 PERIOD_NS = 100
@@ -33,12 +34,12 @@ def test_stream_and_record_agree(data: st.DataObject) -> None:
     time_ns = np.cumsum(intervals)
 
     record = rows_of(structure, u, y, time_ns)
-    buffer = RegressorBuffer(structure)
+    lagged = LaggedRows(structure)
     stream = {}
     for k in range(count):
         if intervals[k] > PERIOD_NS:
-            buffer.restart()
-        regressor = buffer.update(int(time_ns[k]), u[k], y[k])
+            lagged.restart()
+        regressor = lagged.update(u[k].tolist(), float(y[k, 0]))
         if regressor is not None:
             stream[k] = regressor
     assert list(stream) == record.position.tolist()
