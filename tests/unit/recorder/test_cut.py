@@ -191,8 +191,8 @@ def test_both_ends_of_a_window_are_inside(key: str, window: Window, inside: list
     is_by_sample = window.sampled_ns == (10, 20)
     times = [9, 10, 15, 20, 21]
     messages = [stored(key, 3 if is_by_sample else time, time if is_by_sample else 3) for time in times]
-    assert [time for time, item in zip(times, messages, strict=True) if window.contains(item)] == inside
-    assert [time for time, item in zip(times, messages, strict=True) if window.starts_after(item)] == before
+    assert [time for time, item in zip(times, messages, strict=True) if window.side_of(item) == 0] == inside
+    assert [time for time, item in zip(times, messages, strict=True) if window.side_of(item) < 0] == before
 
 
 def test_the_losses_of_a_recovery_are_named_up_to_five_places() -> None:

@@ -15,11 +15,9 @@ from recorder.files.index import (
     decompress,
     is_indexed,
     largest_chunk_bytes,
-    read_indexed_metadata,
-    read_summary,
     span_ns,
 )
-from recorder.files.reader import metadata_records
+from recorder.files.reader import Reader, metadata_records
 from recorder.files.writer import RecordingWriter
 from tests.unit.recorder.test_chunk_data import DESCRIBED, SOUND, bytes_of, chunk, message, recording
 
@@ -165,7 +163,7 @@ def test_a_file_without_a_whole_index_is_refused_with_what_is_wrong(tmp_path: Pa
     path = tmp_path / "run.mcap"
     path.write_bytes(content)
     with pytest.raises(InputError) as raised:
-        read_summary(path)
+        Reader(path)
     assert text in str(raised.value)
     assert str(raised.value).startswith(f"{path}: ")
 
@@ -173,13 +171,13 @@ def test_a_file_without_a_whole_index_is_refused_with_what_is_wrong(tmp_path: Pa
 def test_a_file_without_an_index_has_an_empty_one_and_one_that_ends_at_its_footer_too(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(recording([SOUND], indexed=False))
-    assert vars(read_summary(path)) == vars(Summary())
+    assert vars(Reader(path).summary) == vars(Summary())
     path.write_bytes(changed_at(WHOLE, FOOTER_AT + 9, FOOTER_AT.to_bytes(8, "little")))
-    assert vars(read_summary(path)) == vars(Summary())
+    assert vars(Reader(path).summary) == vars(Summary())
     path.write_bytes(WHOLE[:MAGIC_BYTES] + changed_at(WHOLE, FOOTER_AT + 9, bytes(8))[FOOTER_AT:])
-    assert vars(read_summary(path)) == vars(Summary()), "the shortest file"
+    assert vars(Reader(path).summary) == vars(Summary()), "the shortest file"
     path.write_bytes(WHOLE)
-    found = read_summary(path)
+    found = Reader(path).summary
     assert (list(found.channels), len(found.chunk_indexes)) == ([1], 1)
 
 
@@ -188,17 +186,17 @@ def test_metadata_are_read_where_the_index_names_them_and_another_record_there_i
     with RecordingWriter(path, {"seed": "3"}) as writer:
         writer.write(RecordedMessage("T", b"x", "text", 1, 1))
         writer.add_metadata("notes", {"text": "a"})
-    found = read_summary(path)
-    records = read_indexed_metadata(path, found)
+    reader = Reader(path)
+    reader.read_indexed_metadata()
+    records = reader.metadata
     assert [record.name for record in records] == ["reactorwatch", "notes"]
     assert records == metadata_records(path)
-    (first, *_) = found.metadata_indexes
+    (first, *_) = reader.summary.metadata_indexes
     header = MetadataIndex(length=first.length, name="notes", offset=MAGIC_BYTES)
-    damaged = Summary()
-    damaged.metadata_indexes = [header]
+    reader.summary.metadata_indexes = [header]
     with pytest.raises(InputError, match="its metadata cannot be read"):
-        read_indexed_metadata(path, damaged)
+        reader.read_indexed_metadata()
     record = bytes_of(Metadata(name="notes", metadata={"text": "a"}))
-    damaged.metadata_indexes = [MetadataIndex(length=len(record), name="notes", offset=first.offset + 3)]
+    reader.summary.metadata_indexes = [MetadataIndex(length=len(record), name="notes", offset=first.offset + 3)]
     with pytest.raises(InputError, match="its metadata cannot be read"):
-        read_indexed_metadata(path, damaged)
+        reader.read_indexed_metadata()

@@ -14,7 +14,6 @@ from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.copies import recover
-from recorder.files.index import read_summary
 from recorder.files.part_file import PartFile
 from recorder.files.reader import Reader, StoredChannel, metadata_records
 from recorder.files.recording import Recording
@@ -208,7 +207,7 @@ def test_a_sample_has_its_number_modulo_2_to_the_32_and_anything_else_has_0(tmp_
     message = RecordedMessage("reactor/cstr/sample/T", sample.SerializeToString(), encoding_of(Sample), 1, 1)
     with RecordingWriter(tmp_path / "run.mcap", {}) as writer:
         writer.write(message)
-        writer.write(message, readable=False)
+        writer.write(message._replace(payload=b"\xff\xff"))
         writer.write(message._replace(encoding="text"))
     found = [
         (stored.sequence, isinstance(stored.channel, StoredChannel) and stored.channel.schema is not None)
@@ -223,7 +222,7 @@ def test_a_recording_has_a_channel_for_each_key_encoding_and_use_and_one_schema_
         for message in ENTRIES:
             writer.write(message)
             writer.write(message._replace(latched=True))
-    summary = read_summary(path)
+    summary = Reader(path).summary
     keys = {(entry.key, entry.encoding) for entry in ENTRIES}
     assert len(summary.channels) == 2 * len(keys)
     assert len(summary.schemas) == len({schema.name for schema in summary.schemas.values()})
@@ -232,7 +231,7 @@ def test_a_recording_has_a_channel_for_each_key_encoding_and_use_and_one_schema_
         for _ in range(2):  # two readers have objects of their own for equal channels
             for stored in Reader(path):
                 writer.append(stored)
-    copied = read_summary(copy)
+    copied = Reader(copy).summary
     assert (len(copied.channels), len(copied.schemas)) == (len(summary.channels), len(summary.schemas))
     assert [stored.recorded_message for stored in Reader(copy)] == 2 * [
         stored.recorded_message for stored in Reader(path)
