@@ -7,7 +7,7 @@ follow from its samples and from operators' actions. So a replay reproduces them
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, cast
 
@@ -20,18 +20,9 @@ from monitor_node.alarms.commands import execute_command
 from monitor_node.checks.silence import SilenceCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.health import HEARD_AGAIN_NS, NODE, STALL_NS, Failures, ReceiveStats
-from monitor_node.ingest.alignment import Aligner, ReplayFilter
+from monitor_node.ingest.intake import SampleIntake
 from monitor_node.ingest.rows import Row
-from monitor_node.ingest.samples import (
-    LARGEST_NUMBER,
-    LARGEST_SAMPLE,
-    LARGEST_VALUE,
-    USABLE,
-    RejectCounter,
-    SampleUnits,
-    reject_reason,
-)
-from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
+from monitor_node.ingest.sequence_check import SequenceCheck
 from monitor_node.learn.baseline import NO_VALUE
 from monitor_node.learn.model_update import BASELINE, LIST
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding
@@ -48,7 +39,7 @@ from monitor_node.watch.promise import PromiseStage
 from monitor_node.watch.promise_check import check_training
 from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import OTHER_VERSION, Body, DecodeError, Encoded, Publication, decode, encode
+from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode, encode
 from reactorwatch.contract.commands import decode_command
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply, Health, Promise, Sample
 from reactorwatch.errors import InputError
@@ -77,10 +68,9 @@ class Monitor:
         InputError: the settings are inconsistent.
 
     Attributes:
-        rejects: rejected messages.
+        intake: makes rows of the samples, and counts what it rejects.
         failures: contained errors of this software.
         alarms: alarms of the plant.
-        aligner: makes rows of the samples, and counts them.
         pipeline: pipeline of the plant's rows.
         memory: what the monitor remembers beside its parts.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
@@ -106,24 +96,15 @@ class Monitor:
         self._points, self._model, self._diagnose = points, model, diagnose
         self._changes: deque[Baseline] = deque()
         self._republishes_baseline = False
-        self._signals = config.signals
         self.memory = MonitorMemory(
-            runs=[SequenceCheck() for _ in self._signals], units=dict.fromkeys(self._signals, "")
+            runs=[SequenceCheck() for _ in config.signals], units=dict.fromkeys(config.signals, "")
         )
-        self.rejects, self.failures = RejectCounter(self.memory.refused), Failures(self.memory.failures)
-        known = (*self._signals, *config.carried_signals)
-        self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in known}
-        self._label_keys = {keys.key(config.plant, keys.SAMPLE, signal) for signal in config.labels}
-        self._indices = {signal: place for place, signal in enumerate(self._signals)}
-        self.aligner = Aligner(self._signals, config.reorder_rows)
-        self._replay_filter: ReplayFilter | None = None
+        self.failures = Failures(self.memory.failures)
         self._alarms_with_other_settings: AnnunciatorMemory | None = None
         self.alarms = Annunciator(config)
         self.pipeline = self._new_pipeline(self.alarms)
-        judged_by = self.pipeline.model
-        self._sample_units = SampleUnits(config.units, {} if judged_by is None else judged_by.units)
-        self._plain_units = self._sample_units.plain
-        self._output_units = [""] * len(config.outputs)
+        model_units = {} if self.pipeline.model is None else self.pipeline.model.units
+        self.intake = SampleIntake(config, model_units, self.memory, self._on_row, self._on_label)
         self.span_ns = 0
         self.stats = ReceiveStats(start_ns, start_ns)
         self.on_row_end: Callable[[int, list[Publication]], None] | None = None
@@ -135,95 +116,37 @@ class Monitor:
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Process a message on a key of the plant's samples; returns publications."""
-        self.memory.received += 1
-        if message.received_ns and now_ns - message.received_ns > self.stats.lag_ns:
-            self.stats.lag_ns = now_ns - message.received_ns
-        signal = self._signal_by_key.get(message.key)
-        if signal is None:
-            if message.key not in self._label_keys:
-                self.rejects.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
-            return []
-        if len(message.payload) > LARGEST_SAMPLE:
-            self.rejects.add("too_large", f"{message.key}: {len(message.payload)} bytes are no Sample")
-            return []
-        try:
-            sample = decode(message.payload, message.encoding)
-        except DecodeError as error:
-            if error.reason == OTHER_VERSION:
-                self._refuse(signal, error.reason, str(error))
-            else:
-                self.rejects.add(error.reason, f"{message.key}: {error}")
-            return []
-        if not isinstance(sample, Sample):
-            self.rejects.add("encoding", f"{message.key}: a Sample was expected, got {message.encoding}")
-            return []
-        return self.on_sample(signal, sample, now_ns)
+        return self.on_messages((message,), now_ns)
 
-    def on_sample(self, signal: str, sample: Sample, now_ns: int) -> list[Publication]:
-        """Process a sample of one of the plant's signals; returns publications."""
-        quality, value, unit = sample.quality, sample.value, sample.unit  # each access costs as much as a line here
-        if quality not in USABLE or not abs(value) < LARGEST_VALUE:
-            self._refuse(signal, *reject_reason(signal, sample))
-            return []
-        if unit != self._plain_units.get(signal):
-            try:
-                value, unit = self._sample_units.convert(signal, unit, value)
-            except InputError as error:
-                self._refuse(signal, "unit", str(error))
-                return []
-        index = self._indices.get(signal)
-        if index is None:
-            self.pipeline.operation.on_sample(signal, sample.time_ns, value)
-            return []
-        if self._replay_filter is not None and self._replay_filter.is_duplicate(index, sample.time_ns, sample.sequence):
-            self.aligner.memory.counts.duplicated += 1
-            return []
+    def on_messages(self, messages: Sequence[Encoded], now_ns: int) -> list[Publication]:
+        """Process messages on keys of the plant's samples, in order; returns publications."""
         publications: list[Publication] = []
-        time_ns, number = sample.time_ns, sample.sequence
-        run, is_accepted = self.memory.runs[index], True
-        if run.accept_next(number, time_ns):  # as nearly always
-            self._accept(signal, time_ns, number, value, unit, publications)
-        elif not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):
-            self.rejects.add(
-                "out_of_range", f"{signal} number {number} at {time_ns} ns: no plant counts or lasts so far"
-            )
-            return []
-        else:
-            accepted, rejected = run.update(HeldSample(time_ns, number, value, unit), self.config.reorder_rows)
-            is_accepted = bool(accepted)
-            for item in rejected:
-                self.rejects.add(
-                    "out_of_place",
-                    f"{signal} number {item.number} at {item.time_ns} ns does not follow number {run.newest} at "
-                    f"{run.newest_ns} ns; do two plants publish as {self.config.plant}?",
-                )
-            for item in accepted:
-                self._accept(signal, *item, publications)
-        if is_accepted and now_ns >= self.stats.heard_ns + HEARD_AGAIN_NS:
-            self.stats.heard_ns = now_ns
-            self.silence.of_plant.on_receipt(now_ns)
+        self.memory.received += len(messages)
+        received_ns = min(message.received_ns for message in messages)
+        if received_ns and now_ns - received_ns > self.stats.lag_ns:
+            self.stats.lag_ns = now_ns - received_ns
+        if self.intake.take(messages, publications):
+            self._on_receipt(now_ns)
         self.memory.published += len(publications)
         return publications
 
-    def _refuse(self, signal: str, reason: str, text: str) -> None:
-        """Count a sample of one of the plant's signals that cannot be used."""
-        self.rejects.add(reason, text)
-        if signal in self._indices and reason != "payload":
-            self.memory.unusable.add(signal, text)
+    def on_sample(self, signal: str, sample: Sample, now_ns: int) -> list[Publication]:
+        """Process a sample of one of the plant's signals; returns publications."""
+        publications: list[Publication] = []
+        if self.intake.take_sample(signal, sample, publications):
+            self._on_receipt(now_ns)
+        self.memory.published += len(publications)
+        return publications
 
-    def _accept(
-        self, signal: str, time_ns: int, number: int, value: float, unit: str, publications: list[Publication]
-    ) -> None:
-        """Process an accepted sample."""
-        memory = self.memory
-        if memory.unusable.reasons:
-            memory.unusable.clear(signal)
-        if unit != memory.units[signal] or signal not in memory.heard_from_ns:
-            memory.heard_from_ns.setdefault(signal, time_ns)
-            memory.units[signal] = unit
-            self._output_units = [memory.units[output] for output in self.config.outputs]
-        for row in self.aligner.update(signal, time_ns, number, value):
-            self._on_row(row, publications)
+    def on_history_end(self) -> None:
+        """End the history query: from now on no sample is one that was processed before a restart."""
+        self.intake.end_history()
+
+    def _on_receipt(self, now_ns: int) -> None:
+        """Restart the plant's data timeout, as a usable sample has arrived."""
+        if now_ns >= self.stats.heard_ns + HEARD_AGAIN_NS:
+            self.stats.heard_ns = now_ns
+            self.silence.of_plant.on_receipt(now_ns)
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """Execute an operator's command at the time of the newest row, or refuse it."""
@@ -232,7 +155,7 @@ class Monitor:
             reply, publications = self._execute(question)
         except (InputError, DecodeError) as error:
             reason = error.reason if isinstance(error, DecodeError) else "command"
-            self.rejects.add(reason, f"{question.key}: {error}")
+            self.intake.rejects.add(reason, f"{question.key}: {error}")
             return CommandReply(accepted=False, text=str(error)), []
         self.memory.published += len(publications)
         return reply, publications
@@ -282,7 +205,7 @@ class Monitor:
         state = MonitorState(
             **msgspec.structs.asdict(self.memory),
             settings={},
-            alignment=self.aligner.memory,
+            alignment=self.intake.aligner.memory,
             board=self.alarms.memory,
             watch=self.pipeline.memory,
             unconfirmed=[encode(item)[:3] for item in self.unconfirmed],
@@ -292,8 +215,7 @@ class Monitor:
     def from_bytes(self, data: bytes) -> None:
         """Resume from what `to_bytes` of a monitor with the same settings returned.
 
-        Until `on_history_end`, samples that were processed before are counted as duplicated and dropped (see
-        `ReplayFilter`).
+        Until the history ends, samples that were processed before are dropped, see `SampleIntake.resume`.
 
         Raises:
             InputError: the bytes are no state; nothing has changed.
@@ -325,24 +247,14 @@ class Monitor:
         self.alarms, self.pipeline = board, pipeline
         self._republishes_baseline = True  # it may not have been published before the stop
         self.memory = memory = msgspec.convert(state, MonitorMemory, from_attributes=True)
-        self.rejects.by_reason, self.failures.by_stage = memory.refused, memory.failures
-        self.aligner.memory, self._replay_filter = state.alignment, ReplayFilter(state.alignment)
+        self.failures.by_stage = memory.failures
+        self.intake.resume(memory, state.alignment)
         self.silence.unusable = memory.unusable
-        self._output_units = [memory.units[output] for output in self.config.outputs]
         self.unconfirmed = unconfirmed
 
     @cached_property
     def _learning_settings(self) -> dict[str, Any]:
         return learning_settings(self.config, self.pipeline.model, points=self._points)
-
-    def on_history_end(self) -> None:
-        """End the history query: from now on no sample is one that was processed before a restart."""
-        self._replay_filter = None
-
-    @property
-    def awaits_samples(self) -> bool:
-        """True if no sample has come since it resumed from a state."""
-        return self._replay_filter is not None and not self._replay_filter.has_begun
 
     def _restore_alarms(self, memory: AnnunciatorMemory) -> None:
         """Restore the alarms alone from a copy of their memory.
@@ -374,7 +286,7 @@ class Monitor:
     @property
     def rows(self) -> int:
         """Number of rows so far, including incomplete rows."""
-        return self.aligner.memory.counts.rows
+        return self.intake.aligner.memory.counts.rows
 
     @property
     def silence(self) -> SilenceCheck:
@@ -392,7 +304,7 @@ class Monitor:
     @property
     def excluded_signals(self) -> dict[str, str]:
         """Signals that are not monitored, with the reason: no value came, or the training could not use them."""
-        never_came = (signal for signal in self._signals if signal not in self.memory.heard_from_ns)
+        never_came = (signal for signal in self.config.signals if signal not in self.memory.heard_from_ns)
         return dict.fromkeys(never_came, NO_VALUE) | self.pipeline.evaluation.memory.left_out
 
     @property
@@ -408,12 +320,11 @@ class Monitor:
     def finish(self) -> list[Publication]:
         """Evaluate pending rows, as at the end of a record."""
         publications: list[Publication] = []
-        for signal, run in zip(self._signals, self.memory.runs, strict=True):
-            for sample in run.release():
-                self._accept(signal, *sample, publications)
-        for row in self.aligner.flush():
-            self._on_row(row, publications)
+        self.intake.finish(publications)
         return publications
+
+    def _on_label(self, signal: str, time_ns: int, value: float) -> None:
+        self.pipeline.operation.on_sample(signal, time_ns, value)
 
     def _on_row(self, row: Row, publications: list[Publication]) -> None:
         memory, time_ns, before = self.memory, row.time_ns, len(publications)
@@ -424,7 +335,7 @@ class Monitor:
             self.span_ns += time_ns - memory.last_ns
         memory.last_ns = time_ns
         try:
-            self.pipeline.update(row, self._output_units, publications)
+            self.pipeline.update(row, self.intake.output_units, publications)
             publications.extend(self.alarms.end_row(time_ns))
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
             self._contain("row", error)
@@ -478,7 +389,7 @@ class Monitor:
         self.pipeline.resume_from_alarms()
 
     def _health(self, now_ns: int, phase: str) -> Publication:
-        memory, stats, counts = self.memory, self.stats, self.aligner.memory.counts
+        memory, stats, counts = self.memory, self.stats, self.intake.aligner.memory.counts
         health = Health(
             time_ns=now_ns,
             node=NODE,
@@ -487,8 +398,8 @@ class Monitor:
             uptime_s=(now_ns - stats.start_ns) / 1e9,
             received=memory.received,
             published=memory.published,
-            refused=self.rejects.total,
-            refused_by_reason=self.rejects.by_reason,
+            refused=self.intake.rejects.total,
+            refused_by_reason=self.intake.rejects.by_reason,
             failures=self.failures.by_stage,
             heard_from_ns=memory.heard_from_ns,
             lag_ms=stats.lag_ns / 1e6,

@@ -13,13 +13,11 @@ import msgspec
 from monitor_node.alarms.annunciator import AnnunciatorMemory
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import AlignmentMemory
-from monitor_node.ingest.samples import UnusableSamples
-from monitor_node.ingest.sequence_check import SequenceCheck
+from monitor_node.ingest.intake import IntakeMemory
 from monitor_node.watch.pipeline_memory import PipelineMemory
 from reactorwatch.errors import InputError
 from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.stored_state import Memory
 from reactorwatch.version import this_build
 
 DIGEST_BYTES = 16
@@ -97,36 +95,26 @@ class OtherSettingsError(InputError):
         self.alarms = alarms
 
 
-class MonitorMemory(Memory, kw_only=True):
+class MonitorMemory(IntakeMemory, kw_only=True):
     """Memory of a monitor beside its parts, while it runs and in its stored state.
 
     Attributes:
-        runs: sequence checks of the signals, the inputs first.
-        units: newest unit by signal.
-        heard_from_ns: time of the first accepted sample by signal.
         first_ns: time of the first row; None before it.
         last_ns: time of the last row; None before the first.
         watching_since_ns: time of the first evaluated row; None before it.
         snapshot_due_ns: plant time of the next model snapshots; None before the first row.
         received: number of messages received.
         published: number of messages published.
-        refused: number of rejected messages by reason.
         failures: number of contained errors of this software by stage.
-        unusable: samples refused since the newest usable one.
     """
 
-    runs: list[SequenceCheck]
-    units: dict[str, str]
-    heard_from_ns: dict[str, int] = msgspec.field(default_factory=dict)
     first_ns: int | None = None
     last_ns: int | None = None
     watching_since_ns: int | None = None
     snapshot_due_ns: int | None = None
     received: int = 0
     published: int = 0
-    refused: dict[str, int] = msgspec.field(default_factory=dict)
     failures: dict[str, int] = msgspec.field(default_factory=dict)
-    unusable: UnusableSamples = msgspec.field(default_factory=UnusableSamples)
 
 
 class MonitorState(MonitorMemory, kw_only=True):

@@ -168,9 +168,9 @@ class MonitorNode(FleetMonitor):
     # --- event loop ------------------------------------------------------------------------------------------
 
     def on_history_end(self) -> None:
-        """See `Monitor.on_history_end`; the history of a plant that is cut off comes once its publishers are there."""
+        """End the history; that of a fleet's plant that is cut off comes once its publishers are there."""
         for monitor in self._monitors.values():
-            if self.is_single or not monitor.awaits_samples:
+            if self.is_single or not monitor.intake.awaits_samples:
                 monitor.on_history_end()
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
@@ -190,7 +190,7 @@ class MonitorNode(FleetMonitor):
         monitor, refusal = self._monitors[topic.plant], self._rate.check(sender_name(question), now_ns)
         if refusal is not None:
             monitor.memory.received += 1
-            monitor.rejects.add("too_many_commands", refusal)
+            monitor.intake.rejects.add("too_many_commands", refusal)
             return CommandReply(accepted=False, text=refusal), []
         reply, publications = super().on_command(question, now_ns)
         if reply is not None and reply.accepted and not is_query(question):
@@ -356,7 +356,7 @@ class MonitorNode(FleetMonitor):
     def _log_rejects(self, now_ns: int) -> None:
         """Log refused messages, at most once a minute for each plant, evictions and plants beyond the promise."""
         for plant, monitor in self._monitors.items():
-            if (refused := monitor.rejects.report(now_ns)) is not None:
+            if (refused := monitor.intake.rejects.report(now_ns)) is not None:
                 log.warning(refused, plant=plant)
         if (excess := self._fleet.describe_excess(len(self._monitors))) is not None and not self._excess_logged:
             self._excess_logged = True

@@ -8,12 +8,13 @@ an object, and are cleared after each segment.
 Signals have meanings and roles from their process, or from the catalogue of processes.
 """
 
+import sys
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from operator import attrgetter
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from google.protobuf.message import Message
@@ -183,19 +184,13 @@ class RunColumns:
 def signal_title(name: str, unit: str, process: Process | None = None) -> str:
     """Name of a signal, with its meaning if its process has a variable of that name.
 
-    Args:
-        name: name of the signal.
-        unit: unit of the signal.
-        process: process of the signal; None: any of the catalogue whose variable has this unit, too.
+    Without a process, it is any of the catalogue whose variable has this unit, too.
     """
-    variables = [
-        item
-        for model in _models_of(process)
-        for item in (*model.inputs, *model.states)
-        if item.name == name and (item.unit == unit or process is not None)
-    ]
-    meaning = variables[0].meaning if variables else ""
-    return f"{name}: {meaning}" if meaning else name
+    for model in _models_of(process):
+        for item in (*model.inputs, *model.states):
+            if item.name == name and (item.unit == unit or process is not None):
+                return f"{name}: {item.meaning}" if item.meaning else name
+    return name
 
 
 def signal_roles(units: Mapping[str, str], process: Process | None = None) -> dict[str, str]:
@@ -208,22 +203,16 @@ def signal_roles(units: Mapping[str, str], process: Process | None = None) -> di
     """
     if process is not None:
         roles = {signal.name: signal.role for signal in process.signals}
+    elif (model := find_model(units) or _find_model_with(units)) is not None:
+        roles = {name: "input" if name in model.input_names else "output" for name in model.units}
     else:
-        model = find_model(units) or _find_model_with(units)
-        roles = {} if model is None else {name: _role(model, name) for name in model.units}
-    return {
-        **{name: role for name, role in roles.items() if name in units},
-        **{name: "output" for name in units if name not in roles},
-    }
+        roles = {}
+    known = {name: role for name, role in roles.items() if name in units}
+    return known | {name: "output" for name in units if name not in roles}
 
 
 def find_model(units: Mapping[str, str], process: Process | None = None) -> ProcessModel | None:
-    """Equations whose inputs and outputs are all present, with the same units; None if there are none.
-
-    Args:
-        units: units of the present signals, by name.
-        process: process of the signals; None: any of the catalogue.
-    """
+    """Equations, of the catalogue without a process, whose inputs and outputs are all present with the same units."""
     return next((model for model in _models_of(process) if model.units.items() <= units.items()), None)
 
 
@@ -233,10 +222,6 @@ def _find_model_with(units: Mapping[str, str]) -> ProcessModel | None:
         if all(name in model.units and unit in ("", model.units[name]) for name, unit in units.items()):
             return model
     return None
-
-
-def _role(model: ProcessModel, name: str) -> str:
-    return "input" if name in model.input_names else "output"
 
 
 def _models_of(process: Process | None) -> tuple[ProcessModel, ...]:
@@ -275,10 +260,8 @@ def read_run(recording: Iterable[RecordedMessage | Encoded]) -> RunColumns:
     Raises:
         InputError: the messages are of several plants.
     """
-    reader = RunReader()
-    for entry in recording:
-        reader.add(entry)
-    return reader.next_segment()
+    (run,) = read_segments(recording, sys.maxsize)
+    return run
 
 
 def read_segments(
@@ -307,12 +290,7 @@ def read_segments(
 
 
 class RunReader:
-    """Collects messages and returns them as segments.
-
-    Args:
-        given_zero_ns: see `RunColumns`.
-        process: see `RunColumns`.
-    """
+    """Collects messages and returns them as segments, with the zero and the process of `RunColumns`."""
 
     def __init__(self, given_zero_ns: int | None = None, process: Process | None = None) -> None:
         self._given_zero_ns, self._process = given_zero_ns, process
@@ -355,16 +333,13 @@ class RunReader:
             time_ns = self._newest_ns
         else:
             time_ns = self._clock.continuous_ns(key, message)
-        if into.kind.numbers is not None:
-            into.append(message, time_ns)
-            if kind == keys.SAMPLE and (self._newest_ns is None or time_ns > self._newest_ns):
-                self._newest_ns = time_ns
-            return
         if kind == keys.ALARM and message.event == SUSPECTED:
             kind, message = keys.INCIDENT, messages.Incident(number=message.incident, suspects=message.suspects)
             topic = keys.Topic(self._plant, kind, str(message.number))
             into = self._keys[keys.key(*topic)] = self._keys.get(keys.key(*topic)) or _Key(topic, _KINDS[kind])
-        if kind == keys.INCIDENT:
+        if kind == keys.SAMPLE:
+            self._newest_ns = time_ns if self._newest_ns is None else max(self._newest_ns, time_ns)
+        elif kind == keys.INCIDENT:
             if not self._suspects.update(message.number, message.suspects):
                 return
         elif kind == keys.ALARM:
@@ -374,8 +349,7 @@ class RunReader:
             self._newest_changes[message.alarm] = change
         elif kind == keys.FAULT:
             message.onset_ns += time_ns - message.time_ns
-        message.time_ns = time_ns
-        into.messages.append(message)
+        into.add(message, time_ns)
 
     def set_zero(self, time_ns: int) -> None:
         """Set the time that minutes count from, before the first segment."""
@@ -447,8 +421,7 @@ def _next_context(run: RunColumns) -> SegmentContext:
     before = run.context
     newest = {name: _newest(before.last_samples.get(name), item) for name, item in run.samples.items()}
     onsets = (change.onset_ns for change in run.faults if change.active)
-    return replace(
-        before,
+    return SegmentContext(
         first_ns=run.first_ns if run.samples or before.first_ns is not None else None,
         last_samples={**before.last_samples, **newest},
         alarm_states={**before.alarm_states, **{change.alarm: change.state for change in run.alarms}},
@@ -480,10 +453,12 @@ def _update_statistics(before: SignalStatistics | None, item: SampleColumns) -> 
     )
 
 
-_Dated = TypeVar("_Dated", messages.ModelSnapshot, messages.Health, messages.Promise)
+def times_of(items: Iterable[Any]) -> Times:
+    """Times of messages."""
+    return np.array([item.time_ns for item in items], np.int64)
 
 
-def _last_of_each_time(items: list[_Dated]) -> tuple[_Dated, ...]:
+def _last_of_each_time(items: list[Any]) -> tuple[Any, ...]:
     """Items in order of time; the last one of equal times counts."""
     newest = {item.time_ns: item for item in items}
     return tuple(newest[time_ns] for time_ns in sorted(newest))
@@ -541,10 +516,12 @@ class _Key:
         self.times, self._numbers = array("q"), array("d")  # numbers are row by row
         self.messages: list[Any] = []
 
-    def append(self, message: Any, time_ns: int) -> None:
-        """Add the numbers of a message, if any, at a time."""
-        numbers = self.kind.numbers(message) if self.kind.numbers is not None else ()
-        if numbers:
+    def add(self, message: Any, time_ns: int) -> None:
+        """Add a message, or its numbers if it has any, at a time."""
+        if self.kind.numbers is None:
+            message.time_ns = time_ns
+            self.messages.append(message)
+        elif numbers := self.kind.numbers(message):
             self.unit = self.unit or getattr(message, "unit", "")
             self.times.append(time_ns)
             self._numbers.extend(numbers)

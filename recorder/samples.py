@@ -8,6 +8,7 @@ run.
 import math
 from array import array
 from bisect import bisect_left
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
@@ -345,7 +346,7 @@ class SampleSeries:
     """
 
     def __init__(self) -> None:
-        self.runs: list[dict[str, tuple[array[int], array[float]]]] = []
+        self.runs: list[defaultdict[str, tuple[array[int], array[float]]]] = []
         self.units: dict[str, str] = {}
         self.splitter = RunSplitter()
         self._newest: dict[str, tuple[array[int], array[float]]] = {}  # columns of the newest sample, by signal
@@ -355,19 +356,15 @@ class SampleSeries:
         value = measured_value(sample)
         if value is None:
             return
-        splitter, time_ns = self.splitter, sample.time_ns
-        strays = splitter.strays
-        number = splitter.update(signal, sample.sequence, time_ns)
-        if splitter.strays > strays:
+        strays = self.splitter.strays
+        number = self.splitter.update(signal, sample.sequence, sample.time_ns)
+        if self.splitter.strays > strays:
             for column in self._newest[signal]:
                 column.pop()
         if sample.unit:
             self.units.setdefault(signal, sample.unit)
         if number > len(self.runs):
-            self.runs.append({})
-        series = self.runs[number - 1].get(signal)
-        if series is None:
-            series = self.runs[number - 1][signal] = (array("q"), array("d"))
-        self._newest[signal] = series
-        series[0].append(time_ns)
-        series[1].append(value)
+            self.runs.append(defaultdict(lambda: (array("q"), array("d"))))
+        times, values = self._newest[signal] = self.runs[number - 1][signal]
+        times.append(sample.time_ns)
+        values.append(value)

@@ -253,15 +253,15 @@ class FleetMonitor:
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
         """Process samples, which are in order for each plant."""
         publications: list[Publication] = []
-        touched: dict[Monitor, None] = {}
+        by_monitor: dict[Monitor, list[Encoded]] = {}  # one plant after the other: its objects stay in the cache
         for message in messages:
             monitor = self._by_key.get(message.key) or self._monitor_of(message.key, now_ns)
             if monitor is not None:
-                publications += monitor.on_message(message, now_ns)
-                touched[monitor] = None
-        for monitor in touched:
+                by_monitor.setdefault(monitor, []).append(message)
+        for monitor, own in by_monitor.items():
+            publications += monitor.on_messages(own, now_ns)
             plant = monitor.config.plant
-            if self._active_ns.pop(plant, None) is not None and monitor.rows < PROVEN_ROWS:
+            if self._active_ns and self._active_ns.pop(plant, None) is not None and monitor.rows < PROVEN_ROWS:
                 self._active_ns[plant] = now_ns
             self._schedule(plant, monitor)
         return publications

@@ -227,10 +227,11 @@ class ReplayFilter:
 
     Attributes:
         has_begun: True if a sample has come.
+        is_over: True if no signal has a sample left to filter.
     """
 
     def __init__(self, memory: AlignmentMemory) -> None:
-        self.has_begun = False
+        self.has_begun = self.is_over = False
         self._newest: list[GapTracker | None] = [
             None if item.expected is None else replace(item) for item in memory.sequences
         ]
@@ -248,6 +249,7 @@ class ReplayFilter:
         self.has_begun = True
         newest = self._newest[index]
         if newest is None:
+            self.is_over = not any(self._newest)
             return False
         numbers = self._numbers.get(time_ns)
         if numbers is not None and numbers[index] is None:

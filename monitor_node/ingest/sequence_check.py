@@ -49,16 +49,10 @@ ALIKE = 0.01
 """Share of the usual spacing: a smaller deviation does not update the mean."""
 
 
-UNLIKE, LIKE, EQUAL = 0, 1, 2
-"""Comparison of a spacing with the usual one: of another run; of the run, and to be learned; the same, nearly."""
-
-
-def compare_spacing(usual: Spacing, spacing_ns: float) -> int:
-    """Compare the spacing of two samples, per number, with the usual one of a run, which must be known."""
+def is_alike(usual: Spacing, spacing_ns: float) -> bool:
+    """True if the spacing of two samples, per number, may be of a run whose usual one, which must be known, is this."""
     deviation_ns = abs(spacing_ns - usual.mean_ns)
-    if spacing_ns <= 0.0 or deviation_ns > TOLERANCE * usual.mean_ns + DEVIATIONS * usual.deviation_ns:
-        return UNLIKE
-    return EQUAL if deviation_ns <= ALIKE * usual.mean_ns else LIKE
+    return spacing_ns > 0.0 and deviation_ns <= TOLERANCE * usual.mean_ns + DEVIATIONS * usual.deviation_ns
 
 
 class HeldSample(NamedTuple):
@@ -88,10 +82,9 @@ class SequenceCheck(GapTracker):
         if self.held or number != self.expected or usual.count < MEMORY:
             return False
         spacing_ns = float(time_ns - self.newest_ns)
-        found = compare_spacing(usual, spacing_ns)
-        if found == UNLIKE:
-            return False
-        if found == LIKE:
+        if abs(spacing_ns - usual.mean_ns) > ALIKE * usual.mean_ns:
+            if not is_alike(usual, spacing_ns):
+                return False
             usual.learn(spacing_ns, MEMORY)
         self.expected, self.newest_ns = number + 1, time_ns
         return True
@@ -187,4 +180,4 @@ class SequenceCheck(GapTracker):
         spacing_ns, usual = time_ns / numbers, self.spacing
         if usual.count < MEMORY:
             return not usual.count or spacing_ns <= AT_FIRST * usual.mean_ns
-        return compare_spacing(usual, spacing_ns) != UNLIKE
+        return is_alike(usual, spacing_ns)

@@ -127,7 +127,9 @@ class MessageDiff:
                 self._add_unrecorded(item)
             else:
                 self._last_matched = max(self._last_matched, item.number)
-                fields = [] if payload == item.payload else _differing_fields(body, item.publication.message)
+                again = item.publication.message
+                same = payload == item.payload and type(body) is type(again)  # two types may have the same bytes
+                fields = [] if same else _differing_fields(body, again)
                 if fields:
                     self._differ(Difference(key, before, *fields[0]))
                 else:

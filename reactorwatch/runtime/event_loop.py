@@ -18,7 +18,7 @@ from typing import Protocol, TypeAlias
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
-from reactorwatch.runtime.bus import Bus, Request
+from reactorwatch.runtime.bus import MAX_BATCH, Bus, Request
 from reactorwatch.runtime.clock import SteadyClock
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from reactorwatch.runtime.security.audit import audit
@@ -292,17 +292,17 @@ class EventLoop:
             history_s: age of the oldest earlier publication to receive, see `Bus.subscribe`.
             on_history_end: called when all earlier publications have been handled.
             on_gap: called with messages that were published and never arrived, and the time.
-            on_batch: called instead of `node.on_message`, with messages that have arrived, up to `BATCH` at a time, and
-                the time.
+            on_batch: called instead of `node.on_message`, with messages that have arrived, up to `MAX_BATCH` at a
+                time, and the time.
         """
 
         def put_message(message: Encoded) -> None:
             self._inbox.put(self._node.on_message, (message,), 1, len(message.payload))
 
         def put_batch(handle: Callable[[list[Encoded], int], list[Publication]], messages: list[Encoded]) -> None:
-            for start in range(0, len(messages), BATCH):  # a history comes at once: many thousands
-                part = messages[start : start + BATCH]
-                self._inbox.put(handle, (part,), len(part), sum(len(message.payload) for message in part))
+            for start in range(0, len(messages), MAX_BATCH):  # a history comes at once: many thousands
+                part = messages[start : start + MAX_BATCH]
+                self._inbox.put(handle, (part,), len(part), sum([len(message.payload) for message in part]))
 
         def put_gap(handle: Callable[[Gap, int], list[Publication]], gap: Gap) -> None:
             self._inbox.put(handle, (gap,), 1)

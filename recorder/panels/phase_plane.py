@@ -58,45 +58,32 @@ def draw(run: RunColumns) -> tuple[PlanePlot, ...]:
     states = steady_states_at(model, rounded) if branch else ()
     data = Box(x_seen.lowest, x_seen.highest, y_seen.lowest, y_seen.highest)
     near, far = (_around(points, data) for points in (branch, (*branch, *states)))
-    marks = tuple(_mark(state) for state in states)
+    marks = tuple(
+        PlaneMark(state.kind, float(x_mark), float(y_mark), STABLE if state.stable else UNSTABLE)
+        for state in states
+        for x_mark, y_mark in [state.outputs[:2]]
+    )
     labels = (f"{x_output.name}, {x_output.unit}", f"{y_output.name}, {y_output.unit}")
     note = f"steady states at {input_.name} = {rounded:g} {input_.unit}"
     path = PlanePlot("", *labels, near, data, int(time_ns[-1]), _paths(run, time_ns, x, y), _curves(branch), note=note)
-    at_hand = tuple(mark for mark, state in zip(marks, states, strict=True) if state is states[-1])
+    events = _events(run, time_ns, x, y)
     return (
-        path._replace(
-            title="Around the operating branch",
-            shown=_union(near, data),
-            marks=at_hand,
-            events=_events(run, time_ns, x, y),
-        ),
+        path._replace(title="Around the operating branch", shown=_union(near, data), marks=marks[-1:], events=events),
         path._replace(title="Among all steady states", box=far, shown=_union(far, data), marks=marks),
     )
 
 
 @lru_cache(maxsize=256)
 def steady_states_at(model: ProcessModel, level: float) -> tuple[SteadyState, ...]:
-    """All steady states of a process with one input; the last is the operating point.
-
-    Args:
-        model: the process.
-        level: level of its input.
-    """
+    """All steady states of a process at a level of its only input, computed once; the last is the operating point."""
     return tuple(steady_states(model, np.array([level])))
 
 
 def operating_branch(model: ProcessModel, lowest: float, highest: float, level: float) -> list[SteadyState]:
-    """Steady states of the operating branch between two levels of the input.
+    """Steady states of the operating branch between two levels of the only input, by rising level.
 
-    Args:
-        model: a process with one input.
-        lowest: lowest level of the input.
-        highest: highest level of the input.
-        level: operating level of the input.
-
-    Returns:
-        The steady states by rising level, as far as the branch extends. The grid of levels does not depend on the ends
-        unless they are far apart. Empty if the process has no steady state at `level`.
+    They extend as far as the branch does from the operating level. The grid of levels does not depend on the ends
+    unless they are far apart. Empty if the process has no steady state at the operating level.
     """
     bounds = model.inputs[0]
     if not bounds.lower <= level <= bounds.upper:
@@ -200,11 +187,6 @@ def _events(run: RunColumns, time_ns: Times, x: Values, y: Values) -> tuple[Plan
             if np.isfinite(x[row]):
                 marks.append(PlaneMark(name, float(x[row]), float(y[row]), colour))
     return tuple(marks)
-
-
-def _mark(state: SteadyState) -> PlaneMark:
-    x, y = state.outputs[:2].tolist()
-    return PlaneMark(state.kind, x, y, STABLE if state.stable else UNSTABLE)
 
 
 def _curves(branch: Sequence[SteadyState]) -> tuple[PlanePath, ...]:

@@ -24,6 +24,7 @@ from recorder.columns import (
     Values,
     signal_roles,
     signal_title,
+    times_of,
 )
 from recorder.panels.base import (
     ALARM,
@@ -96,22 +97,17 @@ def _plot(run: RunColumns, name: str, role: str, setpoints: Sequence[str]) -> Ti
     ]
     measured, estimated, rebuilt = run.samples.get(name), run.estimates.get(name), run.reconstructions.get(name)
     if measured is not None:
-        series.append(
-            Series("measured", measured.time_ns, measured.value, MEASURED, width=2.5)
-            if role == "output"
-            else Series("measured", measured.time_ns, measured.value, _ROLE_COLOURS[role], held=True)
-        )
+        style = (MEASURED, 2.5, False) if role == "output" else (_ROLE_COLOURS[role], 1.5, True)
+        series.append(Series("measured", measured.time_ns, measured.value, *style))
     elif not series:
         return None
     if estimated is not None:
         # the prediction is drawn over the measurement and thinner, so that both are visible where they agree
+        label = f"predicted by {run.reference}" if run.reference else "predicted"
         series = [
-            Series("upper limit", estimated.time_ns, estimated.upper_limit, LIMIT, width=1.0, legend="limits"),
-            Series("lower limit", estimated.time_ns, estimated.lower_limit, LIMIT, width=1.0, legend="limits"),
+            *_limits(estimated.time_ns, estimated.lower_limit, estimated.upper_limit),
             *series,
-            Series(
-                "predicted", estimated.time_ns, estimated.prediction, PREDICTED, width=1.0, legend=_reference_label(run)
-            ),
+            Series("predicted", estimated.time_ns, estimated.prediction, PREDICTED, width=1.0, legend=label),
         ]
     if (beside := run.estimates_beside.get(name)) is not None:
         label = "arx, for comparison"
@@ -122,9 +118,11 @@ def _plot(run: RunColumns, name: str, role: str, setpoints: Sequence[str]) -> Ti
     return TimePlot(signal_title(name, unit, run.process), unit, tuple(series))
 
 
-def _reference_label(run: RunColumns) -> str:
-    """Legend of the predictions of the reference."""
-    return f"predicted by {run.reference}" if run.reference else "predicted"
+def _limits(time_ns: Times, lower: Values, upper: Values) -> tuple[Series, Series]:
+    return (
+        Series("upper limit", time_ns, upper, LIMIT, width=1.0, legend="limits"),
+        Series("lower limit", time_ns, lower, LIMIT, width=1.0, legend="limits"),
+    )
 
 
 OVERVIEW = Panel("Overview", draw_overview, arranged="beside")
@@ -143,29 +141,15 @@ def draw_charts(run: RunColumns) -> tuple[TimePlot, ...]:
 
 
 def _residual(name: str, unit: str, estimated: EstimateColumns) -> TimePlot:
-    time_ns, (lower, upper) = estimated.time_ns, estimated.residual_limits
-    return TimePlot(
-        f"Residual of {name}",
-        unit,
-        (
-            Series("upper limit", time_ns, upper, LIMIT, width=1.0, legend="limits"),
-            Series("lower limit", time_ns, lower, LIMIT, width=1.0, legend="limits"),
-            Series("measured - predicted", time_ns, estimated.residual, RESIDUAL),
-        ),
-        _watched_range(estimated),
-    )
-
-
-def _watched_range(estimated: EstimateColumns) -> tuple[float, float] | None:
-    """Range of residuals and limits from the first limits on.
+    """Plot of a residual, whose initial range is that of residuals and limits from the first limits on.
 
     Early in the training residuals are large; on their scale nothing later would be visible.
     """
-    limits = estimated.residual_limits
-    watched = np.isfinite(limits[0]) & np.isfinite(limits[1]) & np.isfinite(estimated.residual)
-    if not watched.any():
-        return None
-    return _with_margin(np.concatenate([limits[0][watched], limits[1][watched], estimated.residual[watched]]))
+    time_ns, residual, (lower, upper) = estimated.time_ns, estimated.residual, estimated.residual_limits
+    watched = np.isfinite(lower) & np.isfinite(upper) & np.isfinite(residual)
+    shown = _with_margin(np.concatenate([lower[watched], upper[watched], residual[watched]]))
+    series = (*_limits(time_ns, lower, upper), Series("measured - predicted", time_ns, residual, RESIDUAL))
+    return TimePlot(f"Residual of {name}", unit, series, shown)
 
 
 def _chart(name: str, chart: ChartColumns) -> TimePlot:
@@ -173,9 +157,8 @@ def _chart(name: str, chart: ChartColumns) -> TimePlot:
     highest, lowest = chart.centre + far, chart.centre - far
     edge = np.where(chart.statistic > highest, highest, np.where(chart.statistic < lowest, lowest, np.nan))
     series = [
-        Series("upper limit", chart.time_ns, chart.upper_limit, LIMIT, width=1.0, legend="limits"),
+        *_limits(chart.time_ns, chart.lower_limit, chart.upper_limit),
         Series("centre", chart.time_ns, chart.centre, LIMIT, width=0.6, legend="limits"),
-        Series("lower limit", chart.time_ns, chart.lower_limit, LIMIT, width=1.0, legend="limits"),
         Series("statistic", chart.time_ns, chart.statistic, RESIDUAL),
     ]
     # Rerun draws lines in the order of their names: points out of limits are drawn last
@@ -271,16 +254,12 @@ def _parameter(name: str, items: Iterable[messages.ModelSnapshot], colour: Colou
 
 
 def _excitation(run: RunColumns, signal: str) -> TimePlot:
-    series = []
-    for purpose, name, colour in (
-        (REFERENCE, _FIXED[REFERENCE], LIMIT),
-        (FROZEN, _FIXED[FROZEN], PREDICTED),
-        (ADAPTIVE, "adaptive model", MEASURED),
-    ):
-        items = run.models.get((signal, purpose), ())
-        if items:
-            time_ns = np.array([item.time_ns for item in items], np.int64)
-            series.append(Series(name, time_ns, np.array([item.excitation for item in items]), colour))
+    names = ((REFERENCE, _FIXED[REFERENCE], LIMIT), (FROZEN, _FIXED[FROZEN], PREDICTED))
+    series = [
+        Series(name, times_of(items), np.array([item.excitation for item in items]), colour)
+        for purpose, name, colour in (*names, (ADAPTIVE, "adaptive model", MEASURED))
+        if (items := run.models.get((signal, purpose), ()))
+    ]
     return TimePlot(f"Excitation of the model of {signal}", "", tuple(series))
 
 

@@ -1,6 +1,7 @@
 """Alarms, the promise of false alarms, and the health of the nodes: three panels."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from itertools import cycle
 from operator import attrgetter
 
 import numpy as np
@@ -9,7 +10,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.contract.promise_text import describe_sizes, promise_fields
 from reactorwatch.records.record import to_minutes
-from recorder.columns import LISTED, RunColumns
+from recorder.columns import LISTED, RunColumns, times_of
 from recorder.panels.base import (
     ALARM,
     FAULT,
@@ -31,35 +32,35 @@ from recorder.panels.base import (
     View,
 )
 
-_WORDS: dict[int, str] = {
-    messages.ALARM_STATE_NORMAL: "normal",
-    messages.ALARM_STATE_UNACKNOWLEDGED: "raised",
-    messages.ALARM_STATE_ACKNOWLEDGED: "acknowledged",
-    messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED: "cleared",
-    messages.ALARM_STATE_SHELVED: "shelved",
-    messages.ALARM_STATE_SUPPRESSED_BY_DESIGN: "suppressed",
-    messages.ALARM_STATE_OUT_OF_SERVICE: "out of service",
+_STATES: dict[int, tuple[str, Colour]] = {
+    messages.ALARM_STATE_NORMAL: ("normal", INPUT),
+    messages.ALARM_STATE_UNACKNOWLEDGED: ("raised", ALARM),
+    messages.ALARM_STATE_ACKNOWLEDGED: ("acknowledged", PREDICTED),
+    messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED: ("cleared", RESIDUAL),
+    messages.ALARM_STATE_SHELVED: ("shelved", MEASURED),
+    messages.ALARM_STATE_SUPPRESSED_BY_DESIGN: ("suppressed", QUIET),
+    messages.ALARM_STATE_OUT_OF_SERVICE: ("out of service", QUIET),
 }
-_COLOURS: dict[str, Colour] = {
-    "normal": INPUT,
-    "raised": ALARM,
-    "acknowledged": PREDICTED,
-    "cleared": RESIDUAL,
-    "shelved": MEASURED,
-    "suppressed": QUIET,
-    "out of service": QUIET,
-}
+"""Word and colour of each state of an alarm."""
 
 
 def draw_alarms(run: RunColumns) -> tuple[View, ...]:
     """State lanes of the alarms, and one log of alarms, suspects and faults."""
-    logged = (change for change in run.alarms if change.event != LISTED)
-    events = [_alarm_event(change, run.zero_ns) for change in logged]
-    events += [_suspects_event(incident, run.zero_ns) for incident in run.incidents]
-    events += [_fault_event(change, run.zero_ns) for change in run.faults]
+    events = []
+    for change in run.alarms:
+        if change.event != LISTED:
+            colour = ALARM if change.state == messages.ALARM_STATE_UNACKNOWLEDGED else QUIET
+            text = f"{change.alarm}: {change.text}"
+            events.append(_event(run, change.time_ns, _word(change.state), text, colour))
+    for incident in run.incidents:
+        text = suspects_text(incident.suspects, run.zero_ns)
+        events.append(_event(run, incident.time_ns, "suspect", text, ALARM))
+    for fault in run.faults:
+        text = f"{'injected' if fault.active else 'removed'}: {fault.specification or fault.cause}"
+        events.append(_event(run, fault.time_ns, "fault", text, FAULT))
     log = EventLog("Alarms and faults", tuple(sorted(events, key=lambda event: event.time_ns)))
     lines = tuple(_line(run, alarm) for alarm in dict.fromkeys(change.alarm for change in run.alarms))
-    return (StateLines("Alarm states", lines, _COLOURS), log)
+    return (StateLines("Alarm states", lines, dict(_STATES.values())), log)
 
 
 def _line(run: RunColumns, alarm: str) -> StateLine:
@@ -76,32 +77,12 @@ def _line(run: RunColumns, alarm: str) -> StateLine:
 
 
 def _word(state: int) -> str:
-    return _WORDS.get(state, str(state))
+    return _STATES[state][0] if state in _STATES else str(state)
 
 
-def _alarm_event(change: messages.Alarm, zero_ns: int) -> Event:
-    word = _word(change.state)
-    colour = ALARM if change.state == messages.ALARM_STATE_UNACKNOWLEDGED else QUIET
-    return Event(change.time_ns, word, f"{_at(change.time_ns, zero_ns)}  {change.alarm}: {change.text}", colour)
-
-
-def _suspects_event(incident: messages.Incident, zero_ns: int) -> Event:
-    text = suspects_text(incident.suspects, zero_ns)
-    return Event(incident.time_ns, "suspect", f"{_at(incident.time_ns, zero_ns)}  {text}", ALARM)
-
-
-def _fault_event(change: messages.Fault, zero_ns: int) -> Event:
-    action = "injected" if change.active else "removed"
-    return Event(
-        change.time_ns,
-        "fault",
-        f"{_at(change.time_ns, zero_ns)}  {action}: {change.specification or change.cause}",
-        FAULT,
-    )
-
-
-def _at(time_ns: int, zero_ns: int) -> str:
-    return f"{to_minutes(time_ns, zero_ns):.1f} min"
+def _event(run: RunColumns, time_ns: int, kind: str, text: str, colour: Colour) -> Event:
+    """Event whose text begins with its minute."""
+    return Event(time_ns, kind, f"{to_minutes(time_ns, run.zero_ns):.1f} min  {text}", colour)
 
 
 ALARMS = Panel("Alarms", draw_alarms)
@@ -111,35 +92,30 @@ def draw_promise(run: RunColumns) -> tuple[View, ...]:
     """Plot of alarms found and promised, and a log of the promise in words with the power."""
     if not run.promises:
         return ()
-    time_ns = np.array([item.time_ns for item in run.promises], np.int64)
-    found, promised = (
-        np.array([getattr(item, name) for item in run.promises], np.float64) for name in ("found", "expected_so_far")
-    )
+    time_ns = times_of(run.promises)
+    promised = np.array([item.expected_so_far for item in run.promises], np.float64)
+    found = np.array([item.found for item in run.promises], np.float64)
     plot = TimePlot(
         "Alarms since the training: found and promised",
         "",
-        (
-            Series("promised", time_ns, promised, LIMIT),
-            Series("found", time_ns, found, ALARM, held=True),
-        ),
+        (Series("promised", time_ns, promised, LIMIT), Series("found", time_ns, found, ALARM, held=True)),
     )
-    return plot, EventLog("Promise and power", tuple(_promise_events(run.promises, run.zero_ns)))
+    return plot, EventLog("Promise and power", tuple(_promise_events(run)))
 
 
-def _promise_events(promises: tuple[messages.Promise, ...], zero_ns: int) -> list[Event]:
+def _promise_events(run: RunColumns) -> list[Event]:
     """One event for each change of what is stated; the counts alone are drawn."""
     events: list[Event] = []
     before: tuple[object, ...] = ()
-    for item in promises:
+    for item in run.promises:
         holds = item.kept and not item.drifted
         power = [describe_sizes(each) for each in promise_fields(item)["power"]]
         stated = (item.found, holds, power)
         if stated == before:
             continue
-        at = f"{to_minutes(item.time_ns, zero_ns):.1f} min"
-        events.append(Event(item.time_ns, "promise", f"{at}  {item.text}", QUIET if holds else ALARM))
+        events.append(_event(run, item.time_ns, "promise", item.text, QUIET if holds else ALARM))
         if not before or power != before[2]:
-            events += [Event(item.time_ns, "power", f"{at}  seen in nine of ten: {line}", QUIET) for line in power]
+            events += [_event(run, item.time_ns, "power", f"seen in nine of ten: {line}", QUIET) for line in power]
         before = stated
     return events
 
@@ -166,16 +142,12 @@ def draw_health(run: RunColumns) -> tuple[View, ...]:
         StateLine(node, tuple(report.time_ns for report in reports), tuple(report.phase for report in reports))
         for node, reports in sorted(run.health.items())
     )
+    lags = _health_lines(run, attrgetter("lag_ms"))
+    problems = _health_lines(run, _problems, held=True)
     return (
         StateLines("Node phases", lanes, _PHASES),
-        TimePlot(
-            "Lag between receipt and the end of processing", "ms", tuple(_health_lines(run, attrgetter("lag_ms")))
-        ),
-        TimePlot(
-            "Lost, late, refused, duplicate or out of order",
-            "messages since the start",
-            tuple(_health_lines(run, _problems, held=True)),
-        ),
+        TimePlot("Lag between receipt and the end of processing", "ms", lags),
+        TimePlot("Lost, late, refused, duplicate or out of order", "messages since the start", problems),
     )
 
 
@@ -183,10 +155,11 @@ def _problems(report: messages.Health) -> float:
     return float(report.lost + report.late + report.refused + report.duplicated + report.out_of_order)
 
 
-def _health_lines(run: RunColumns, of: Callable[[messages.Health], float], *, held: bool = False) -> Iterator[Series]:
-    for index, (node, reports) in enumerate(sorted(run.health.items())):
-        time_ns = np.array([report.time_ns for report in reports], np.int64)
-        yield Series(node, time_ns, np.array([of(item) for item in reports]), SEVERAL[index % len(SEVERAL)], held=held)
+def _health_lines(run: RunColumns, of: Callable[[messages.Health], float], *, held: bool = False) -> tuple[Series, ...]:
+    return tuple(
+        Series(node, times_of(reports), np.array([of(item) for item in reports]), colour, held=held)
+        for (node, reports), colour in zip(sorted(run.health.items()), cycle(SEVERAL), strict=False)
+    )
 
 
 HEALTH = Panel("Health", draw_health)

@@ -2,6 +2,13 @@
 
 Each panel is a tab with its views, initially on the full run: Rerun's default is the last minute around the cursor. The
 stored data of a view do not grow with the run.
+
+Every point is on two timelines: the time of the run, usually since its first sample, for people, and the sample time,
+for comparison with other data.
+
+Rerun lacks a plot of one quantity over another, so the axes of a plane are drawn as lines and labels. Each segment adds
+a strip to the path, and the view shows all strips regardless of their time. The first segment sets the scale of the
+page. A frame that has become too small is redrawn larger.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,31 +19,100 @@ from uuid import NAMESPACE_URL, uuid5
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
-from recorder.columns import RunColumns
+from reactorwatch.axis import Axis, axis
+from recorder.columns import RunColumns, Times, Values
 from recorder.panels.base import (
     Arrangement,
+    Box,
     EventLog,
     Panel,
+    PlaneMark,
+    PlanePath,
     PlanePlot,
     Series,
-    StateLine,
     StateLines,
     TimePlot,
     View,
     ViewReference,
 )
-from recorder.view.stream import APPLICATION, RUN_TIME, SAMPLE_TIME, Frame, Stream, draw_plane, path_of
+
+APPLICATION = "reactorwatch"
+RUN_TIME = "run time"
+SAMPLE_TIME = "sample time"
+BATCH_ROWS = 8192
+"""Points of a line that are sent at once."""
 
 _ENDLESS = rr.TimeRangeBoundary.infinite()
 _WHOLE_RUN = rr.TimeRange(start=_ENDLESS, end=_ENDLESS)
 _LANES_SHARE = 1.3
 """Height of lanes, in heights of a time plot."""
 
+_WIDTH, _HEIGHT = 400.0, 300.0  # page size of the box that sets the scales
+_AXIS_COLOUR = (90, 90, 90)
+_LABEL_COLOUR = (150, 150, 150)
+_BELOW, _PATHS, _CURVES, _MARKS = 0.0, 10.0, 30.0, 100.0  # drawing order
+
+
+def path_of(*parts: str) -> str:
+    """Path of an entity, from names with any characters."""
+    return rr.new_entity_path(list(parts))
+
+
+def _origin(tab: str, view: View) -> str:
+    """Path of a view; Rerun labels lanes with their full paths, so these are short and without spaces."""
+    return path_of(view.title.lower().replace(" ", "-")) if isinstance(view, StateLines) else path_of(tab, view.title)
+
+
+class _Frame(NamedTuple):
+    """Axes of a plane, and the box that sets its scales."""
+
+    box: Box
+    x_axis: Axis
+    y_axis: Axis
+
+    def contains(self, shown: Box) -> bool:
+        across = self.x_axis.lower <= shown.x_lower and shown.x_upper <= self.x_axis.upper
+        return across and self.y_axis.lower <= shown.y_lower and shown.y_upper <= self.y_axis.upper
+
+    def page(self, x: Values, y: Values) -> NDArray[np.float64]:
+        """Page coordinates, shape (points, 2); the second one points downwards, as on a screen."""
+        box = self.box
+        across = (x - box.x_lower) / ((box.x_upper - box.x_lower) or 1.0)
+        up = (y - box.y_lower) / ((box.y_upper - box.y_lower) or 1.0)
+        return np.column_stack([across * _WIDTH, (1.0 - up) * _HEIGHT])
+
+    def strips(self, line: PlanePath) -> list[NDArray[np.float64]]:
+        """Parts of a path between its gaps, on the page."""
+        there = np.isfinite(line.x) & np.isfinite(line.y)
+        edges = np.flatnonzero(np.diff(there, prepend=False, append=False))
+        return [self.page(line.x[start:end], line.y[start:end]) for start, end in edges.reshape(-1, 2)]
+
+    @property
+    def edges(self) -> tuple[float, float, float, float]:
+        """Left, right, top and bottom in page coordinates."""
+        corners = self.page(
+            np.array([self.x_axis.lower, self.x_axis.upper]), np.array([self.y_axis.lower, self.y_axis.upper])
+        )
+        (left, bottom), (right, top) = corners.tolist()
+        return left, right, top, bottom
+
+    @property
+    def bounds(self) -> rrb.VisualBounds2D:
+        """Visible range of the page, labels included."""
+        left, right, top, bottom = self.edges
+        width, height = right - left, bottom - top
+        return rrb.VisualBounds2D(
+            x_range=(left - 0.12 * width, right + 0.1 * width), y_range=(top - 0.18 * height, bottom + 0.22 * height)
+        )
+
 
 class _PlacedView(NamedTuple):
-    path: str
+    """A view, and how Rerun shows it."""
+
     view: View
+    shown: rrb.View
 
 
 @dataclass
@@ -50,42 +126,30 @@ class Layout:
 
     def __init__(self) -> None:
         self._tabs: dict[str, _Tab] = {}
-        self._frames: dict[str, Frame] = {}
+        self.frames: dict[str, _Frame] = {}
+        """Frames of planes, by path."""
         self.changed = False
         """True if the last blueprint lacks something."""
 
     def update(self, tab: str, arranged: Arrangement, views: Sequence[View]) -> None:
-        """Add the views of a segment to a tab.
-
-        Args:
-            tab: title of the tab.
-            arranged: arrangement of the tab.
-            views: the views.
-        """
+        """Add the views of a segment to a tab, of which the title is given."""
         known = self._tabs.setdefault(tab, _Tab(arranged))
         for view in views:
             before = known.views.get(view.title)
             after = known.views[view.title] = _merge(before, view)
             self.changed |= before is None or _is_empty(before) != _is_empty(after)
             if isinstance(view, PlanePlot):
-                self._note_plane(origin(tab, view), view)
+                self._update_frame(_origin(tab, view), view)
         titles = [view.title for view in views]
         if known.views.keys() == set(titles) and list(known.views) != titles:
             known.views = {title: known.views[title] for title in titles}  # complete: now their order is known
             self.changed = True
 
-    def frame(self, path: str) -> Frame:
-        """Frame of a plane."""
-        return self._frames[path]
-
     def blueprint(self, *, live: bool = False) -> rrb.Blueprint:
-        """Rerun blueprint of the present tabs.
-
-        Args:
-            live: True if the run continues: the cursor then follows it.
-        """
+        """Rerun blueprint of the present tabs; the cursor follows a live run."""
         self.changed = False
-        tabs = [self._container(title, tab) for title, tab in self._tabs.items() if any(self._place_views(title, tab))]
+        placed = {title: list(self._place_views(title, tab)) for title, tab in self._tabs.items()}
+        tabs = [_container(title, self._tabs[title].arranged, items) for title, items in placed.items() if items]
         return rrb.Blueprint(
             _with_stable_id(rrb.Tabs(*tabs, active_tab=0 if tabs else None), "tabs"),
             rrb.TimePanel(state="collapsed", timeline=RUN_TIME, play_state="following" if live else "paused"),
@@ -94,14 +158,15 @@ class Layout:
             auto_views=False,
         )
 
-    def _note_plane(self, path: str, plane: PlanePlot) -> None:
-        known = self._frames.get(path)
-        if known is None or not known.holds(plane.shown):
-            self._frames[path] = Frame.around(plane.box if known is None else known.box, plane.shown)
+    def _update_frame(self, path: str, plane: PlanePlot) -> None:
+        known, shown = self.frames.get(path), plane.shown
+        if known is None or not known.contains(shown):
+            axes = axis(shown.x_lower, shown.x_upper), axis(shown.y_lower, shown.y_upper)
+            self.frames[path] = _Frame(plane.box if known is None else known.box, *axes)
             self.changed = True
 
     def _place_views(self, title: str, tab: _Tab) -> Iterator[_PlacedView]:
-        """Yield the non-empty views of a tab with their paths."""
+        """Yield the non-empty views of a tab."""
         for view in tab.views.values():
             where, shown = title, view
             if isinstance(view, ViewReference):
@@ -110,28 +175,10 @@ class Layout:
                     continue
                 where, shown = view.panel, other.views[view.title]
             if not _is_empty(shown):
-                yield _PlacedView(origin(where, shown), shown)
+                path = _origin(where, shown)
+                yield _PlacedView(shown, _with_stable_id(self._rerun_view(path, shown), title, path))
 
-    def _container(self, title: str, tab: _Tab) -> rrb.Container:
-        placed = list(self._place_views(title, tab))
-        if tab.arranged == "beside":
-            over_time = [item for item in placed if isinstance(item.view, TimePlot | StateLines)]
-            rest = [item for item in placed if item not in over_time]
-            columns = [self._column(title, number, items) for number, items in enumerate((over_time, rest)) if items]
-            # a grid and not a row: on a phone it puts the second column below the first
-            return _with_stable_id(rrb.Grid(*columns, column_shares=[3, 2][: len(columns)], name=title), title)
-        views = [_with_stable_id(self._view(item), title, item.path) for item in placed]
-        if tab.arranged == "grid" and len(placed) > 1:
-            return _with_stable_id(rrb.Grid(*views, grid_columns=2, name=title), title)
-        return _with_stable_id(rrb.Vertical(*views, row_shares=_shares(placed), name=title), title)
-
-    def _column(self, title: str, number: int, placed: Sequence[_PlacedView]) -> rrb.Container:
-        """Views one below the other, so that one time is one vertical line."""
-        views = [_with_stable_id(self._view(item), title, item.path) for item in placed]
-        return _with_stable_id(rrb.Vertical(*views, row_shares=_shares(placed)), title, str(number))
-
-    def _view(self, placed: _PlacedView) -> rrb.View:
-        path, view = placed
+    def _rerun_view(self, path: str, view: View) -> rrb.View:
         match view:
             case TimePlot():
                 return rrb.TimeSeriesView(
@@ -151,11 +198,10 @@ class Layout:
                 )
                 return rrb.TextLogView(origin=path, name=view.title, columns=columns)
             case PlanePlot():
-                across, down = self._frames[path].bounds
                 at_any_time = [
                     rrb.VisibleTimeRange(timeline, start=_ENDLESS, end=_ENDLESS) for timeline in (RUN_TIME, SAMPLE_TIME)
                 ]
-                bounds = rrb.VisualBounds2D(x_range=across, y_range=down)
+                bounds = self.frames[path].bounds
                 return rrb.Spatial2DView(origin=path, name=view.title, visual_bounds=bounds, time_ranges=at_any_time)
             case ViewReference():
                 raise AssertionError("references were resolved before")
@@ -163,9 +209,22 @@ class Layout:
                 assert_never(view)
 
 
-def origin(tab: str, view: View) -> str:
-    """Path of a view; Rerun labels lanes with their full paths, so these are short and without spaces."""
-    return path_of(view.title.lower().replace(" ", "-")) if isinstance(view, StateLines) else path_of(tab, view.title)
+def _container(title: str, arranged: Arrangement, placed: Sequence[_PlacedView]) -> rrb.Container:
+    if arranged == "beside":
+        over_time = [item for item in placed if isinstance(item.view, TimePlot | StateLines)]
+        others = [item for item in placed if item not in over_time]
+        columns = [_column(items, title, str(number)) for number, items in enumerate((over_time, others)) if items]
+        # a grid and not a row: on a phone it puts the second column below the first
+        return _with_stable_id(rrb.Grid(*columns, column_shares=[3, 2][: len(columns)], name=title), title)
+    if arranged == "grid" and len(placed) > 1:
+        return _with_stable_id(rrb.Grid(*(item.shown for item in placed), grid_columns=2, name=title), title)
+    return _column(placed, title, name=title)
+
+
+def _column(placed: Sequence[_PlacedView], *id_names: str, name: str | None = None) -> rrb.Container:
+    """Views one below the other, so that one time is one vertical line."""
+    shares = [_LANES_SHARE if isinstance(item.view, StateLines) else 1.0 for item in placed]
+    return _with_stable_id(rrb.Vertical(*(item.shown for item in placed), row_shares=shares, name=name), *id_names)
 
 
 _Part = TypeVar("_Part", rrb.Container, rrb.View)
@@ -175,10 +234,6 @@ def _with_stable_id(part: _Part, *names: str) -> _Part:
     """Set an id derived from names, so that a viewer keeps the changes of users in the next blueprint."""
     part.id = uuid5(NAMESPACE_URL, "/".join((APPLICATION, *names)))
     return part
-
-
-def _shares(placed: Sequence[_PlacedView]) -> list[float]:
-    return [_LANES_SHARE if isinstance(item.view, StateLines) else 1.0 for item in placed]
 
 
 def _is_empty(view: View) -> bool:
@@ -205,14 +260,11 @@ def _merge(known: View | None, view: View) -> View:
 
 
 class Renderer:
-    """Draws views onto a Rerun stream.
-
-    Args:
-        recording: the stream.
-    """
+    """Draws views onto a Rerun stream."""
 
     def __init__(self, recording: rr.RecordingStream) -> None:
-        self._stream = Stream(recording)
+        self._recording = recording
+        self._static_keys: dict[str, object] = {}  # of the static data that were logged last, by path
         self.layout = Layout()
 
     def draw(self, run: RunColumns, panels: Sequence[Panel]) -> None:
@@ -221,17 +273,10 @@ class Renderer:
             self.add(panel.title, panel.arranged, panel.draw(run), run.zero_ns)
 
     def add(self, tab: str, arranged: Arrangement, views: Sequence[View], zero_ns: int) -> None:
-        """Draw views.
-
-        Args:
-            tab: title of their tab.
-            arranged: arrangement of the tab.
-            views: the views; data of a view with a known title are added to it.
-            zero_ns: time that minutes count from.
-        """
+        """Draw the views of a tab, with minutes from `zero_ns`; data of a view with a known title are added to it."""
         self.layout.update(tab, arranged, views)
         for view in views:
-            path = origin(tab, view)
+            path = _origin(tab, view)
             match view:
                 case TimePlot():
                     for series in view.series:
@@ -239,14 +284,27 @@ class Renderer:
                 case EventLog():
                     self._draw_log(path, view, zero_ns)
                 case StateLines():
-                    for line in view.lines:
-                        self._draw_states(path + path_of(*line.name.split("/")), line, view, zero_ns)
+                    self._draw_states(path, view, zero_ns)
                 case PlanePlot():
-                    draw_plane(self._stream, path, view, self.layout.frame(path), zero_ns)
+                    self._draw_plane(path, view, zero_ns)
                 case ViewReference():
                     pass
                 case _:
                     assert_never(view)
+
+    def _log_static(self, path: str, key: object, data: rr.AsComponents) -> None:
+        """Log static data, unless those logged last had an equal key."""
+        if self._static_keys.get(path) != key:
+            self._static_keys[path] = key
+            self._recording.log(path, data, static=True)
+
+    def _send(self, path: str, time_ns: Times, zero_ns: int, columns: rr.ComponentColumnList) -> None:
+        """Send columns, a row for each time."""
+        clocks = [
+            rr.TimeColumn(RUN_TIME, duration=(time_ns - zero_ns).astype("timedelta64[ns]")),
+            rr.TimeColumn(SAMPLE_TIME, timestamp=time_ns.astype("datetime64[ns]")),
+        ]
+        self._recording.send_columns(path, clocks, columns, strict=True)
 
     def _draw_series(self, path: str, series: Series, zero_ns: int) -> None:
         mode = rr.components.InterpolationMode.StepAfter if series.held else rr.components.InterpolationMode.Linear
@@ -258,8 +316,10 @@ class Renderer:
             # by default Rerun draws the average where several points fall on a pixel, and so hides every peak
             aggregation_policy=rr.components.AggregationPolicy.MinMax,
         )
-        self._stream.log_static(path, (series.colour, series.width, series.legend, series.held), style)
-        self._stream.send_series(path, series.time_ns, zero_ns, series.value)
+        self._log_static(path, (series.colour, series.width, series.legend, series.held), style)
+        for start in range(0, series.time_ns.size, BATCH_ROWS):
+            rows = slice(start, start + BATCH_ROWS)
+            self._send(path, series.time_ns[rows], zero_ns, rr.Scalars.columns(scalars=series.value[rows]))
 
     def _draw_log(self, path: str, log: EventLog, zero_ns: int) -> None:
         if not log.events:
@@ -269,10 +329,75 @@ class Renderer:
             level=[event.kind for event in log.events],
             color=[event.colour for event in log.events],
         )
-        self._stream.send(path, np.array([event.time_ns for event in log.events], np.int64), zero_ns, columns)
+        self._send(path, np.array([event.time_ns for event in log.events], np.int64), zero_ns, columns)
 
-    def _draw_states(self, path: str, line: StateLine, lanes: StateLines, zero_ns: int) -> None:
+    def _draw_states(self, path: str, lanes: StateLines, zero_ns: int) -> None:
         words, colours = list(lanes.colours), list(lanes.colours.values())
-        self._stream.log_static(path, tuple(words), rr.StateConfiguration(values=words, colors=colours))
-        columns = rr.StateChange.columns(state=list(line.states))
-        self._stream.send(path, np.array(line.time_ns, np.int64), zero_ns, columns)
+        for line in lanes.lines:
+            lane = path + path_of(*line.name.split("/"))
+            self._log_static(lane, tuple(words), rr.StateConfiguration(values=words, colors=colours))
+            columns = rr.StateChange.columns(state=list(line.states))
+            self._send(lane, np.array(line.time_ns, np.int64), zero_ns, columns)
+
+    def _draw_plane(self, path: str, plane: PlanePlot, zero_ns: int) -> None:
+        """Draw a plane, or add a segment to it."""
+        frame = self.layout.frames[path]
+        self._draw_axes(path, plane, frame)
+        for order, line in enumerate(plane.paths):
+            strips = frame.strips(line)
+            if strips:
+                where = path + path_of(line.name)
+                style = rr.LineStrips2D.from_fields(
+                    colors=[line.colour], radii=rr.Radius.ui_points(line.width / 2), draw_order=_PATHS + order
+                )
+                self._log_static(where, (line.colour, line.width), style)
+                columns = rr.LineStrips2D.columns(strips=strips).partition([len(strips)])
+                self._send(where, np.array([plane.time_ns], np.int64), zero_ns, columns)
+        for line in plane.curves:
+            radius = rr.Radius.ui_points(line.width / 2)
+            curve = rr.LineStrips2D(frame.strips(line), colors=[line.colour], radii=radius, draw_order=_CURVES)
+            self._log_static(path + path_of(line.name), np.concatenate([line.x, line.y]).tobytes(), curve)
+        if plane.marks:
+            self._log_static(path + path_of("marks"), plane.marks, _points(plane.marks, frame))
+        for mark in plane.events:
+            self._log_static(path + path_of(mark.name), mark, _points((mark,), frame))
+
+    def _draw_axes(self, path: str, plane: PlanePlot, frame: _Frame) -> None:
+        x_axis, y_axis = frame.x_axis, frame.y_axis
+        left, right, top, bottom = frame.edges
+        width, height = right - left, bottom - top
+        key = (x_axis.lower, x_axis.upper, y_axis.lower, y_axis.upper)
+        x_ticks = frame.page(x_axis.ticks, np.full(x_axis.ticks.size, y_axis.lower))
+        y_ticks = frame.page(np.full(y_axis.ticks.size, x_axis.lower), y_axis.ticks)
+        lines = [[[at, top], [at, bottom]] for at, _ in x_ticks] + [[[left, at], [right, at]] for _, at in y_ticks]
+        lines.append([[left, top], [right, top], [right, bottom], [left, bottom], [left, top]])
+        radius = rr.Radius.ui_points(0.4)
+        grid = rr.LineStrips2D(lines, colors=[_AXIS_COLOUR], radii=radius, draw_order=_BELOW)
+        self._log_static(path + path_of("axes"), key, grid)
+        texts = {
+            **{(at, bottom + 0.05 * height): text for (at, _), text in zip(x_ticks, x_axis.labels, strict=True)},
+            **{(left - 0.045 * width, at): text for (_, at), text in zip(y_ticks, y_axis.labels, strict=True)},
+            ((left + right) / 2, bottom + 0.14 * height): plane.x_label,
+            (left - 0.045 * width, top - 0.1 * height): plane.y_label,
+        }
+        if plane.note:
+            texts[((left + right) / 2, top - 0.1 * height)] = plane.note
+        labels = rr.Points2D(
+            list(texts),
+            labels=list(texts.values()),
+            show_labels=True,
+            colors=[_LABEL_COLOUR],
+            radii=rr.Radius.ui_points(0.0),
+        )
+        self._log_static(path + path_of("axis labels"), (key, plane.note), labels)
+
+
+def _points(marks: Sequence[PlaneMark], frame: _Frame) -> rr.Points2D:
+    return rr.Points2D(
+        frame.page(np.array([mark.x for mark in marks]), np.array([mark.y for mark in marks])),
+        labels=[mark.name for mark in marks],
+        show_labels=True,
+        colors=[mark.colour for mark in marks],
+        radii=rr.Radius.ui_points(6.0),
+        draw_order=_MARKS,
+    )

@@ -24,8 +24,7 @@ from reactorwatch.records.atomic import atomic_write
 from recorder.columns import RunColumns
 from recorder.panels import PANELS
 from recorder.panels.base import Colour, Panel, Series, TimePlot, View
-from recorder.view.drawing import Renderer
-from recorder.view.stream import APPLICATION, SAMPLE_TIME
+from recorder.view.drawing import APPLICATION, SAMPLE_TIME, Renderer
 
 _PIPE_BYTES = 65_536
 
@@ -152,7 +151,7 @@ def read_time_plots(path: Path) -> list[TimePlot]:
 
 @dataclass
 class _Line:
-    """Data of a line, collected from the chunks of its entity."""
+    """Data of a line, from the chunks of its entity."""
 
     style: dict[str, Any] = field(default_factory=dict)
     times: list[NDArray[np.int64]] = field(default_factory=list)

@@ -7,10 +7,8 @@ Publishers store only the last minute. So the nodes that raise alarms are querie
 monitor's health report holds the time of the first sample.
 """
 
-import contextlib
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from queue import Empty, SimpleQueue
 from typing import NamedTuple
 
 import rerun as rr
@@ -63,29 +61,22 @@ def query_history(bus: Bus, plant: str) -> RunHistory:
             if isinstance(reply, messages.CommandReply):
                 listed += reply.alarms
                 answered.add(node)
-    zero_ns: int | None = None
-    for message in bus.query_history(keys.all_keys(plant, keys.HEALTH)):
-        reported_ns = zero_of(message)
-        zero_ns = zero_ns if reported_ns is None else reported_ns
+    zeros_ns = [zero_of(message) for message in bus.query_history(keys.all_keys(plant, keys.HEALTH))]
+    zero_ns = next((zero_ns for zero_ns in reversed(zeros_ns) if zero_ns is not None), None)
     alarms = [Publication(keys.key(plant, keys.ALARM, item.alarm), item) for item in alarm_changes(listed)]
     alarms += [Publication(keys.key(plant, keys.INCIDENT, str(item.number)), item) for item in incidents_of(listed)]
     return RunHistory(tuple(map(encode, alarms)), zero_ns, frozenset(answered))
 
 
 class HistoryQuery:
-    """Repeats the query when a node that lists alarms appears, until it replies; never blocks.
-
-    Args:
-        query: `query_history`.
-        answered: nodes that have replied before.
-    """
+    """Repeats a query when a node that lists alarms appears and has not replied before; never blocks."""
 
     def __init__(self, query: Callable[[], RunHistory], answered: frozenset[str] = frozenset()) -> None:
         self._query = query
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._waiting, self._answered = set[str](), set(answered)
         self._thread: threading.Thread | None = None
-        self._answers: SimpleQueue[RunHistory] = SimpleQueue()
+        self._answers: list[RunHistory] = []
 
     def on_alive(self, token: str, is_alive: bool) -> None:
         """Process that a node appeared or disappeared; one that appears again, as after a restart, is queried again."""
@@ -102,11 +93,11 @@ class HistoryQuery:
                     self._thread = threading.Thread(target=self._query_until_answered, name="past", daemon=True)
                     self._thread.start()
 
-    def answers(self) -> Iterator[RunHistory]:
+    def answers(self) -> list[RunHistory]:
         """Replies since the last call."""
-        with contextlib.suppress(Empty):
-            while True:
-                yield self._answers.get_nowait()
+        with self._lock:
+            answers, self._answers = self._answers, []
+        return answers
 
     def end(self) -> None:
         """Stop querying, before the bus is closed."""
@@ -119,8 +110,8 @@ class HistoryQuery:
     def _query_until_answered(self) -> None:
         while not self._ended.is_set():
             past = self._query()
-            self._answers.put(past)
             with self._lock:
+                self._answers.append(past)
                 self._answered |= past.answered & self._waiting
                 self._waiting -= past.answered
                 if not self._waiting:
@@ -178,7 +169,7 @@ class LiveDashboard:
         is_closed: returns True once the viewer is closed.
         now_ns: clock reading.
         past: history of the run before the subscription.
-        query: repeats the query for alarms when a node appears; None never repeats it.
+        query: query for the history when a node appears; None never repeats it.
         process: process of the plant; None: unknown.
     """
 
@@ -199,20 +190,17 @@ class LiveDashboard:
         # a fleet's monitor stores no health report: the next one holds the zero
         self._zero_within_ns = now_ns + (ZERO_TIMEOUT_NS if not self._has_zero and "monitor" in past.answered else 0)
         self._query = query
-        self._known = dict.fromkeys(map(_alarm_change_key, past.alarms))
-        self._count = len(past.alarms)
-        for message in past.alarms:
-            self._reader.add(message)
+        self._known: dict[tuple[str, int, str], None] = {}  # changes of alarms, oldest first
+        self._count = 0
+        self._add(*past.alarms)
         self._next_ns = now_ns + DRAW_INTERVAL_NS
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Collect a message until the next drawing."""
-        if self._is_known(message):
-            return []  # it was listed before
         if now_ns < self._zero_within_ns and not self._has_zero and (zero_ns := zero_of(message)) is not None:
             self._reader.set_zero(zero_ns)
             self._has_zero = True
-        self._take(message)
+        self._add(message)
         if self._count >= SEGMENT_MESSAGES or now_ns >= self._next_ns:
             self._draw(now_ns)
         return []
@@ -230,9 +218,7 @@ class LiveDashboard:
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Draw the collected messages."""
         for past in self._query.answers() if self._query is not None else ():
-            for message in past.alarms:
-                if not self._is_known(message):
-                    self._take(message)
+            self._add(*past.alarms)
         self._draw(now_ns)
         return []
 
@@ -252,32 +238,28 @@ class LiveDashboard:
         self._draw(now_ns)
         return []
 
-    def _take(self, message: Encoded) -> None:
-        self._reader.add(message)
-        self._count += 1
-
-    def _is_known(self, message: Encoded) -> bool:
-        """True if a message repeats a change of an alarm; any other change is stored."""
-        change = _alarm_change_key(message)
-        if change is None:
-            return False
-        if change in self._known:
-            return True
-        self._known[change] = None
-        if len(self._known) > MAX_REMEMBERED:
-            del self._known[next(iter(self._known))]
-        return False
+    def _add(self, *received: Encoded) -> None:
+        """Add messages, but those that repeat a change of an alarm, which was listed or received before."""
+        for message in received:
+            if (change := _alarm_change_key(message)) is not None:
+                if change in self._known:
+                    continue
+                self._known[change] = None
+                if len(self._known) > MAX_REMEMBERED:
+                    del self._known[next(iter(self._known))]
+            self._reader.add(message)
+            self._count += 1
 
     def _draw(self, now_ns: int) -> None:
         self._next_ns = now_ns + DRAW_INTERVAL_NS
-        if not self._count or (not self._has_zero and now_ns < self._zero_within_ns and self._count < SEGMENT_MESSAGES):
+        has_samples = self._reader.has_samples
+        is_waiting = not self._has_zero and (now_ns < self._zero_within_ns or not has_samples)
+        if not self._count or (is_waiting and self._count < SEGMENT_MESSAGES):
             return
-        if not (self._has_zero or self._reader.has_samples) and self._count < SEGMENT_MESSAGES:
-            return  # the zero of the run is its first sample
         self._count = 0
         run = self._reader.next_segment()
-        if not (self._has_zero or self._reader.has_samples):
-            return
+        if not (self._has_zero or has_samples):
+            return  # the zero of the run is its first sample
         self._drawing.draw(run, PANELS)
         self._zero_within_ns = 0  # minutes of drawn data cannot change
         if self._drawing.layout.changed:

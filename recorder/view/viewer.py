@@ -27,22 +27,16 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.http_guard import GuardedPort
 from reactorwatch.runtime.loopback import free_port
+from recorder.view.drawing import APPLICATION
 from recorder.view.live import HistoryQuery, LiveDashboard, query_history
-from recorder.view.stream import APPLICATION
 
 NODE = "view"
 SCREENS = ("WAYLAND_DISPLAY", "WAYLAND_SOCKET", "DISPLAY")  # those that winit reads
-CLEAN_EXIT_CODES = (
-    None,
-    0,
-    130,
-    -signal.SIGINT,
-    -signal.SIGTERM,
-)  # running, closed, or terminated together with this process
+CLEAN_EXIT_CODES = (None, 0, 130, -signal.SIGINT, -signal.SIGTERM)
+"""Codes of a viewer that runs, was closed, or was terminated together with this process."""
 LOOPBACK = ("127.0.0.1", "::1")
 START_TIMEOUT_S = 30.0
 POLL_S = 0.1
-
 EXIT_TIMEOUT_S = 5.0
 
 
@@ -64,15 +58,7 @@ def describe_exit(code: int, log: Path) -> str:
 def viewer(
     *arguments: str, port: int, bind: str, log: Path, environment: Mapping[str, str] | None = None
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a viewer within the context.
-
-    Args:
-        arguments: arguments of its command line.
-        port: port for data.
-        bind: address to listen on.
-        log: file for its output.
-        environment: additional environment variables.
-    """
+    """Run a viewer that listens for data within the context, with more arguments and environment variables."""
     command = [str(viewer_program()), "--bind", bind, "--port", str(port), "--hide-welcome-screen", *arguments]
     with log.open("wb") as output:
         process = subprocess.Popen(  # noqa: S603 (the program is Rerun's own, the arguments are paths and numbers)
@@ -150,7 +136,8 @@ def show(
                     raise _exit_error(child.returncode, target, log)
                 return
             try:
-                recording = stream_to(data, bind, f"{plant}-{time.time_ns()}")
+                recording = rr.RecordingStream(APPLICATION, recording_id=f"{plant}-{time.time_ns()}")
+                recording.connect_grpc(f"rerun+http://{_in_url(_reachable_address(bind))}:{data}/proxy")
                 past = query_history(bus, plant)
                 query = HistoryQuery(lambda: query_history(bus, plant), past.answered)
                 now_ns = time.time_ns()
@@ -162,19 +149,6 @@ def show(
                 recording.disconnect()
             finally:
                 bus.close()
-
-
-def stream_to(port: int, address: str, name: str) -> rr.RecordingStream:
-    """Stream to a viewer.
-
-    Args:
-        port: port of the viewer.
-        address: address of the viewer.
-        name: id of the recording.
-    """
-    recording = rr.RecordingStream(APPLICATION, recording_id=name)
-    recording.connect_grpc(f"rerun+http://{_in_url(_reachable_address(address))}:{port}/proxy")
-    return recording
 
 
 def _check_screen(platform: str, environment: Mapping[str, str]) -> None:

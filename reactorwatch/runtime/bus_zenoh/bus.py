@@ -21,10 +21,10 @@ from reactorwatch.runtime.bus import MAX_BATCH, Request, SubscribeOptions
 from reactorwatch.runtime.bus_zenoh.messages import (
     MAX_ENCODING,
     SEQUENCE_ATTACHMENT,
+    WILDCARD,
     ReadSample,
     SampleReader,
     first_line,
-    has_wildcard,
     matches_whole_streams,
     truncated_payload,
     zenoh_expression,
@@ -204,12 +204,12 @@ class ZenohBus:
         """Deliver numbered messages in order, and hand over others at once."""
         numbered, others = list[tuple[int, int, Encoded]](), list[Encoded]()
         for origin, message in read:
-            if has_wildcard(message.key):
+            if WILDCARD in message[0]:
                 self._refuse_wildcard(message.key)
             elif origin is None or delivery is None:  # its publisher does not number messages
                 others.append(message)
             else:
-                numbered.append((*origin, message))
+                numbered.append((origin[0], origin[1], message))
         if others:
             handler(others)
         if delivery is not None and numbered:
@@ -223,7 +223,7 @@ class ZenohBus:
 
         def on_sample(sample: zenoh.Sample) -> None:
             message = SampleReader(sample.encoding).read(sample, time.time_ns())[1]
-            if has_wildcard(message.key):
+            if WILDCARD in message.key:
                 self._refuse_wildcard(message.key)
             else:
                 handler(message)
@@ -354,7 +354,7 @@ class ZenohBus:
                 is_complete = False
                 continue
             origin, message = SampleReader(reply.ok.encoding).read(reply.ok, time.time_ns())
-            if origin is not None and not has_wildcard(message.key):
+            if origin is not None and WILDCARD not in message.key:
                 messages.append(SequencedMessage(*origin, message))
         return messages, is_complete
 
@@ -468,15 +468,16 @@ def cache_size(key: str, cache_messages: int) -> int:
     return cache_messages if is_of_every_row else min(cache_messages, MAX_CACHED_OF_OTHERS)
 
 
-def _read_batch(channel: Any, reader: SampleReader) -> Iterator[ReadSample]:
+def _read_batch(channel: Any, reader: SampleReader) -> list[ReadSample]:
     """Wait for a sample, and read it and those that have arrived until then."""
     sample, now_ns = channel.recv(), time.time_ns()
-    left, room = MAX_BATCH, MAX_BATCH_BYTES
+    batch, room = list[ReadSample](), MAX_BATCH_BYTES
     while sample is not None:
         read = reader.read(sample, now_ns)
-        yield read
-        left, room = left - 1, room - len(read[1].payload)
-        sample = channel.try_recv() if left and room > 0 else None
+        batch.append(read)
+        room -= len(read[1][1])  # of its payload
+        sample = channel.try_recv() if len(batch) < MAX_BATCH and room > 0 else None
+    return batch
 
 
 def _history_selector(seconds: float) -> str:

@@ -13,6 +13,12 @@ MAX_ENCODING = 1000
 MAX_KEY = 1000
 """Characters of a key whose messages are put in order. A key may have 65,535, and names of streams are stored."""
 
+WILDCARD = "*"
+"""Part of the key of a message published on many keys at once.
+
+Zenoh hands it to the subscribers of all of them, and a router's rules treat it as one on a key of its own.
+"""
+
 SEQUENCE_ATTACHMENT = struct.Struct("<QQ")  # publisher, and sequence number in the stream
 
 ReadSample: TypeAlias = tuple[tuple[int, int] | None, Encoded]
@@ -53,14 +59,6 @@ class SampleReader:
             return None, message
         name = attachment.to_bytes()
         return SEQUENCE_ATTACHMENT.unpack(name) if len(name) == SEQUENCE_ATTACHMENT.size else None, message
-
-
-def has_wildcard(key: str) -> bool:
-    """True for the key of a message published on many keys at once.
-
-    Zenoh hands it to the subscribers of all of them, and a router's rules treat it as one on a key of its own.
-    """
-    return "*" in key
 
 
 def truncated_encoding(encoding: zenoh.Encoding) -> str:

@@ -50,5 +50,5 @@ def test_any_bytes_on_any_key_are_counted(key: str, payload: bytes, encoding: st
     message = Encoded(key, payload, encoding)
     monitor, recorder = Monitor(fuzz.MONITOR, 0), Recorder("cstr", 0)
     assert monitor.on_message(message, 1) == []
-    assert monitor.rejects.total + monitor.rows + len(monitor.aligner.memory.pending) == 1
+    assert monitor.intake.rejects.total + monitor.rows + len(monitor.intake.aligner.memory.pending) == 1
     assert recorder.on_message(message, 1) is not None

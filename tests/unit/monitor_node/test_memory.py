@@ -93,7 +93,7 @@ def test_a_fleet_s_monitor_holds_as_many_objects_after_each_round(rows: list[lis
         node.on_tick(row * 10**9)
         if row >= TRAINING_ROWS and (row - TRAINING_ROWS) % ROUND == ROUND - 1:
             for monitor in map(node.monitor, node.plants):
-                monitor.rejects.report(row * 10**9)
+                monitor.intake.rejects.report(row * 10**9)
                 monitor.notes.clear()
             counts.append(objects())
     assert growth(counts[1], counts[-1]) == {}

@@ -296,7 +296,7 @@ def test_foreign_messages_on_the_plant_s_keys_are_counted_and_harm_nothing(
 def test_foreign_names_do_not_fill_the_log() -> None:
     monitor = Monitor(CONFIG, 0)
     monitor.on_message(sample("T", 0, 0.0, 440.0)._replace(key="reactor/" + "x" * 1_000_000), 0)
-    report = monitor.rejects.report(0)
+    report = monitor.intake.rejects.report(0)
     assert report is not None
     assert len(report) < 500
 
@@ -315,14 +315,14 @@ def test_a_monitor_that_did_not_run_when_something_was_due_counts_it() -> None:
 def test_refusals_are_reported_once_a_minute_at_most() -> None:
     monitor, _ = watch([item for _, item in garbage()])
     minute = 60_000_000_000
-    report = monitor.rejects.report(10 * minute)
+    report = monitor.intake.rejects.report(10 * minute)
     assert report is not None
     assert "not_finite" in report
     watch_again = monitor.on_message(garbage()[0][1], 0)
     assert watch_again == []
-    assert monitor.rejects.report(10 * minute + 59 * minute // 60) is None
-    assert monitor.rejects.report(11 * minute) is not None
-    assert monitor.rejects.report(12 * minute) is None  # nothing new since
+    assert monitor.intake.rejects.report(10 * minute + 59 * minute // 60) is None
+    assert monitor.intake.rejects.report(11 * minute) is not None
+    assert monitor.intake.rejects.report(12 * minute) is None  # nothing new since
 
 
 def test_a_run_with_missing_rows_still_finds_the_leak() -> None:

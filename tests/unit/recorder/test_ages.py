@@ -136,3 +136,55 @@ def test_the_clock_since_the_machine_s_start_has_a_name_and_advances() -> None:
     first, second = read_boot_clock(), read_boot_clock()
     assert first.boot == second.boot
     assert first.since_ns <= second.since_ns
+
+
+def stored_ages(path: Path, boot: str, since_ns: int) -> None:
+    """A file of ages: one recording, first seen at 0, and 100 ns since."""
+    clock = Confirmed(since_ns, boot)
+    ages = Ages(path, clock.read)
+    ages.update([("a", 1)])
+    clock.now_ns += 100
+    ages.store()
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "since_ns", "now_ns"),
+    [
+        ("a boot", "a boot", 1400, 400),  # it was stored at 1100
+        ("a boot", "a boot", 1100, 100),
+        ("a boot", "a boot", 1099, 100),  # no clock since boot goes back
+        ("a boot", "another", 1400, 100),
+        ("", "", 1400, 100),  # unknown boots
+    ],
+)
+def test_the_time_between_two_recorders_is_confirmed_by_the_clock_of_one_boot(
+    tmp_path: Path, before: str, after: str, since_ns: int, now_ns: int
+) -> None:
+    stored_ages(tmp_path / ".ages", before, 1000)
+    ages = Ages(tmp_path / ".ages", Confirmed(since_ns, after).read)
+    assert ages.now_ns() == now_ns
+    assert ages.update([("a", 1), ("b", 1)]) == {"a": 0, "b": now_ns}
+
+
+def test_a_recording_is_as_old_as_its_completion_though_it_is_listed_later(tmp_path: Path) -> None:
+    clock = Confirmed(0)
+    ages = Ages(tmp_path / ".ages", clock.read)
+    clock.now_ns = 500
+    ages.add("a", 1)
+    ages.add("b", 1)
+    clock.now_ns = 900
+    assert ages.update([("a", 1), ("b", 2), ("c", 1)]) == {"a": 500, "b": 900, "c": 900}
+    clock.now_ns = 1000
+    assert ages.update([("a", 1), ("c", 1)]) == {"a": 500, "c": 900}
+    assert ages.update([("a", 1), ("b", 2), ("c", 1)]) == {"a": 500, "b": 1000, "c": 900}, "b was deleted in between"
+
+
+def test_without_the_identifier_of_the_boot_no_boot_is_claimed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    identifier = tmp_path / "boot_id"
+    identifier.write_text("7-7\n")
+    monkeypatch.setattr("recorder.files.ages._BOOT_ID", identifier)
+    assert read_boot_clock().boot == "7-7"
+    identifier.unlink()
+    first, second = read_boot_clock(), read_boot_clock()
+    assert first.boot == second.boot == ""
+    assert 0 < first.since_ns <= second.since_ns

@@ -1,17 +1,20 @@
 """Recordings out of recordings: a stretch of time, and several as one."""
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.records import Channel as McapChannel
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
-from recorder import RecordedMessage
-from recorder.files.copies import Window, cut, sample_window
+from recorder import RecordedMessage, StoredMessage
+from recorder.files.copies import RecoveryResult, Window, cut, recover, sample_window
+from recorder.files.reader import Damage, StoredChannel, metadata_records
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import read_record
@@ -167,3 +170,68 @@ def test_the_model_that_stands_is_that_of_the_moment_and_not_a_later_one(tmp_pat
     model = decode(standing.payload, standing.encoding)
     assert isinstance(model, messages.ModelSnapshot)
     assert model.rows == 10
+
+
+def stored(key: str, log_time_ns: int, publish_time_ns: int) -> StoredMessage:
+    """A message of a file."""
+    record = McapChannel(id=1, topic=key, message_encoding="x", metadata={}, schema_id=0)
+    return StoredMessage(StoredChannel(key, "x", record=record, schema=None), 0, log_time_ns, publish_time_ns, b"")
+
+
+@pytest.mark.parametrize(
+    ("key", "window", "inside", "before"),
+    [
+        ("reactor/cstr/sample/T", Window((10, 20)), [10, 15, 20], [9]),
+        ("reactor/cstr/sample/T", Window((0, 5), (10, 20)), [10, 15, 20], [9]),
+        ("reactor/cstr/health/plant", Window((10, 20), (50, 60)), [10, 15, 20], [9]),
+        ("of another program", Window((10, 20), (50, 60)), [10, 15, 20], [9]),
+    ],
+)
+def test_both_ends_of_a_window_are_inside(key: str, window: Window, inside: list[int], before: list[int]) -> None:
+    is_by_sample = window.sampled_ns == (10, 20)
+    times = [9, 10, 15, 20, 21]
+    messages = [stored(key, 3 if is_by_sample else time, time if is_by_sample else 3) for time in times]
+    assert [time for time, item in zip(times, messages, strict=True) if window.contains(item)] == inside
+    assert [time for time, item in zip(times, messages, strict=True) if window.starts_after(item)] == before
+
+
+def test_the_losses_of_a_recovery_are_named_up_to_five_places() -> None:
+    damages = tuple(Damage(at, "a chunk") for at in range(7))
+    assert RecoveryResult(1, 1, 1, {}, (), 0).losses == ""
+    assert RecoveryResult(1, 1, 1, {}, damages[:2], 3).losses == (
+        "a chunk at byte 0; a chunk at byte 1; 3 messages of channels that are described nowhere"
+    )
+    assert "more places" not in RecoveryResult(1, 1, 1, {}, damages[:5], 0).losses
+    assert RecoveryResult(1, 1, 1, {}, damages, 0).losses.endswith("a chunk at byte 4; 2 more places")
+
+
+def test_a_recovery_that_lost_nothing_but_the_end_is_only_truncated() -> None:
+    end, chunk = Damage(9, "cut off", is_end=True), Damage(3, "a chunk")
+    for damages, orphans, expected in (
+        ((), 0, True), ((end,), 0, True), ((chunk, end), 0, False), ((end,), 1, False),
+    ):  # fmt: skip
+        assert RecoveryResult(1, 1, 1, {}, damages, orphans).is_only_truncated is expected
+
+
+def test_a_recovery_counts_topics_and_times_and_dates_the_file_by_its_last_message(tmp_path: Path) -> None:
+    source, out = recorded(tmp_path / "run.mcap", ENTRIES[:50]), tmp_path / "out.mcap"
+    saved = recover(source, out)
+    times = [entry.log_time_ns for entry in ENTRIES[:50]]
+    assert (saved.messages, saved.first_ns, saved.last_ns) == (50, times[0], times[-1])
+    assert saved.topics == Counter(entry.key for entry in ENTRIES[:50])
+    assert out.stat().st_mtime_ns == times[-1]
+    assert [record.name for record in metadata_records(out)] == ["reactorwatch"]
+
+
+def test_of_an_empty_window_nothing_is_written(tmp_path: Path) -> None:
+    source, out = recorded(tmp_path / "run.mcap", ENTRIES[:50]), tmp_path / "out.mcap"
+    first_ns, last_ns = ENTRIES[0].log_time_ns, ENTRIES[49].log_time_ns
+    for window in (Window((0, first_ns - 1)), Window((last_ns + 1, last_ns + 9))):
+        with pytest.raises(InputError, match="holds no message of that time"):
+            cut([source], out, window, {})
+        assert not out.exists()
+    with pytest.raises(InputError, match="there is no recording of that time; were its files deleted"):
+        cut([], out, ALWAYS, {})
+    with pytest.raises(InputError, match="holds no sample of that time"):
+        sample_window([source], 1, 2)
+    assert cut([source], out, Window((first_ns, first_ns)), {}) == 1

@@ -27,8 +27,8 @@ from recorder.panels.base import (
     View,
     ViewReference,
 )
+from recorder.view.drawing import BATCH_ROWS, RUN_TIME, SAMPLE_TIME
 from recorder.view.file import read_time_plots, write_rrd, write_views
-from recorder.view.stream import BATCH_ROWS, RUN_TIME, SAMPLE_TIME
 from recorder.view.viewer import viewer_program
 from tests.unit.recorder import golden
 

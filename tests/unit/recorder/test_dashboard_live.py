@@ -11,9 +11,8 @@ from rerun.chunk import RrdReader
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.find import find_process
 from recorder.columns import RunColumns, read_run
-from recorder.view.drawing import Renderer
+from recorder.view.drawing import SAMPLE_TIME, Renderer
 from recorder.view.live import DRAW_INTERVAL_NS, LiveDashboard
-from recorder.view.stream import SAMPLE_TIME
 from tests.unit.recorder import golden
 
 MESSAGES = [Encoded(entry.key, entry.payload, entry.encoding) for entry in golden.entries()]

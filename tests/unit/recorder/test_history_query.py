@@ -12,6 +12,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.runtime.bus import Request
 from recorder.view import live
+from recorder.view.drawing import RUN_TIME
 from recorder.view.live import (
     DRAW_INTERVAL_NS,
     ZERO_TIMEOUT_NS,
@@ -21,7 +22,6 @@ from recorder.view.live import (
     alarm_changes,
     query_history,
 )
-from recorder.view.stream import RUN_TIME
 from tests.memory_bus import Exchange, MemoryBus
 
 MINUTE = 60_000_000_000

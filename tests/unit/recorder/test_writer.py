@@ -9,12 +9,16 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
+from reactorwatch.contract.codec import encoding_of
+from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
+from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.copies import recover
+from recorder.files.index import read_summary
 from recorder.files.part_file import PartFile
-from recorder.files.reader import Reader
+from recorder.files.reader import Reader, StoredChannel, metadata_records
 from recorder.files.recording import Recording
-from recorder.files.writer import RecordingWriter, WriteError
+from recorder.files.writer import RecordingWriter, WriteError, check_free
 from tests.unit.recorder import golden
 
 ENTRIES = list(golden.entries())[:30]
@@ -151,3 +155,113 @@ def test_the_library_reads_a_recording_and_its_statistics_agree(tmp_path: Path) 
     assert summary.statistics is not None
     assert summary.statistics.message_count == len(ENTRIES)
     assert summary.statistics.chunk_count == -(-len(ENTRIES) // 7)
+
+
+def test_a_recording_that_cannot_be_started_leaves_no_file(tmp_path: Path) -> None:
+    disk, path = Disk(), tmp_path / "run.mcap"
+    disk.room = 20
+    with pytest.raises(WriteError) as raised:
+        RecordingWriter(path, {}, disk.open)
+    assert str(raised.value) == f"recording {path}: cannot be written: No space left on device"
+    assert raised.value.reason == "No space left on device"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_that_can_no_longer_be_written_names_the_file_that_it_left(tmp_path: Path) -> None:
+    disk, writer, part = start_second_chunk(tmp_path)
+    disk.room = 0
+    with pytest.raises(WriteError) as raised:
+        writer.flush()
+    assert str(raised.value).endswith(f"cannot be written: No space left on device; what was written is in {part}")
+    writer.abandon()
+
+
+def test_the_start_of_a_recording_is_in_its_file_at_once_and_messages_after_a_flush(tmp_path: Path) -> None:
+    path, part = tmp_path / "run.mcap", tmp_path / "run.mcap.part"
+    writer = RecordingWriter(path, {"seed": "3"})
+    (record,) = metadata_records(part)
+    assert (record.name, record.metadata["seed"]) == ("reactorwatch", "3")
+    started_bytes = writer.size_bytes
+    assert started_bytes == part.stat().st_size
+    writer.write(ENTRIES[0])
+    assert intact_messages(part) == []
+    assert writer.abandon() == 0, "its chunk was not written"
+    assert not path.exists()
+
+
+def test_a_recording_is_renamed_when_it_is_closed_and_a_second_close_does_nothing(tmp_path: Path) -> None:
+    path, part = tmp_path / "run.mcap", tmp_path / "run.mcap.part"
+    with RecordingWriter(path, {}) as writer:
+        writer.write(ENTRIES[0])
+        writer.add_metadata("notes", {"text": "a"})
+        assert writer.size_bytes == writer._stream.tell()
+    assert (path.exists(), part.exists()) == (True, False)
+    content = path.read_bytes()
+    writer.close()
+    assert writer.abandon() == 0
+    assert path.read_bytes() == content
+    assert [record.name for record in metadata_records(path)] == ["reactorwatch", "notes"]
+
+
+def test_a_sample_has_its_number_modulo_2_to_the_32_and_anything_else_has_0(tmp_path: Path) -> None:
+    sample = Sample(sequence=2**32 + 5, time_ns=1, quality=QUALITY_GOOD)
+    message = RecordedMessage("reactor/cstr/sample/T", sample.SerializeToString(), encoding_of(Sample), 1, 1)
+    with RecordingWriter(tmp_path / "run.mcap", {}) as writer:
+        writer.write(message)
+        writer.write(message, readable=False)
+        writer.write(message._replace(encoding="text"))
+    found = [
+        (stored.sequence, isinstance(stored.channel, StoredChannel) and stored.channel.schema is not None)
+        for stored in Reader(tmp_path / "run.mcap")
+    ]
+    assert found == [(5, True), (0, False), (0, False)]
+
+
+def test_a_recording_has_a_channel_for_each_key_encoding_and_use_and_one_schema_for_each_type(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with RecordingWriter(path, {}) as writer:
+        for message in ENTRIES:
+            writer.write(message)
+            writer.write(message._replace(latched=True))
+    summary = read_summary(path)
+    keys = {(entry.key, entry.encoding) for entry in ENTRIES}
+    assert len(summary.channels) == 2 * len(keys)
+    assert len(summary.schemas) == len({schema.name for schema in summary.schemas.values()})
+    copy = tmp_path / "copy.mcap"
+    with RecordingWriter(copy, {}) as writer:
+        for _ in range(2):  # two readers have objects of their own for equal channels
+            for stored in Reader(path):
+                writer.append(stored)
+    copied = read_summary(copy)
+    assert (len(copied.channels), len(copied.schemas)) == (len(summary.channels), len(summary.schemas))
+    assert [stored.recorded_message for stored in Reader(copy)] == 2 * [
+        stored.recorded_message for stored in Reader(path)
+    ]
+
+
+def test_a_file_has_room_for_a_number_of_keys_and_the_next_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recorder.files.writer.MAX_CHANNELS", 2)
+    with RecordingWriter(tmp_path / "run.mcap", {}) as writer:
+        for key in ("a", "b"):
+            writer.write(RecordedMessage(key, b"x", "text", 1, 1))
+        with pytest.raises(WriteError, match="a file has room for 2 keys, and 'c' is one more") as raised:
+            writer.write(RecordedMessage("c", b"x", "text", 1, 1))
+        assert raised.value.reason == "a file has room for 2 keys, and 'c' is one more"
+        writer.write(RecordedMessage("a", b"y", "text", 2, 2))
+    assert [stored.payload for stored in Reader(tmp_path / "run.mcap")] == [b"x", b"x", b"y"]
+
+
+def test_a_recording_of_a_name_that_is_taken_is_refused_with_the_cure(tmp_path: Path) -> None:
+    path, part = tmp_path / "run.mcap", tmp_path / "run.mcap.part"
+    check_free(path)
+    with pytest.raises(InputError, match=r"the folder .* does not exist"):
+        check_free(tmp_path / "none" / "run.mcap")
+    with RecordingWriter(path, {}), pytest.raises(InputError, match="is being written by another recorder"):
+        check_free(path)
+    with pytest.raises(InputError, match="exists already and is not overwritten"):
+        check_free(path)
+    path.rename(part)
+    with pytest.raises(InputError, match=f"`reactorwatch recover {part}` saves what is whole in it"):
+        check_free(path)

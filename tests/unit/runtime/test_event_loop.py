@@ -10,7 +10,8 @@ import pytest
 
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply, Health
-from reactorwatch.runtime.event_loop import BATCH, EventLoop, StopSignal, stop_on_signals
+from reactorwatch.runtime.bus import MAX_BATCH
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
 
@@ -350,10 +351,10 @@ def test_a_history_that_comes_at_once_is_handled_in_parts_between_which_the_node
 
     loop = EventLoop(Echo(), bus, stop, on_publish=lambda _publication: published.append(len(parts)))
     loop.subscribe("in/**", on_batch=on_batch)
-    bus.hand_over([Encoded("in/x", b"", "")] * (2 * BATCH + 1))
+    bus.hand_over([Encoded("in/x", b"", "")] * (2 * MAX_BATCH + 1))
     stop.set()
     loop.run()
-    assert parts == [BATCH, BATCH, 1]
+    assert parts == [MAX_BATCH, MAX_BATCH, 1]
     assert published[:3] == [1, 2, 3]
 
 

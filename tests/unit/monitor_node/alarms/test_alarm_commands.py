@@ -238,7 +238,7 @@ def test_a_flood_of_commands_is_refused_counted_and_written_nowhere(
     assert {reply.text for reply in replies if not reply.accepted} == {
         "too many commands by 'Anna': 30 at once and 5 a second are taken; try again in a second"
     }
-    assert room.node.monitor(PLANT).rejects.by_reason == {"too_many_commands": 3000 - len(obeyed)}
+    assert room.node.monitor(PLANT).intake.rejects.by_reason == {"too_many_commands": 3000 - len(obeyed)}
     assert room.ask("comment", AlarmCommand(alarm="shewhart/T", by="Ben", comment="mine")).accepted
     question = Encoded(f"reactor/{PLANT}/command/comment", *encode_message(by_anna(comment="a second later")))
     reply, _ = room.node.on_command(question, 1_000_000_000)

@@ -1,7 +1,8 @@
 """The figures of EEMUA 191, against cases counted by hand."""
 
+from monitor_node.alarms.incidents import is_empty
 from reactorwatch.contract.alarm_states import Event
-from reactorwatch.contract.messages_pb2 import AlarmKpis, Priority
+from reactorwatch.contract.messages_pb2 import AlarmKpis, Priority, PriorityCount
 from reactorwatch.records.record import to_time_ns
 
 from .desk import Desk
@@ -75,6 +76,7 @@ def test_priorities_and_states_are_counted() -> None:
     }
     assert (figures.unacknowledged, figures.shelved, figures.suppressed, figures.out_of_service) == (1, 1, 0, 0)
     assert figures.incidents == 1
+    assert list(counts) == [f"PRIORITY_{name}" for name in ("CRITICAL", "HIGH", "MEDIUM", "LOW")]
 
 
 def test_they_are_published_at_each_minute_and_at_each_change() -> None:
@@ -90,3 +92,17 @@ def test_a_clock_that_is_set_back_forgets_what_lies_ahead() -> None:
     raise_at(desk, 100)
     desk.point(50)
     assert desk.figures().alarms_10min == 0
+
+
+def test_figures_are_empty_until_an_alarm_is_activated_or_hidden() -> None:
+    desk = Desk()
+    desk.point(0)
+    assert is_empty(desk.figures())
+    desk.published += desk.board.act("shewhart/C", Event.SUPPRESS, "Anna", "")
+    assert not is_empty(desk.figures())
+    desk.published += desk.board.act("shewhart/C", Event.UNSUPPRESS, "Anna", "")
+    assert is_empty(desk.figures())
+    raise_at(desk, 1)
+    assert not is_empty(desk.figures())
+    assert not is_empty(AlarmKpis(priorities=[PriorityCount(raised=0), PriorityCount(raised=1)]))
+    assert is_empty(AlarmKpis(time_ns=7, priorities=[PriorityCount(raised=0)]))

@@ -14,7 +14,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.alarm_states import Event, State
 from reactorwatch.contract.codec import encode
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, AlarmState, Incident
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, AlarmState, Incident, Priority
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.spc.charts.base import Judgement
@@ -343,3 +343,193 @@ def test_a_state_that_cannot_be_is_refused_and_changes_nothing() -> None:
     with pytest.raises(InputError, match="shewhart/T is normal, but its condition is active"):
         desk.board.restore(memory)
     assert desk.board.memory.to_bytes() == before
+
+
+# --- messages, and rest --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_message_of_an_alarm_states_the_value_and_the_limit_that_was_crossed(sign: int) -> None:
+    desk = Desk()
+    desk.point(1.0, T=sign * 5.0)
+    desk.point(2.0, T=sign * 1.0)
+    raised, cleared = desk.messages(Alarm)
+    assert (raised.value, raised.limit, raised.unit) == (sign * 5.0, sign * 3.0, "K")
+    assert (raised.text, raised.raised_ns, raised.cleared_ns) == ("shewhart/T is out", to_time_ns(1.0), 0)
+    assert (cleared.value, cleared.limit, cleared.unit) == (sign * 1.0, sign * 3.0, "K")
+    assert cleared.text == "shewhart/T is back within its limits"
+    assert (cleared.raised_ns, cleared.cleared_ns) == (to_time_ns(1.0), to_time_ns(2.0))
+
+
+def test_the_text_of_a_raised_alarm_names_the_operation_and_the_warning() -> None:
+    desk = Desk()
+    desk.board.describe_operation = lambda time_ns: f"in operation since {time_ns} ns"
+    desk.board.warning = "false alarms are likely"
+    desk.point(1.0, T=OUT)
+    assert desk.messages(Alarm)[-1].text == (
+        f"shewhart/T is out; in operation since {to_time_ns(1.0)} ns; false alarms are likely"
+    )
+
+
+def test_a_change_at_a_time_of_its_own_is_published_with_that_time() -> None:
+    desk, out = Desk(), Judgement(OUT, 0.0, -3.0, 3.0, True)
+    change = desk.alarm().update(out, "K", to_time_ns(0.5))
+    assert change is not None
+    desk.published += desk.board.apply(to_time_ns(2.0), [change])
+    (raised,) = desk.messages(Alarm)
+    assert (raised.time_ns, raised.raised_ns) == (to_time_ns(0.5), to_time_ns(0.5))
+
+
+def test_causes_that_a_chart_finds_are_those_of_the_incident() -> None:
+    desk, out = Desk(), Judgement(OUT, 0.0, -3.0, 3.0, True)
+    change = desk.alarm().update(out)
+    assert change is not None
+    change.entries = [SuspectedCause("coolant_flow", 0.9)]
+    desk.published += desk.board.apply(to_time_ns(1.0), [change])
+    desk.point(1.0)
+    (incident,) = desk.messages(Incident)
+    assert [item.cause for item in incident.suspects] == ["coolant_flow"]
+
+
+def test_suspects_alone_change_an_incident_and_a_search_that_stopped_is_stated_until_the_next() -> None:
+    desk = Desk()
+    desk.board.set_suspects([SuspectedCause("coolant_flow", 0.9)])  # there is no incident yet
+    desk.point(1.0, T=OUT)
+    desk.board.set_suspects([], stopped=True)
+    desk.point(2.0, T=OUT)
+    desk.board.set_suspects([SuspectedCause("coolant_flow", 0.9)])
+    desk.point(3.0, T=OUT)
+    published = [(item.time_ns, [s.cause for s in item.suspects], item.text) for item in desk.messages(Incident)]
+    assert published == [
+        (to_time_ns(1.0), [], ""),
+        (to_time_ns(2.0), [], "the search for its cause stopped at its budget of filter steps, so none is named"),
+        (to_time_ns(3.0), ["coolant_flow"], ""),
+    ]
+
+
+def test_an_alarm_raised_while_suppressed_is_first_out_of_no_incident() -> None:
+    """It was that of the incident before."""
+    desk = Desk()
+    desk.point(0, T=OUT)
+    assert desk.messages(Alarm)[-1].first_in
+    desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Anna", "")
+    desk.point(1, T=IN)
+    desk.board.act("shewhart/T", Event.SUPPRESS, "Anna", "start-up")
+    desk.point(2, T=OUT)
+    hidden = desk.messages(Alarm)[-1]
+    assert (hidden.event, hidden.incident, hidden.first_in) == ("raised", 0, False)
+
+
+def test_an_alarm_that_is_declared_again_counts_its_points_from_the_start() -> None:
+    desk = Desk(msgspec.structs.replace(AT_ONCE, raise_count=2, window=3, clear_count=3))
+    desk.point(0, T=OUT)
+    desk.alarms["T"] = desk.board.declare("shewhart", "T")
+    desk.point(1, T=OUT)
+    assert desk.changes() == []
+    desk.point(2, T=OUT)
+    assert desk.changes() == [("shewhart/T", "raised")]
+    for minute in (3, 4):
+        desk.point(minute, T=IN)
+    desk.alarms["T"] = desk.board.declare("shewhart", "T")
+    for minute in (5, 6):
+        desk.point(minute, T=IN)
+        assert desk.alarm().memory.is_active
+    desk.point(7, T=IN)
+    assert not desk.alarm().memory.is_active
+
+
+def test_a_board_is_at_rest_while_no_alarm_is_active_or_shelved_or_remembers_points() -> None:
+    desk = Desk(msgspec.structs.replace(AT_ONCE, raise_count=2, window=2))
+    c, t = desk.alarms["C"], desk.alarms["T"]
+    assert desk.board.is_at_rest([])
+    desk.point(0, T=OUT)
+    assert [desk.board.is_at_rest(counting) for counting in ([], [c], [t], [c, t])] == [False, False, True, True]
+    desk.point(1, T=OUT)
+    assert not desk.board.is_at_rest([c, t])
+    desk.point(2, T=IN)
+    desk.point(3, C=IN)
+    assert desk.board.is_at_rest([])
+    desk.board.act("shewhart/C", Event.SHELVE, "Anna", "", 10.0)
+    assert not desk.board.is_at_rest([c, t])
+    desk.point(13, T=IN)
+    assert desk.board.is_at_rest([])
+
+
+def test_an_alarm_that_names_its_cause_leaves_nothing_unexplained() -> None:
+    desk = Desk()
+    stuck = desk.board.declare("stuck", "T", without_on_delay=True, names_cause=True)
+    desk.judge(stuck, 1.0, Judgement(9.0, 0.0, -6.0, 6.0, True))
+    unexplained = [desk.board.has_unexplained]
+    for minute, value in ((2.0, OUT), (3.0, IN)):
+        desk.point(minute, C=value)
+        unexplained.append(desk.board.has_unexplained)
+    assert unexplained == [False, True, False]
+    assert [alarm.names_cause for alarm in desk.messages(Alarm)] == [True, False, False]
+
+
+def test_delays_are_left_out_one_by_one_and_priority_and_dead_band_may_be_given() -> None:
+    desk = Desk(msgspec.structs.replace(AT_ONCE, raise_count=2, window=2, clear_count=2))
+    raised_at_once = desk.board.declare("silence", "T", without_on_delay=True)
+    cleared_at_once = desk.board.declare("shift", "T", without_off_delay=True)
+    wide = desk.board.declare("range", "T", without_on_delay=True, without_off_delay=True, dead_band=0.5)
+    urgent = desk.board.declare("stuck", "C", priority="critical")
+    assert (raised_at_once.priority, cleared_at_once.priority) == (Priority.PRIORITY_HIGH, Priority.PRIORITY_HIGH)
+    assert urgent.priority == Priority.PRIORITY_CRITICAL
+    points = {value: Judgement(value, 0.0, -3.0, 3.0, value > 3.0) for value in (5.0, 2.0, 1.0)}
+    for alarm, expected in (
+        (raised_at_once, [True, True, True, False]),
+        (cleared_at_once, [False, True, False, False]),
+        (wide, [True, True, True, False]),
+    ):
+        active = []
+        for minute, value in enumerate((5.0, 5.0, 2.0, 1.0)):
+            desk.judge(alarm, minute, points[value])
+            active.append(alarm.memory.is_active)
+        assert active == expected
+
+
+def test_a_reason_stays_until_another_is_given() -> None:
+    desk = Desk()
+    desk.point(0, T=OUT)
+    desk.board.act("shewhart/T", Event.SHELVE, "Anna", "known", 10.0)
+    desk.board.act("shewhart/T", Event.UNSHELVE, "Ben", "")
+    assert (desk.alarm().memory.by, desk.alarm().memory.comment) == ("Ben", "known")
+    desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Ben", "seen")
+    assert desk.alarm().memory.comment == "seen"
+
+
+@pytest.mark.parametrize("minutes", [30.0, 480.0])
+def test_shelving_again_changes_its_end_and_the_longest_time_is_allowed(minutes: float) -> None:
+    desk = Desk()
+    desk.point(5.0, T=OUT)
+    desk.board.act("shewhart/T", Event.SHELVE, "Anna", "", 10.0)
+    desk.point(8.0, T=OUT)
+    desk.board.act("shewhart/T", Event.SHELVE, "Anna", "", minutes)
+    memory = desk.alarm().memory
+    assert (memory.shelved_ns, memory.shelved_until_ns) == (to_time_ns(8.0), to_time_ns(8.0 + minutes))
+    desk.point(7.9 + minutes, T=OUT)
+    assert desk.alarm().memory.state is State.SHELVED
+    desk.point(8.0 + minutes, T=OUT)
+    assert desk.alarm().memory.state is State.UNACKNOWLEDGED
+
+
+def test_an_alarm_that_names_its_cause_keeps_it_whatever_the_incident_is_suspected_of() -> None:
+    desk = Desk()
+    stuck = desk.board.declare("stuck", "T", without_on_delay=True, names_cause=True)
+    change = stuck.update(Judgement(9.0, 0.0, -6.0, 6.0, True))
+    assert change is not None
+    change.suspects, change.contributions = [SuspectedCause("stuck_sensor", 1.0)], {"T": 1.0}
+    desk.published += desk.board.apply(to_time_ns(1.0), [change])
+    desk.board.set_suspects([SuspectedCause("coolant_flow", 0.9)])
+    desk.point(2.0, C=OUT)
+    message = desk.board.alarm("stuck/T")
+    assert [(item.cause, item.probability) for item in message.suspects] == [("stuck_sensor", 1.0)]
+    assert [(item.signal, item.share) for item in message.contributions] == [("T", 1.0)]
+    assert [item.cause for item in desk.board.alarm("shewhart/C").suspects] == ["coolant_flow"]
+
+
+def test_before_the_first_sample_the_alarms_are_listed_at_time_0() -> None:
+    assert [(alarm.alarm, alarm.time_ns) for alarm in Desk().board.all_alarms()] == [
+        ("shewhart/C", 0),
+        ("shewhart/T", 0),
+    ]

@@ -83,7 +83,7 @@ def test_a_flood_of_commands_is_refused(bench: Bench, capsys: pytest.CaptureFixt
     replies = [bench.node.on_command(question, bench.now_ns)[0] for _ in range(3000)]
     refused = [reply for reply in replies if reply is not None and "too many commands" in reply.text]
     assert len(refused) == 3000 - PER_NAME.at_once
-    assert bench.node.monitor("a").rejects.by_reason["too_many_commands"] == len(refused)
+    assert bench.node.monitor("a").intake.rejects.by_reason["too_many_commands"] == len(refused)
     for _ in range(101):
         bench.tick()
     assert f"too_many_commands ({len(refused)} so far)" in capsys.readouterr().out

@@ -157,7 +157,7 @@ def test_a_payload_of_more_than_1000_bytes_is_no_sample(size: int, refused: dict
     payload = message.payload + filling + bytes((rest & 127 | 128, rest >> 7)) + b"x" * rest
     assert len(payload) == size
     monitor.on_message(message._replace(payload=payload), 0)
-    assert monitor.rejects.by_reason == refused
+    assert monitor.intake.rejects.by_reason == refused
 
 
 @pytest.mark.parametrize(
@@ -168,4 +168,4 @@ def test_numbers_and_times_beyond_2_to_the_62_are_of_no_plant(number: int, time_
     monitor = Monitor(MonitorConfig(), 0)
     message = Sample(time_ns=time_ns, sequence=number, value=440.0, unit="K", quality=Quality.QUALITY_GOOD)
     monitor.on_sample("T", message, 0)
-    assert monitor.rejects.by_reason == ({"out_of_range": 1} if is_refused else {})
+    assert monitor.intake.rejects.by_reason == ({"out_of_range": 1} if is_refused else {})

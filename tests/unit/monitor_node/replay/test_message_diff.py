@@ -158,3 +158,141 @@ def test_an_alarm_with_other_suspects_or_limits_by_the_last_bit_is_no_proof(name
     else:
         again.limit = math.nextafter(again.limit, math.inf)
     assert [item.what for item in differences(keys.ALARM, recorded, again)] == [field]
+
+
+CHART = "reactor/cstr/chart/x/T"
+
+
+def point(time_ns: int, statistic: float = 1.0) -> Publication:
+    """A point of a chart."""
+    return Publication(CHART, ChartPoint(time_ns=time_ns, statistic=statistic))
+
+
+def compared(recorded: list[Publication], replayed: list[Publication], *, replayed_first: bool = False) -> MessageDiff:
+    """Comparison of a run."""
+    diff = MessageDiff()
+    if replayed_first:
+        diff.add_replayed(replayed)
+    for item in recorded:
+        diff.add_recorded(encode(item), keys.CHART)
+    if not replayed_first:
+        diff.add_replayed(replayed)
+    diff.finish()
+    return diff
+
+
+@pytest.mark.parametrize("replayed_first", [True, False])
+def test_messages_that_one_side_does_not_have_are_differences_and_those_around_them_are_equal(
+    *, replayed_first: bool
+) -> None:
+    recorded, replayed = [point(time) for time in (1, 2, 4, 6)], [point(time) for time in (1, 3, 4, 5, 6)]
+    diff = compared(recorded, replayed, replayed_first=replayed_first)
+    assert [(item.key, item.time_ns, item.what) for item in diff.differences] == [
+        (CHART, 2, NOT_REPLAYED),
+        (CHART, 3, NOT_RECORDED),
+        (CHART, 5, NOT_RECORDED),
+    ]
+    assert [(item.recorded, item.again) for item in diff.differences] == [
+        ("time_ns: 2 statistic: 1", ""),
+        ("", "time_ns: 3 statistic: 1"),
+        ("", "time_ns: 5 statistic: 1"),
+    ]
+    count = diff.counts[keys.CHART]
+    assert (count.recorded, count.equal, diff.differing, diff.unrecorded) == (4, 3, 3, 0)
+
+
+def test_messages_replayed_after_the_last_recorded_one_are_counted_and_are_no_differences() -> None:
+    """The recording had ended."""
+    diff = compared([point(1), point(2)], [point(time) for time in range(1, 8)])
+    assert (diff.differing, diff.unrecorded, diff.counts[keys.CHART].equal) == (0, 5, 2)
+
+
+def test_a_message_of_another_key_replayed_before_the_last_recorded_one_is_a_difference() -> None:
+    other = Publication("reactor/cstr/chart/y/T", ChartPoint(time_ns=1))
+    diff = MessageDiff()
+    diff.add_recorded(encode(point(1)), keys.CHART)
+    diff.add_recorded(encode(point(2)), keys.CHART)
+    diff.add_replayed([point(1), other, point(2), other])
+    diff.finish()
+    assert [(item.key, item.what) for item in diff.differences] == [(other.key, NOT_RECORDED)]
+    assert (diff.differing, diff.unrecorded) == (1, 1)
+
+
+def test_recorded_messages_that_are_not_replayed_to_the_end_are_differences() -> None:
+    diff = compared([point(time) for time in range(1, 8)], [point(1), point(2)])
+    assert [(item.time_ns, item.what) for item in diff.differences] == [(time, NOT_REPLAYED) for time in range(3, 8)]
+    diff.finish()
+    assert diff.differing == 5, "each is counted once"
+
+
+def test_a_recorded_message_that_cannot_be_decoded_is_a_difference_with_the_reason() -> None:
+    diff = MessageDiff()
+    diff.add_recorded(encode(point(1))._replace(payload=b"\xff\xff"), keys.CHART)
+    diff.finish()
+    (found,) = diff.differences
+    assert (found.key, found.time_ns, found.what, found.again) == (CHART, 0, "payload", "")
+    assert found.recorded
+    assert (diff.counts[keys.CHART].recorded, diff.counts[keys.CHART].equal) == (1, 0)
+
+
+def test_at_most_100_differences_are_listed_and_all_are_counted() -> None:
+    diff = compared([point(time) for time in range(150)], [point(time, 2.0) for time in range(150)])
+    assert [item.time_ns for item in diff.differences] == list(range(100))
+    assert {(item.what, item.recorded, item.again) for item in diff.differences} == {("statistic", "1.0", "2.0")}
+    assert (diff.differing, diff.counts[keys.CHART].equal) == (150, 0)
+
+
+def test_the_differences_of_several_runs_are_added_in_the_order_of_time() -> None:
+    first = compared([point(time) for time in range(0, 120, 2)], [point(time, 2.0) for time in range(0, 120, 2)])
+    second = compared([point(time) for time in range(1, 121, 2)], [point(time, 2.0) for time in range(1, 131, 2)])
+    first.add(second)
+    assert [item.time_ns for item in first.differences] == list(range(100))
+    count = first.counts[keys.CHART]
+    assert (first.differing, first.unrecorded, count.recorded, count.equal) == (120, 5, 120, 0)
+    equal = compared([point(1)], [point(1), point(2)])
+    equal.add(equal)
+    assert (equal.unrecorded, equal.counts[keys.CHART].recorded, equal.counts[keys.CHART].equal) == (2, 2, 2)
+    empty = MessageDiff()
+    empty.add(second)
+    assert (empty.counts[keys.CHART].recorded, empty.differing) == (60, 60)
+
+
+def test_differences_of_several_keys_are_in_the_order_of_time() -> None:
+    diff = MessageDiff()
+    for key, times in (("reactor/cstr/chart/y/T", (2, 4)), (CHART, (1, 3))):
+        for time_ns in times:
+            diff.add_recorded(encode(Publication(key, ChartPoint(time_ns=time_ns))), keys.CHART)
+    diff.finish()
+    assert [item.time_ns for item in diff.differences] == [1, 2, 3, 4]
+
+
+def test_a_message_of_another_type_on_a_key_is_a_difference_that_names_both() -> None:
+    """Also where the bytes are the same."""
+    assert ChartPoint(time_ns=1).SerializeToString() == Estimate(time_ns=1).SerializeToString()
+    (found,) = differences(keys.CHART, ChartPoint(time_ns=1), Estimate(time_ns=1))
+    assert found[2:] == ("message", "reactorwatch.v1.ChartPoint", "reactorwatch.v1.Estimate")
+
+
+def test_nan_is_equal_to_itself() -> None:
+    assert differences(keys.CHART, ChartPoint(statistic=math.nan), ChartPoint(statistic=math.nan)) == []
+
+
+def test_of_several_fields_that_differ_the_first_is_named() -> None:
+    recorded, again = ChartPoint(time_ns=1, statistic=1.0, upper_limit=3.0), ChartPoint(time_ns=1, statistic=2.0)
+    (found,) = differences(keys.CHART, recorded, again)
+    assert found[2:] == ("statistic", "1.0", "2.0")
+
+
+def test_the_same_values_in_another_order_of_the_fields_are_equal() -> None:
+    diff, message = MessageDiff(), ChartPoint(time_ns=1, statistic=2.0)
+    payload = ChartPoint(statistic=2.0).SerializeToString() + ChartPoint(time_ns=1).SerializeToString()
+    assert payload != message.SerializeToString()
+    diff.add_recorded(encode(Publication(CHART, message))._replace(payload=payload), keys.CHART)
+    diff.add_replayed([Publication(CHART, message)])
+    diff.finish()
+    assert (diff.differing, diff.counts[keys.CHART].equal) == (0, 1)
+
+
+def test_a_blank_at_the_end_of_a_text_is_a_difference() -> None:
+    (found,) = differences(keys.ALARM, Alarm(text="T is high"), Alarm(text="T is high "))
+    assert found[2:] == ("text", "'T is high'", "'T is high '")

@@ -176,7 +176,7 @@ def test_a_wrong_command_gets_one_line_and_changes_nothing(
     assert reply.text.startswith(text)
     assert published == []
     run.monitor.memory.received -= 1
-    run.monitor.rejects.by_reason.clear()
+    run.monitor.intake.rejects.by_reason.clear()
     assert run.monitor.to_bytes() == before
 
 

@@ -59,7 +59,7 @@ def test_an_alarm_states_saturation_and_a_moved_set_point() -> None:
         f"; u0 is at its upper bound, 1.7 l/h; sp moved from 20 to 25 K, from {since_min:.3g} min before on"
     )
     assert monitor.rows == ROWS
-    assert monitor.rejects.by_reason == {}
+    assert monitor.intake.rejects.by_reason == {}
 
 
 def test_texts_are_the_same_live_resumed_replayed_and_back_tested() -> None:

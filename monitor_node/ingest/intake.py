@@ -1,0 +1,209 @@
+"""Way of a plant's samples from messages to rows: each sample is checked, converted, and aligned with the others."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import msgspec
+
+from monitor_node.config import MonitorConfig
+from monitor_node.ingest.alignment import Aligner, AlignmentMemory, ReplayFilter
+from monitor_node.ingest.rows import Row
+from monitor_node.ingest.samples import (
+    LARGEST_NUMBER,
+    LARGEST_SAMPLE,
+    LARGEST_VALUE,
+    USABLE,
+    RejectCounter,
+    SampleUnits,
+    UnusableSamples,
+    reject_reason,
+)
+from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import OTHER_VERSION, DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.messages_pb2 import Sample
+from reactorwatch.errors import InputError
+from reactorwatch.stored_state import Memory
+
+
+class IntakeMemory(Memory, kw_only=True):
+    """Memory of an intake beside that of the alignment.
+
+    Attributes:
+        runs: sequence checks of the signals, the inputs first.
+        units: newest unit by signal.
+        heard_from_ns: time of the first accepted sample by signal.
+        refused: number of rejected messages by reason.
+        unusable: samples refused since the newest usable one.
+    """
+
+    runs: list[SequenceCheck]
+    units: dict[str, str]
+    heard_from_ns: dict[str, int] = msgspec.field(default_factory=dict)
+    refused: dict[str, int] = msgspec.field(default_factory=dict)
+    unusable: UnusableSamples = msgspec.field(default_factory=UnusableSamples)
+
+
+class SampleIntake:
+    """Makes rows of the samples of one plant.
+
+    Args:
+        config: settings of the monitor.
+        model_units: units of the equations by signal.
+        memory: memory to start with.
+        on_row: called with each row that is ready, and the publications so far.
+        on_label: called with signal, time and value of a sample of a signal that is carried along only.
+
+    Attributes:
+        memory: what it remembers.
+        rejects: rejected messages.
+        aligner: makes rows of the samples, and counts them.
+        output_units: newest units of the outputs.
+    """
+
+    def __init__(
+        self,
+        config: MonitorConfig,
+        model_units: Mapping[str, str],
+        memory: IntakeMemory,
+        on_row: Callable[[Row, list[Publication]], None],
+        on_label: Callable[[str, int, float], None],
+    ) -> None:
+        self._config, self._on_row, self._on_label = config, on_row, on_label
+        known = (*config.signals, *config.carried_signals)
+        self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in known}
+        self._label_keys = {keys.key(config.plant, keys.SAMPLE, signal) for signal in config.labels}
+        self._indices = {signal: index for index, signal in enumerate(config.signals)}
+        self._units = SampleUnits(config.units, model_units)
+        self.rejects = RejectCounter()
+        self.aligner = Aligner(config.signals, config.reorder_rows)
+        self._use(memory)
+        self._replay_filter: ReplayFilter | None = None
+
+    def _use(self, memory: IntakeMemory) -> None:
+        self.memory, self.rejects.by_reason = memory, memory.refused
+        self.output_units = [memory.units[output] for output in self._config.outputs]
+
+    def resume(self, memory: IntakeMemory, alignment: AlignmentMemory) -> None:
+        """Resume from memories, which are those that run then.
+
+        Until `end_history`, samples that were processed before are counted as duplicated and dropped.
+        """
+        self._use(memory)
+        self.aligner.memory, self._replay_filter = alignment, ReplayFilter(alignment)
+
+    def end_history(self) -> None:
+        """End the history query: from now on no sample is one that was processed before a restart."""
+        self._replay_filter = None
+
+    @property
+    def awaits_samples(self) -> bool:
+        """True if no sample has come since it resumed."""
+        return self._replay_filter is not None and not self._replay_filter.has_begun
+
+    def take(self, messages: Sequence[Encoded], publications: list[Publication]) -> bool:
+        """Process messages on keys of the plant's samples; returns True if a sample was accepted.
+
+        Args:
+            messages: the messages, in order.
+            publications: list to which publications are added.
+        """
+        is_accepted = False
+        for key, payload, encoding, _ in messages:
+            signal = self._signal_by_key.get(key)
+            if signal is None:
+                if key not in self._label_keys:
+                    self.rejects.add("unknown_signal", f"{key} is none of {', '.join(self._config.signals)}")
+                continue
+            if len(payload) > LARGEST_SAMPLE:
+                self.rejects.add("too_large", f"{key}: {len(payload)} bytes are no Sample")
+                continue
+            try:
+                sample = decode(payload, encoding)
+            except DecodeError as error:
+                if error.reason == OTHER_VERSION:
+                    self._refuse(signal, error.reason, str(error))
+                else:
+                    self.rejects.add(error.reason, f"{key}: {error}")
+                continue
+            if not isinstance(sample, Sample):
+                self.rejects.add("encoding", f"{key}: a Sample was expected, got {encoding}")
+            elif self.take_sample(signal, sample, publications):
+                is_accepted = True
+        return is_accepted
+
+    def take_sample(self, signal: str, sample: Sample, publications: list[Publication]) -> bool:
+        """Process a sample of one of the plant's signals; returns True if it was accepted, see `take`."""
+        quality, value, unit = sample.quality, sample.value, sample.unit  # each access costs as much as a line here
+        if quality not in USABLE or not abs(value) < LARGEST_VALUE:
+            self._refuse(signal, *reject_reason(signal, sample))
+            return False
+        if unit != self._units.plain.get(signal):
+            try:
+                value, unit = self._units.convert(signal, unit, value)
+            except InputError as error:
+                self._refuse(signal, "unit", str(error))
+                return False
+        index, time_ns, number = self._indices.get(signal), sample.time_ns, sample.sequence
+        if index is None:
+            self._on_label(signal, time_ns, value)
+            return False
+        if self._replay_filter is not None and self._is_repeated(self._replay_filter, index, time_ns, number):
+            return False
+        if self.memory.runs[index].accept_next(number, time_ns):  # as nearly always
+            self._accept(signal, time_ns, number, value, unit, publications)
+            return True
+        return self._check_sequence(index, signal, HeldSample(time_ns, number, value, unit), publications)
+
+    def _is_repeated(self, replay_filter: ReplayFilter, index: int, time_ns: int, number: int) -> bool:
+        """True if a sample was processed before a restart; without a signal left to filter, the filter ends."""
+        is_duplicate = replay_filter.is_duplicate(index, time_ns, number)
+        self.aligner.memory.counts.duplicated += is_duplicate
+        if replay_filter.is_over:
+            self._replay_filter = None
+        return is_duplicate
+
+    def _check_sequence(self, index: int, signal: str, sample: HeldSample, publications: list[Publication]) -> bool:
+        """Process a sample that is not the expected one of its run; returns True if one was accepted."""
+        run, time_ns, number = self.memory.runs[index], sample.time_ns, sample.number
+        if not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):
+            text = f"{signal} number {number} at {time_ns} ns: no plant counts or lasts so far"
+            self.rejects.add("out_of_range", text)
+            return False
+        accepted, rejected = run.update(sample, self._config.reorder_rows)
+        for item in rejected:
+            self.rejects.add(
+                "out_of_place",
+                f"{signal} number {item.number} at {item.time_ns} ns does not follow number {run.newest} at "
+                f"{run.newest_ns} ns; do two plants publish as {self._config.plant}?",
+            )
+        for item in accepted:
+            self._accept(signal, *item, publications)
+        return bool(accepted)
+
+    def _refuse(self, signal: str, reason: str, text: str) -> None:
+        """Count a sample of one of the plant's signals that cannot be used."""
+        self.rejects.add(reason, text)
+        if signal in self._indices and reason != "payload":
+            self.memory.unusable.add(signal, text)
+
+    def _accept(
+        self, signal: str, time_ns: int, number: int, value: float, unit: str, publications: list[Publication]
+    ) -> None:
+        """Align an accepted sample, and process the rows that are ready."""
+        memory = self.memory
+        if memory.unusable.reasons:
+            memory.unusable.clear(signal)
+        if unit != memory.units[signal] or signal not in memory.heard_from_ns:
+            memory.heard_from_ns.setdefault(signal, time_ns)
+            memory.units[signal] = unit
+            self.output_units = [memory.units[output] for output in self._config.outputs]
+        for row in self.aligner.update(signal, time_ns, number, value):
+            self._on_row(row, publications)
+
+    def finish(self, publications: list[Publication]) -> None:
+        """Process held samples and pending rows, as at the end of a record."""
+        for signal, run in zip(self._config.signals, self.memory.runs, strict=True):
+            for sample in run.release():
+                self._accept(signal, *sample, publications)
+        for row in self.aligner.flush():
+            self._on_row(row, publications)
