@@ -124,7 +124,7 @@ class Counting(MonitorNode):
             for index in range(SIGNALS * row, SIGNALS * (row + 1)):
                 super().on_messages(messages[index : index + 1], start_ns + index * 10**9)
         trained = self.monitor(plant_name(0))
-        assert trained.pipeline.is_ordinary
+        assert trained.pipeline.evaluation.is_ordinary
         body, few = SEAL.open(trained.to_bytes()), max(plants // 10, 1)
         for number in range(1, plants):
             if number == few:

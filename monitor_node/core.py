@@ -281,7 +281,7 @@ class Monitor:
         """`waiting` for the first row, `training` or `watching`."""
         if self.memory.first_ns is None:
             return "waiting"
-        return "watching" if self.pipeline.watching or not self.pipeline.is_judged else "training"
+        return "watching" if self.pipeline.watching or not self.pipeline.baselines.modes.is_judged else "training"
 
     @property
     def rows(self) -> int:

@@ -116,7 +116,7 @@ def watch(job: Job) -> Result:
     kept = promise is None or promise.kept
     return Result(
         alarms,
-        monitor.pipeline.expected_false_alarms,
+        monitor.pipeline.baselines.expected_false_alarms,
         rows,
         rows - unfamiliar_rows(monitor),
         kept,

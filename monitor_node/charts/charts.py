@@ -397,7 +397,10 @@ class ChartWatch:
                     continue
                 if points:
                     row.publications.append(Publication(charts.keys[index], chart_point(row.time_ns, judgement)))
-                change = charts.alarms[index].update(judgement, SD)
+                alarm = charts.alarms[index]
+                if not (judgement.out or alarm.memory.standing or alarm.memory.recent):
+                    continue  # such a point changes no alarm
+                change = alarm.update(judgement, SD)
                 if change is None:
                     continue
                 if change.is_raised:

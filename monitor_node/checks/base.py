@@ -173,10 +173,6 @@ class SignalCheck:
                 changes.append(change)
         return changes
 
-    def invalid_values(self) -> Flags:
-        """One flag a value of the newest row, after the changes of its alarms: it is no measurement; empty: all are."""
-        return [alarm.memory.standing for alarm in self.alarms] if self.is_invalid_while_active else self.invalid
-
     def on_gap(self) -> None:
         """Forget what a gap in the rows makes undecidable."""
 

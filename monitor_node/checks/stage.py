@@ -133,10 +133,15 @@ class SignalChecks:
         """
         flags = [False] * len(row.values)
         for check in self._checks:
-            if check.judged == judged:
-                changes += check.changes(check.update(row))
-                for i, is_invalid in enumerate(check.invalid_values()):
-                    flags[i] = flags[i] or is_invalid
+            if check.judged != judged:
+                continue
+            if findings := check.update(row):
+                changes += check.changes(findings)
+            invalid = check.invalid
+            if check.is_invalid_while_active:
+                invalid = [alarm.memory.standing for alarm in check.alarms]
+            for i, is_invalid in enumerate(invalid):
+                flags[i] = flags[i] or is_invalid
         return flags
 
     def on_gap(self) -> None:

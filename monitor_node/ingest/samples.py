@@ -72,15 +72,15 @@ class SampleUnits:
         Raises:
             InputError: the unit is unknown, or measures another quantity.
         """
-        value, wanted = self._convert(signal, unit, value)
-        if wanted == unit:
+        wanted = self._wanted.get(signal, unit)
+        scale, offset = SAME if unit == wanted else self._conversion(signal, unit, wanted)
+        if (scale, offset) == SAME:
             self.plain[signal] = unit
-        return value, wanted
-
-    def _convert(self, signal: str, unit: str, value: float) -> tuple[float, str]:
-        wanted = self._wanted.get(signal)
-        if wanted is None or unit == wanted:
             return value, unit
+        return scale * value + offset, wanted
+
+    def _conversion(self, signal: str, unit: str, wanted: str) -> tuple[float, float]:
+        """Scale and offset of a unit, found once for each signal and unit."""
         known = self._conversions.get((signal, unit))
         if known is None:
             try:
@@ -91,8 +91,7 @@ class SampleUnits:
                 self._conversions[signal, unit] = known
         if isinstance(known, InputError):
             raise known
-        scale, offset = known
-        return (value, unit) if known == SAME else (scale * value + offset, wanted)
+        return known
 
 
 class UnusableSamples(Memory, kw_only=True):
@@ -133,9 +132,8 @@ class RejectCounter:
         """Count a message; `example` describes it."""
         self.by_reason[reason] = self.by_reason.get(reason, 0) + 1
         if reason not in self._pending_report:
-            self._pending_report[reason] = (
-                example if len(example) <= LONGEST_EXAMPLE else f"{example[:LONGEST_EXAMPLE]}..."
-            )
+            is_long = len(example) > LONGEST_EXAMPLE
+            self._pending_report[reason] = f"{example[:LONGEST_EXAMPLE]}..." if is_long else example
 
     @property
     def total(self) -> int:

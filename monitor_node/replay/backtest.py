@@ -14,7 +14,7 @@ from monitor_node.learn.arx import arx_structure
 from monitor_node.learn.arx_fit import fewest_rows
 from monitor_node.learn.baseline import FEWEST_ROWS
 from monitor_node.monitor_state import MonitorMemory
-from monitor_node.watch.pipeline_memory import PipelineMemory
+from monitor_node.watch.pipeline import PipelineMemory
 from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_states import Event
@@ -188,7 +188,7 @@ def train(
         InputError: as `run`; or the record has too few rows, or no output that can be watched.
     """
     monitor = _make_monitor(config, zero_ns, model)
-    monitor.pipeline.open_training()
+    monitor.pipeline.training.open()
     for _ in _publications(monitor, messages):
         pass
     monitor.pipeline.end_training(monitor.memory.last_ns or 0)
@@ -230,6 +230,7 @@ def run(
             first_ns = monitor.memory.first_ns
         alarms += (item.message for item in publications if isinstance(item.message, Alarm))
         incidents += (item.message for item in publications if isinstance(item.message, Incident))
+    reference = monitor.pipeline.evaluation.reference
     return Backtest(
         inputs=monitor.config.inputs,
         outputs=monitor.config.outputs,
@@ -239,14 +240,14 @@ def run(
         span_ns=monitor.span_ns,
         runs=1 + monitor.intake.aligner.memory.counts.restarts,
         watching_since_ns=monitor.memory.watching_since_ns,
-        expected_false_alarms=monitor.pipeline.expected_false_alarms,
+        expected_false_alarms=monitor.pipeline.baselines.expected_false_alarms,
         alarm_messages=alarms,
         incident_messages=incidents,
         refused=dict(monitor.intake.rejects.by_reason),
         notes=[*(trained.notes if trained is not None else ()), *monitor.notes],
         left_out=monitor.excluded_signals,
-        reference=monitor.pipeline.newest_reference or None,
-        noise_levels=monitor.pipeline.noise_levels,
+        reference=monitor.pipeline.reference or monitor.pipeline.baselines.modes.reference or None,
+        noise_levels=None if reference is None else reference.noise_levels,
         baseline=monitor.baseline,
         training_rows=monitor.pipeline.training.trained_rows if trained is None else trained.rows,
         promise=monitor.promise,
@@ -268,7 +269,7 @@ def _describe_obstacle(monitor: Monitor) -> str:
     pipeline = monitor.pipeline
     if pipeline.has_judged:
         return ""
-    if not pipeline.is_judged:
+    if not pipeline.baselines.modes.is_judged:
         return "the training has seen no row in the plant's mode of operation; train on rows in it"
     if pipeline.watching:
         return (

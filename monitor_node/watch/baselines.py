@@ -7,6 +7,8 @@ plant starts up or shuts down, or one that the training has not seen, is watched
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
+import msgspec
+
 from monitor_node.config import MonitorConfig
 from monitor_node.health import NODE, Failures
 from monitor_node.learn.baseline import TrainingResult
@@ -20,16 +22,36 @@ from monitor_node.learn.model_update import (
 )
 from monitor_node.learn.training import Training
 from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding, equations_text, read_equations
-from monitor_node.learn.training_rows import TrainingRows
-from monitor_node.watch.evaluation import Evaluation
+from monitor_node.watch.evaluation import Evaluation, EvaluationMemory
 from monitor_node.watch.operation import Operation
-from monitor_node.watch.pipeline_memory import EvaluationMemory, ModesMemory
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.stored_state import copy_of
+from reactorwatch.stored_state import Memory, copy_of
 
 MOST_KEPT = 3
 """Baselines that can be restored; memory stays bounded."""
+
+
+class ModesMemory(Memory):
+    """Memory of the modes of a plant; one without signals of modes is always in the same.
+
+    Attributes:
+        mode: present mode, one value a signal; NaN before its first sample.
+        is_judged: False in a mode in which signals are checked only.
+        is_learned: True once a mode was learned: one that is new then has not been seen in the training.
+        reference: kind of the reference that judged last.
+        expected: false alarms expected in the modes before, less those of the present one before.
+        is_resumed: True if the present mode was seen in the training, and is learned from these rows now.
+        others: memory of each other mode that was learned, or whose training was left before its end.
+    """
+
+    mode: list[float]
+    is_judged: bool = True
+    is_learned: bool = False
+    reference: str = ""
+    expected: float = 0.0
+    is_resumed: bool = False
+    others: dict[str, EvaluationMemory] = msgspec.field(default_factory=dict)
 
 
 class Baselines:
@@ -97,29 +119,25 @@ class Baselines:
             period_ns: sampling period.
             units: units of the outputs.
         """
-        self.start(trained, period_ns, units)
+        self.start(trained, period_ns)
         if self._config.diagnose_training and equations_text(self._model):
             self.update.rows = trained.rows
         if self._diagnose is not None and (job := self.diagnosis_job) is not None:
             self.on_finding(self._diagnose(job))
         change = self._change_model(time_ns, period_ns, units)
         if change is None:
-            self._check_training(trained.rows)
+            self._check_training(trained, period_ns, units)
         return change
 
-    def start(self, trained: TrainingResult, period_ns: float, units: Sequence[str]) -> None:
+    def start(self, trained: TrainingResult, period_ns: float) -> None:
         """Start to judge by what was learned."""
         self.modes.is_learned, self.modes.reference = True, trained.reference.kind
-        self._evaluation.start(trained, period_ns, units, again=False)
+        self._evaluation.start(trained, period_ns, again=False)
         self._operation.end_training()
 
-    def _check_training(self, rows: TrainingRows) -> None:
-        """Judge the training by itself."""
-        evaluation, reference = self._evaluation, self._evaluation.reference
-        if reference is not None:
-            model = self.equations if reference.follows_equations else None
-            note = evaluation.promises.check(rows, model, reference.kind, evaluation.memory.rows_watched)
-            evaluation.notes += [note] if note else []
+    def _check_training(self, trained: TrainingResult, period_ns: float, units: Sequence[str]) -> None:
+        model = self.equations if trained.reference.follows_equations else None
+        self._evaluation.check_training(trained, model, period_ns, units)
 
     @property
     def diagnosis_job(self) -> DiagnosisJob | None:
@@ -162,8 +180,8 @@ class Baselines:
             evaluation.notes.append("the identified models predict the training better; the baseline stays as it is")
             return None
         self.modes.reference, evaluation.memory.change = trained.reference.kind, change
-        evaluation.start(trained, period_ns, units, again=True)
-        self._check_training(trained.rows)
+        evaluation.start(trained, period_ns, again=True)
+        self._check_training(trained, period_ns, units)
         if evaluation.memory.rows_watched:  # the filter stands at the end of the training, and rows have come since
             trained.reference.restart()
             evaluation.release_values()

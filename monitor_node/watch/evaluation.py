@@ -4,31 +4,87 @@ They are reference, prewhitening, signal checks, charts, tests of lasting steps,
 way of a row through them is the pipeline's (`pipeline`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgspec
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.causes.stage import Suspicion, SuspicionMemory, has_causes
-from monitor_node.charts.charts import ChartWatch
+from monitor_node.charts.chart_design import count_chance_alarms
+from monitor_node.charts.charts import ChartsMemory, ChartWatch
 from monitor_node.charts.drift import DriftWatch
+from monitor_node.charts.shift import NAME as SHIFT
 from monitor_node.charts.shift import ShiftWatch
 from monitor_node.checks.base import CheckTraining
 from monitor_node.checks.stage import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import SamplingPeriod
-from monitor_node.learn.arx import ArxReference
+from monitor_node.learn.arx import ArxMemory, ArxPredictor, ArxReference
+from monitor_node.learn.arx_fit import adaptive_snapshot
 from monitor_node.learn.baseline import TrainingResult
+from monitor_node.learn.black_box_reference import BlackBoxMemory
+from monitor_node.learn.process_reference import ProcessMemory
 from monitor_node.learn.references import Reference
 from monitor_node.learn.signal_range import possible_ranges, stated_ranges
-from monitor_node.watch.budget import AlarmBudget
-from monitor_node.watch.pipeline_memory import EvaluationMemory
+from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.power import Watch
-from monitor_node.watch.promise import PromiseStage
+from monitor_node.watch.promise import PlantPromise, PromiseStage
 from monitor_node.watch.row_step import OrdinaryRows
-from reactorwatch.contract.messages_pb2 import Check
+from reactorwatch.arrays import Array
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Baseline, Check, ModelSnapshot
+from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.spc import false_alarm_budget
+from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
-from reactorwatch.stored_state import place_records
+from reactorwatch.spc.training_errors import TrainingErrors
+from reactorwatch.stored_state import Memory, Records, place_records
+
+
+class EvaluationMemory(Memory, kw_only=True):
+    """Memory of what judges the rows: in force, of an earlier baseline that can be restored, or of another mode.
+
+    Attributes:
+        predictors: identified models, one an output.
+        signals: memory of each signal check by name; as it was read, until the checks go on from it.
+        whiteners: prewhitening filters, one an output, see `WHITENER`.
+        quarantined: one flag an output: its newest value may be a spike.
+        reference: memory of the reference; None before the end of the training.
+        checks: checks of the training.
+        left_out: signals that are not monitored, with the reason.
+        charts: memory of the charts.
+        shift: tests for lasting steps, one an output, see `STEP_TEST`; None without them.
+        suspicion: memory of the search for causes; None if there is none.
+        promise: the promise of false alarms.
+        arl0: in-control run length of each alarm, in rows; 0 before the end of the training.
+        rows_watched: number of evaluated rows.
+        until_drift: number of rows until the next drift point.
+        incident: rows since an alarm without a known cause is active; None: there is none.
+        change: change of the baseline by which it came into force; None: the first training.
+        training: rows of its training, of a mode that was left before the end; None else.
+    """
+
+    predictors: list[ArxPredictor]
+    signals: dict[str, Any]
+    whiteners: Records
+    quarantined: tuple[bool, ...]
+    reference: ProcessMemory | BlackBoxMemory | ArxMemory | None = None
+    checks: list[Check] = msgspec.field(default_factory=list)
+    left_out: dict[str, str] = msgspec.field(default_factory=dict)
+    charts: ChartsMemory = msgspec.field(default_factory=ChartsMemory)
+    shift: Records | None = None
+    suspicion: SuspicionMemory | None = None
+    promise: PlantPromise | None = None
+    arl0: float = 0.0
+    rows_watched: int = 0
+    until_drift: int = 0
+    incident: TrainingRows | None = None
+    change: Baseline | None = None
+    training: TrainingRows | None = None
 
 
 class Evaluation:
@@ -83,7 +139,6 @@ class Evaluation:
         self._use_ranges()
         self.drift = DriftWatch(config, board, publish=models.points)
         self.shift = ShiftWatch(config, board)
-        self._budget = AlarmBudget(config, self.charts.design, self.signals, self.shift, self.drift)
         self.suspicion: Suspicion | None = None
         self.whitener_numbers = self.ordinary.numbers["whiteners"][0]
         self.whiteners = [Prewhitener(None, self.whitener_numbers[i : i + 1]) for i in range(len(config.outputs))]
@@ -145,13 +200,12 @@ class Evaluation:
 
     # --- start and stop --------------------------------------------------------------------------------------
 
-    def start(self, trained: TrainingResult, period_ns: float, units: Sequence[str], *, again: bool) -> None:
+    def start(self, trained: TrainingResult, period_ns: float, *, again: bool) -> None:
         """Start to evaluate rows.
 
         Args:
             trained: result of the training.
             period_ns: sampling period.
-            units: units of the outputs.
             again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
         """
         self._leave_out(trained.left_out)
@@ -161,7 +215,7 @@ class Evaluation:
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
         )
         period_min = period_ns / MINUTE_NS
-        arl0 = self._budget.share(self.evaluated, period_min, trained.checks)
+        arl0 = self._share_budget(period_min, trained.checks)
         memory = self.memory
         memory.checks, memory.arl0 = trained.checks, arl0
         self._set_reference(trained.reference, trained.learned)
@@ -172,25 +226,38 @@ class Evaluation:
         memory.charts, memory.shift = self.charts.memory, self.shift.memory
         values, e = trained.measured.T.tolist(), trained.e.T.tolist()
         self.signals.start(CheckTraining(values, e, trained.outliers, period_ns, arl0))
-        watch = self._watch(trained, units, period_min) if self.promises.states_power else None
-        rates = self._budget.alarm_rates(trained, self.evaluated, arl0)
-        self.promises.start(rates, self.chance_alarms / arl0, period_min, trained.excess_rate(arl0), watch)
+        rates, mean_rate = self._alarm_rates(trained, arl0), self.chance_alarms / arl0
+        self.promises.start(rates, mean_rate, period_min, trained.excess_rate(arl0))
         memory.promise = self.promises.promise
         if not again:
             self.notes += self.drift.start(self.models.predictors, self.evaluated, arl0)
         self.notes += [f"training: {check.result}" for check in trained.checks if check.result != "ok"]
 
-    def _watch(self, trained: TrainingResult, units: Sequence[str], period_min: float) -> Watch:
-        return Watch(
-            self._config,
-            trained.reference,
-            trained.learned,
-            self.charts.design.detectors(trained.learned, trained.e, self.memory.arl0),
-            self.shift.sensitivities,
-            self.evaluated,
-            dict(zip(self._config.outputs, units, strict=True)),
-            period_min,
-        )
+    def check_training(
+        self, trained: TrainingResult, model: ProcessModel | None, period_ns: float, units: Sequence[str]
+    ) -> None:
+        """Judge the training by itself, and state the power of the watch that has started with it.
+
+        Args:
+            trained: result of the training.
+            model: equations that judge; None: none do.
+            period_ns: sampling period.
+            units: units of the outputs.
+        """
+        watch: Watch | None = None
+        if self.promises.states_power:
+            watch = Watch(
+                self._config,
+                trained.reference,
+                trained.learned,
+                self.charts.design.detectors(trained.learned, trained.e, self.memory.arl0),
+                self.shift.sensitivities,
+                self.evaluated,
+                dict(zip(self._config.outputs, units, strict=True)),
+                period_ns / MINUTE_NS,
+            )
+        note = self.promises.check(trained, model, watch, self.memory.rows_watched)
+        self.notes += [note] if note else []
 
     def _set_reference(
         self, reference: Reference, learned: list[Prewhitening], suspicion: SuspicionMemory | None = None
@@ -246,12 +313,78 @@ class Evaluation:
         """Take no value for a possible spike any more."""
         self.memory.quarantined = (False,) * len(self._config.outputs)
 
-    # --- rates -----------------------------------------------------------------------------------------------
+    # --- models ----------------------------------------------------------------------------------------------
+
+    def model_snapshots(self, time_ns: int) -> Iterator[Publication]:
+        """Snapshots of each output's models: adaptive, fitted to the training, and the reference.
+
+        The fitted model is only compared with the adaptive one, which is the reference if that is `arx`.
+        """
+        inputs, outputs, reference = self._config.inputs, self._config.outputs, self.reference
+        for index, (signal, predictor) in enumerate(zip(outputs, self.models.predictors, strict=True)):
+            adaptive, stored = adaptive_snapshot(predictor), predictor.reference_model
+            fitted = ModelSnapshot.FromString(stored) if stored else None
+            judging = None if reference is None else reference.snapshot(index, inputs, outputs)
+            if fitted is not None:
+                fitted.held = True
+            if adaptive is not None:
+                adaptive.reference = reference is not None and reference.is_identified
+            for snapshot in (adaptive if predictor.judges else fitted, judging):
+                if snapshot is not None:
+                    snapshot.checks.extend(self.memory.checks)
+            for snapshot in (adaptive, fitted, judging):
+                if snapshot is not None:
+                    snapshot.time_ns = time_ns
+                    yield Publication(keys.key(self._config.plant, keys.MODEL, signal), snapshot)
+
+    # --- budget of false alarms ------------------------------------------------------------------------------
 
     @property
     def chance_alarms(self) -> int:
-        """Number of alarms that can be false alarms."""
-        return self._budget.count(self.evaluated)
+        """Number of alarms that can be false alarms: they share the promised ones."""
+        of_signals = SignalChecks.CHANCE_ALARMS * sum(self.evaluated)
+        return self.charts.design.chance_alarms + of_signals + self._count_tests()
+
+    def _count_tests(self) -> int:
+        """Number of tests of lasting steps and of drift charts, each of which chance can raise an alarm of."""
+        of_steps = sum(self.evaluated) if self.shift.is_active else 0
+        return of_steps + self.drift.chance_alarms(self.evaluated)
+
+    def _share_budget(self, period_min: float, checks: list[Check]) -> float:
+        """In-control run length of each alarm, in rows.
+
+        Args:
+            period_min: sampling period.
+            checks: checks of the training; one is added where less is promised or tested than usual.
+
+        Raises:
+            InputError: the charts cannot keep the rate that the settings ask for.
+        """
+        asked, usual = self._config.false_alarms_per_30_days, false_alarm_budget.USUAL_PER_30_DAYS
+        try:
+            promised = false_alarm_budget.promise_per_30_days(asked, self.chance_alarms, period_min)
+        except InputError:
+            if not self.shift.is_active:
+                raise
+            self.shift.is_active = False
+            why = f"{asked:g} false alarms in 30 days cannot be kept with more alarms"
+            checks.append(Check(name=SHIFT, result=f"lasting steps are not tested for: {why}"))
+            promised = false_alarm_budget.promise_per_30_days(asked, self.chance_alarms, period_min)
+        if asked is None and promised != usual:
+            text = (
+                f"{promised:.3g} false alarms in 30 days are promised instead of {usual:g}: that is the nearest that "
+                f"the charts can keep for {self.chance_alarms} alarms and rows every {period_min:.3g} min"
+            )
+            checks.append(Check(name="promise", result=text))
+        return false_alarm_budget.share_arl0(promised, self.chance_alarms, period_min)
+
+    def _alarm_rates(self, trained: TrainingResult, arl0: float) -> Array:
+        """False alarms a row by the errors that the training may have made, shape (draws,)."""
+        errors = TrainingErrors.draw(len(trained.learned))
+        rates = self.charts.design.relative_rates(trained.learned, trained.e, trained.values, arl0, errors)
+        rates += self.signals.relative_rates(trained.learned, self.evaluated, arl0, errors)
+        rates += self._count_tests()
+        return rates / arl0
 
     @property
     def expected_false_alarms(self) -> float:
@@ -262,9 +395,9 @@ class Evaluation:
     # --- ordinary rows ---------------------------------------------------------------------------------------
 
     def find_ordinary(self, time_ns: int, sampling: SamplingPeriod) -> bool:
-        """True if the compiled step may take the row after this one; it then finds its numbers."""
+        """True if the compiled step may take the row after this one, while no alarm is active; fills its numbers."""
         reference, time_min = self.ordinary.reference, time_ns / MINUTE_NS
-        if reference is None or self._board.has_unexplained or not self.charts.is_ordinary:
+        if reference is None or not self.charts.is_ordinary:
             return False
         if self.memory.left_out or True in self.memory.quarantined:
             return False
@@ -285,3 +418,19 @@ class Evaluation:
         if self.is_ordinary:
             self.charts.store(self.ordinary.numbers[0])
             self.is_ordinary = False
+
+
+def check_promise(config: MonitorConfig, period_min: float) -> None:
+    """Check that charts can keep the promised number of false alarms, with every output monitored.
+
+    Args:
+        config: settings of the monitor.
+        period_min: sampling period in minutes.
+
+    Raises:
+        InputError: charts cannot keep the promise.
+    """
+    outputs = len(config.outputs)
+    of_drift = outputs if ParameterT2.name in config.charts else 0
+    alarms = count_chance_alarms(config) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
+    false_alarm_budget.promise_per_30_days(config.false_alarms_per_30_days, alarms, period_min)

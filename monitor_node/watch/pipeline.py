@@ -10,7 +10,8 @@ Commands and diagnoses change the baseline by which rows are judged, and so does
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import repeat
 from math import isfinite, nan
 
 from monitor_node.alarms.alarms import AlarmChange
@@ -24,23 +25,48 @@ from monitor_node.learn.arx import ArxReference
 from monitor_node.learn.baseline import NO_VALUE, TrainingResult
 from monitor_node.learn.model_update import is_command
 from monitor_node.learn.signal_range import input_bounds
+from monitor_node.learn.training import TrainingMemory
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.learn.training_rows import TrainingRows
-from monitor_node.watch.baselines import Baselines
-from monitor_node.watch.budget import check_promise
-from monitor_node.watch.estimates import chart_limits, estimate_keys, estimates, model_snapshots
-from monitor_node.watch.evaluation import Evaluation
-from monitor_node.watch.operation import Operation
-from monitor_node.watch.pipeline_memory import PipelineMemory
+from monitor_node.watch.baselines import Baselines, ModesMemory
+from monitor_node.watch.evaluation import Evaluation, EvaluationMemory, check_promise
+from monitor_node.watch.operation import CarriedState, Operation
 from monitor_node.watch.promise import PromiseStage
 from monitor_node.watch.row_step import EVENT, VIOLATING
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Alarm, Baseline
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Estimate
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.spc.prewhitening import expected_values, innovations
+from reactorwatch.spc.prewhitening import innovations
+from reactorwatch.stored_state import Memory
+
+
+class PipelineMemory(Memory):
+    """Memory of a pipeline, without the alarms.
+
+    Attributes:
+        sampling: sampling period.
+        operation: modes and set points, by signal.
+        training: memory of the training.
+        evaluation: memory of what judges the rows.
+        modes: memory of the modes.
+        kept: baselines that can be restored, the oldest first.
+        change: newest change of a baseline, of any mode; None: there was none.
+        undiagnosed: rows of the training while its diagnosis is pending; None: it is not.
+        commands: changes by accepted commands that hold from the next row on, in order.
+    """
+
+    sampling: SamplingPeriod
+    operation: dict[str, CarriedState]
+    training: TrainingMemory
+    evaluation: EvaluationMemory
+    modes: ModesMemory
+    kept: list[EvaluationMemory]
+    change: Baseline | None
+    undiagnosed: TrainingRows | None
+    commands: list[Baseline]
 
 
 class PlantPipeline:
@@ -93,7 +119,8 @@ class PlantPipeline:
         self._sampling = SamplingPeriod()
         self._promise_checked = False
         self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
-        self._paths, self._paths_beside = estimate_keys(config), estimate_keys(config, ArxReference.kind)
+        self._paths = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
+        self._paths_beside = [f"{path}/{ArxReference.kind}" for path in self._paths]
         self.models = ArxReference(config, points=points)
         self.evaluation = Evaluation(
             config,
@@ -162,19 +189,9 @@ class PlantPipeline:
         self.evaluation.signals.silence.follow_alarms()
 
     @property
-    def is_ordinary(self) -> bool:
-        """True if the compiled step may take the next row, see `row_step`."""
-        return self.evaluation.is_ordinary
-
-    @property
     def watching(self) -> bool:
         """True if rows are evaluated."""
         return self.evaluation.reference is not None
-
-    @property
-    def is_judged(self) -> bool:
-        """False in a mode in which signals are checked only."""
-        return self.baselines.modes.is_judged
 
     @property
     def reference(self) -> str:
@@ -182,25 +199,9 @@ class PlantPipeline:
         return "" if self.evaluation.reference is None else self.evaluation.reference.kind
 
     @property
-    def newest_reference(self) -> str:
-        """Kind of the reference that judges, or judged last; empty before there was one."""
-        return self.reference or self.baselines.modes.reference
-
-    @property
-    def noise_levels(self) -> dict[str, dict[str, float]] | None:
-        """Noise levels of the equations, see `ProcessReference`; None with another reference."""
-        reference = self.evaluation.reference
-        return None if reference is None else reference.noise_levels
-
-    @property
     def trained_share(self) -> float:
         """Share of the training that is done, 0 to 1."""
         return 1.0 if self.watching else self.training.share(self._sampling.period_ns)
-
-    @property
-    def expected_false_alarms(self) -> float:
-        """Mean number of false alarms expected so far."""
-        return self.baselines.expected_false_alarms
 
     # --- rows ------------------------------------------------------------------------------------------------
 
@@ -242,11 +243,10 @@ class PlantPipeline:
         if not (self._points or evaluation.drift.wanted or shift.is_active):
             return True
         before = len(row.publications)
-        predictions, sds, z, expected, points = ordinary.results
+        predictions, sds, z, points = ordinary.results
         if self._points:
             scales = [sd * whitened for sd, whitened in zip(sds, evaluation.whitened_sds, strict=True)]
-            limits = chart_limits(predictions, sds, scales, expected, charts.memory.widths)
-            row.publications.extend(estimates(row, self._paths, predictions, limits))
+            self._publish_estimates(row, predictions, sds, scales)
             row.publications.extend(charts.points(time_ns, points))
         changes = shift.update(row, z, points=self._points) if shift.is_active else []
         self._end_row(row, changes, before)
@@ -257,20 +257,25 @@ class PlantPipeline:
     def _take_event(self, row: Row, measured: MeasuredRow) -> None:
         """Pass a row that is not ordinary through the stages, one by one, and apply its changes of alarms once."""
         evaluation, modes, time_ns = self.evaluation, self.baselines.modes, row.time_ns
-        evaluation.leave_ordinary()
+        if evaluation.is_ordinary:
+            evaluation.leave_ordinary()
         self._units = measured.units
         if row.restarted:
             self.operation.on_restart()
         self.operation.inputs = measured.inputs
         changes: list[AlarmChange] = []
         seen = CheckRow(time_ns, row.values, measured.units)
-        usable = seen.without(evaluation.signals.update("signals", seen, changes))
-        measured.inputs, measured.values = tuple(usable[: self._inputs]), usable[self._inputs :]
+        invalid = evaluation.signals.update("signals", seen, changes)
+        if True in invalid:
+            usable = seen.without(invalid)
+            measured.inputs, measured.values = tuple(usable[: self._inputs]), usable[self._inputs :]
         if evaluation.reference is not None and modes.is_judged:
             if row.restarted:
                 evaluation.signals.on_restart()
             self._evaluate(measured, changes)
-            evaluation.is_ordinary = evaluation.find_ordinary(time_ns, self._sampling)
+            evaluation.is_ordinary = not self._board.has_unexplained and evaluation.find_ordinary(
+                time_ns, self._sampling
+            )
         else:
             if not modes.is_judged and modes.is_learned:
                 evaluation.signals.update("outputs", CheckRow(time_ns, measured.values, measured.units), changes)
@@ -290,7 +295,9 @@ class PlantPipeline:
             self._mask_signals(row, memory.left_out)
         seen = CheckRow(time_ns, row.values, units)
         stuck = signals.update("outputs", seen, changes)
-        row.values = values = seen.without(stuck)
+        if True in stuck:
+            row.values = seen.without(stuck)
+        values = row.values
         if row.interval.is_gap:  # the input in it is unknown
             evaluation.restart()
         predictions, sds, extrapolation = reference.update(row, memory.quarantined)
@@ -299,11 +306,9 @@ class PlantPipeline:
         if extrapolation is not None:
             tested = [(value - known) / sd for value, known, sd in zip(values, *extrapolation, strict=True)]
         scales = [sd * whitened for sd, whitened in zip(sds, evaluation.whitened_sds, strict=True)]
-        if self._points:
-            expected = expected_values(evaluation.whitener_numbers)
-            limits = chart_limits(predictions, sds, scales, expected, charts.memory.widths)
-            row.publications.extend(estimates(row, self._paths, predictions, limits))
         e = innovations(evaluation.whitener_numbers, z)
+        if self._points:
+            self._publish_estimates(row, predictions, sds, scales)
         memory.rows_watched += 1
         if not self.has_judged:
             judged = (*e, *(tested if shift.is_active else ()), *(values if charts.reads_values else ()))
@@ -324,6 +329,24 @@ class PlantPipeline:
                 self._noted.add(about)
                 evaluation.notes.append(text)
 
+    def _publish_estimates(
+        self, row: MeasuredRow, predictions: Sequence[float], sds: Sequence[float], scales: Sequence[float]
+    ) -> None:
+        """Publish the reference's estimates, with limits about the value that each prewhitening filter expected.
+
+        Args:
+            row: the row.
+            predictions: prediction of each output.
+            sds: standard deviation of each prediction error.
+            scales: standard deviation of each prewhitened residual in the output's unit.
+        """
+        expected, widths = self.evaluation.whitener_numbers["expected"].tolist(), self.evaluation.charts.memory.widths
+        limits: list[tuple[float, float, float]] = []
+        for prediction, sd, scale, mean, width in zip(predictions, sds, scales, expected, widths, strict=True):
+            usual, reach = prediction + sd * mean, scale * width
+            limits.append((scale, usual - reach, usual + reach))
+        _publish_estimates(row, self._paths, predictions, limits)
+
     def _end_row(
         self, row: MeasuredRow, changes: list[AlarmChange], before: int, stuck: Sequence[bool] | None = None
     ) -> None:
@@ -343,7 +366,7 @@ class PlantPipeline:
             is_beside = reference is not self.models
             predictions = self.models.adapt(row) if is_beside or self.models.stays_as_fitted else []
             if is_beside and predictions:
-                publications.extend(estimates(row, self._paths_beside, predictions))
+                _publish_estimates(row, self._paths_beside, predictions)
             changes += evaluation.drift.update(row, self.models.predictors)
         if changes:
             publications.extend(board.apply(row.time_ns, changes))
@@ -406,11 +429,7 @@ class PlantPipeline:
                 return
             self.evaluation.notes.append(training.refuse(trained.refused, time_ns))
         if predictions := training.add(row):
-            row.publications.extend(estimates(row, self._paths, predictions))
-
-    def open_training(self) -> None:
-        """Train until `end_training`, on all rows until then."""
-        self.training.open()
+            _publish_estimates(row, self._paths, predictions)
 
     def end_training(self, time_ns: int) -> None:
         """End the training with the rows so far; the next row is the first of another run of the plant.
@@ -430,7 +449,7 @@ class PlantPipeline:
 
     def start(self, trained: TrainingResult) -> None:
         """Start to judge by what was learned elsewhere from the rows so far."""
-        self.baselines.start(trained, self._sampling.period_ns, self._units)
+        self.baselines.start(trained, self._sampling.period_ns)
 
     def start_run(self) -> None:
         """Expect the first row of another run of the plant, whose times are unrelated to those of the training."""
@@ -450,15 +469,36 @@ class PlantPipeline:
             publications.extend(self._promise_messages(time_ns))
 
     def snapshots(self, time_ns: int) -> list[Publication]:
-        """Snapshots of the promise and of each output's models, see `model_snapshots`."""
+        """Snapshots of the promise and of each output's models."""
         if not self._points:
             return []
-        reference, checks = self.evaluation.reference, self.evaluation.memory.checks
-        snapshots = model_snapshots(time_ns, self._config, self.models.predictors, reference, checks)
-        return [*self._promise_messages(time_ns), *snapshots]
+        return [*self._promise_messages(time_ns), *self.evaluation.model_snapshots(time_ns)]
 
     def _promise_messages(self, time_ns: int) -> list[Publication]:
         return self.evaluation.promises.messages(time_ns, self.evaluation.memory.rows_watched)
+
+
+def _publish_estimates(
+    row: MeasuredRow,
+    paths: Sequence[str],
+    predictions: Sequence[float],
+    limits: Iterable[tuple[float, float, float]] = repeat((0.0, nan, nan)),
+) -> None:
+    """Publish estimates of a row's outputs that have a value and a prediction.
+
+    Args:
+        row: the row.
+        paths: key of each output's estimate.
+        predictions: prediction of each output.
+        limits: standard deviation of each residual, and the lower and upper limit of the value; NaN: not learned yet.
+    """
+    of_outputs = zip(paths, predictions, row.values, row.units, strict=True)
+    for (path, prediction, value, unit), (sd, lower, upper) in zip(of_outputs, limits, strict=False):
+        residual = value - prediction
+        if isfinite(residual):
+            estimate = Estimate(time_ns=row.time_ns, prediction=prediction, residual=residual, unit=unit)
+            estimate.residual_sd, estimate.lower_limit, estimate.upper_limit = sd, lower, upper
+            row.publications.append(Publication(path, estimate))
 
 
 def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:

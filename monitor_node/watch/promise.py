@@ -21,6 +21,7 @@ from monitor_node.charts.shift import NAME as SHIFT
 from monitor_node.checks.stage import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.health import NODE, Failures
+from monitor_node.learn.baseline import TrainingResult
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.power import Watch, state_power
 from reactorwatch.arrays import Array
@@ -261,7 +262,6 @@ class PromiseStage:
     ) -> None:
         self.states_power = states_power
         self._config, self._board, self._failures, self._check, self._points = config, board, failures, check, points
-        self._watch: Watch | None = None
         self._published: Promise | None = None
         self._key = keys.key(config.plant, keys.PROMISE, NODE)
         charts = {name for name, _ in alarm_names(config)}
@@ -279,7 +279,7 @@ class PromiseStage:
         self._promise = promise
         self._board.warning = "" if promise is None else promise.warning
 
-    def start(self, rates: Array, mean_rate: float, period_min: float, excess: float, watch: Watch | None) -> None:
+    def start(self, rates: Array, mean_rate: float, period_min: float, excess: float) -> None:
         """State the promise after a training; alarms so far go on to count.
 
         Args:
@@ -287,9 +287,8 @@ class PromiseStage:
             mean_rate: false alarms a row, on average over trainings.
             period_min: sampling period.
             excess: times as many false alarms as promised that residuals after moves of the inputs raise.
-            watch: the plant as it is watched, to state its power by; None: that is not stated.
         """
-        self.alarm_rates, self._watch = rates, watch
+        self.alarm_rates = rates
         rows = false_alarm_budget.DAYS_MIN / period_min
         mean, upper = rows * mean_rate, rows * float(np.quantile(rates, QUANTILE))
         check = TrainingCheck(excess=excess if excess > LEAST_EXCESS else 0.0)
@@ -297,13 +296,13 @@ class PromiseStage:
         counts = (0, 0, 0) if before is None else (before.found, before.events, before.last_row)
         self.promise = PlantPromise(mean, max(mean, upper), rows, check, *counts)
 
-    def check(self, rows: TrainingRows, model: ProcessModel | None, kind: str, rows_watched: int) -> str:
+    def check(self, trained: TrainingResult, model: ProcessModel | None, watch: Watch | None, rows_watched: int) -> str:
         """Judge the training by itself, and state the power; an error there leaves the promise without them.
 
         Args:
-            rows: rows of the training.
+            trained: result of the training.
             model: equations that judge; None: none do.
-            kind: kind of the reference.
+            watch: the plant as it is watched, to state its power by; None: that is not stated.
             rows_watched: number of rows evaluated since.
 
         Returns:
@@ -311,15 +310,14 @@ class PromiseStage:
         """
         if self.promise is None:
             return ""
-        if self._watch is not None:
-            watch, self._watch = self._watch, None
+        if watch is not None:
             try:
-                self.promise.power = Promise(power=state_power(watch, rows)).SerializeToString()
+                self.promise.power = Promise(power=state_power(watch, trained.rows)).SerializeToString()
             except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
                 self._failures.add("power", error, "the deviations that would be seen are not stated")
         if self._check is not None:
             try:
-                check = self._check(self._config, model, rows, kind)
+                check = self._check(self._config, model, trained.rows, trained.reference.kind)
             except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
                 self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
             else:

@@ -79,7 +79,7 @@ def check_training(
     half = len(aligned) // 2
     settings = msgspec.structs.replace(config, reference=reference, isolation=False, diagnose_training=False)
     learner = PlantPipeline(settings, Annunciator(settings), points=False, model=model)
-    learner.open_training()
+    learner.training.open()
     units = [""] * len(config.outputs)
     for row in aligned[:half]:
         learner.update(row, units, [])

@@ -94,7 +94,6 @@ def frame_types(inputs: int, outputs: int, alarms: int) -> FrameTypes:
     work = [
         ("new", "f8", (3 + 2 * inputs + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
         ("outputs", "f8", (5 * outputs + 1,)),  # its results
-        ("expected", "f8", (outputs,)),  # expected values of the prewhitening filters
         ("e", "f8", (outputs,)),  # prewhitened residuals
         ("columns", "f8", (_COLUMNS, outputs)),  # columns of a bank of charts, see `compiled_chart`
         ("points", "f8", (max(alarms, 1), POINT)),  # points of the charts, one row an alarm
@@ -129,7 +128,6 @@ class Work(NamedTuple):
 
     new: Array
     outputs: Array
-    expected: Array
     e: Array
     columns: Array
     points: Array
@@ -208,9 +206,8 @@ def work_at(frame: Words) -> Work:
         carray(pointer_at(frame[_WORK]), (3 + 2 * inputs + 2 * outputs,), np.float64),
         carray(pointer_at(frame[_WORK + 1]), (5 * outputs + 1,), np.float64),
         carray(pointer_at(frame[_WORK + 2]), (outputs,), np.float64),
-        carray(pointer_at(frame[_WORK + 3]), (outputs,), np.float64),
-        carray(pointer_at(frame[_WORK + 4]), (_COLUMNS, outputs), np.float64),
-        carray(pointer_at(frame[_WORK + 5]), (alarms, POINT), np.float64),
+        carray(pointer_at(frame[_WORK + 3]), (_COLUMNS, outputs), np.float64),
+        carray(pointer_at(frame[_WORK + 4]), (alarms, POINT), np.float64),
     )
 
 

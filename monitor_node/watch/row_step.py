@@ -50,7 +50,7 @@ from reactorwatch.spc.charts.mewma import move as move_mewma
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.charts.shewhart import _judge as judge_shewhart
 from reactorwatch.spc.compiled_chart import PRESENT, SETTINGS, STATISTIC, X
-from reactorwatch.spc.prewhitening import expected_value, innovation
+from reactorwatch.spc.prewhitening import innovation
 from reactorwatch.spc.silence import update_timeout
 from reactorwatch.spc.stuck import is_stuck, quantise, take_reading
 
@@ -208,7 +208,6 @@ def step(
         take_reading(p.stuck[i], quantise(value, settings.resolutions[i]))
         if is_stuck(p.stuck[i]):
             return EVENT
-        work.expected[i] = expected_value(whitener)
         work.e[i] = innovation(whitener, (value - work.outputs[i]) / work.outputs[2 * outputs + i])
         if not (abs(work.e[i]) <= p.spike_limits[i] and abs(work.e[i]) < LARGEST_VALUE):
             return EVENT
@@ -291,16 +290,15 @@ class OrdinaryRows:
         return verdict
 
     @property
-    def results(self) -> tuple[list[float], list[float], list[float], list[float], Array]:
+    def results(self) -> tuple[list[float], list[float], list[float], Array]:
         """Results of the newest row.
 
-        Predictions, their standard deviations, normalised residuals, expected values of these, and the points of the
-        charts, see `ChartWatch.points`.
+        Predictions, their standard deviations, normalised residuals, and the points of the charts, see
+        `ChartWatch.points`.
         """
         work, count = self._work[0], len(self._config.outputs)
-        outputs, expected = work["outputs"].tolist(), work["expected"].tolist()
-        sds, z = outputs[2 * count : 3 * count], outputs[3 * count : 4 * count]
-        return outputs[:count], sds, z, expected, work["points"]
+        outputs = work["outputs"].tolist()
+        return outputs[:count], outputs[2 * count : 3 * count], outputs[3 * count : 4 * count], work["points"]
 
 
 def has_step(config: MonitorConfig) -> bool:

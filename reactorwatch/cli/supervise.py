@@ -12,7 +12,7 @@ import structlog
 
 from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
-from monitor_node.watch.budget import check_promise
+from monitor_node.watch.evaluation import check_promise
 from plant_node.config import PlantConfig
 from reactorwatch.cli.bus_settings import (
     VIEWER,

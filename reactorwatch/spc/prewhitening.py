@@ -230,11 +230,6 @@ def _innovations(numbers: Any, z: Array) -> int:
 _EXPECTED_VALUE, _INNOVATION, _INNOVATIONS = Entry(_expected_value), Entry(_innovation), Entry(_innovations)
 
 
-def expected_values(numbers: NDArray[np.void]) -> list[float]:
-    """Predictions of the next values of several filters, see `Prewhitener.expected_value`."""
-    return [_EXPECTED_VALUE.call(numbers[i : i + 1]) for i in range(len(numbers))]
-
-
 def innovations(numbers: NDArray[np.void], z: Sequence[float]) -> list[float]:
     """Innovations of the next values of several filters, see `Prewhitener.update`.
 

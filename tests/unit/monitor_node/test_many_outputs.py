@@ -100,7 +100,7 @@ def test_a_chart_of_all_outputs_is_left_out_aloud_after_a_training_with_too_few_
     assert any(f"/{charts[0]}/" in key for key in points)
     assert not any(key.endswith("/all") for key in points)
     again.from_bytes(monitor.to_bytes())
-    assert again.pipeline.expected_false_alarms == monitor.pipeline.expected_false_alarms > 0.0
+    assert again.pipeline.baselines.expected_false_alarms == monitor.pipeline.baselines.expected_false_alarms > 0.0
     assert watch(again, values, 110) == watch(monitor, values, 110)
 
 
@@ -129,7 +129,7 @@ def test_the_default_promise_is_refused_at_no_period_and_the_promise_is_publishe
     promised = min(max(1.0, fewest), most)
     assert monitor.memory.watching_since_ns is not None
     days = 200 * period_s / 86_400 - monitor.memory.watching_since_ns / 86_400e9
-    assert monitor.pipeline.expected_false_alarms == pytest.approx(promised * days / 30)
+    assert monitor.pipeline.baselines.expected_false_alarms == pytest.approx(promised * days / 30)
     told = f"training: {promised:.3g} false alarms in 30 days are promised instead of 1: that is the nearest"
     assert [note.startswith(told) for note in monitor.notes] == ([True] if promised != 1.0 else [])
 

@@ -96,7 +96,7 @@ def test_a_monitor_that_resumes_publishes_the_same_bit_for_bit() -> None:
         first, second = Monitor(settings(), 0), Monitor(settings(), 0)
         before = watch(first, values[:, :stop])
         second.from_bytes(first.to_bytes())
-        assert second.pipeline.expected_false_alarms == first.pipeline.expected_false_alarms > 0.0
+        assert second.pipeline.baselines.expected_false_alarms == first.pipeline.baselines.expected_false_alarms > 0.0
         assert before + watch(second, values, stop) == said
 
 
@@ -132,4 +132,4 @@ def test_after_a_training_too_short_for_the_chart_each_output_has_its_own() -> N
     assert note.endswith("90 rows in which all 10 signals could be learned from, 100 are needed")
     resumed.from_bytes(monitor.to_bytes())
     assert "ewma/y4" in {alarm.alarm for alarm in raised(watch(resumed, values, 120))}
-    assert resumed.pipeline.expected_false_alarms > 0.0
+    assert resumed.pipeline.baselines.expected_false_alarms > 0.0

@@ -107,7 +107,7 @@ def test_a_monitor_without_a_signal_resumes_from_its_stored_state(signal: str, l
         said += again.on_message(message, 0)
     assert said == expected
     assert again.excluded_signals == monitor.excluded_signals == {signal: "no value of it has come"}
-    assert again.pipeline.expected_false_alarms == monitor.pipeline.expected_false_alarms
+    assert again.pipeline.baselines.expected_false_alarms == monitor.pipeline.baselines.expected_false_alarms
     assert any(isinstance(item.message, Alarm) and item.message.event == "raised" for item in said)
 
 

@@ -170,7 +170,9 @@ def test_the_reference_in_use_is_published_with_its_noise_levels_and_no_other_is
         assert min(model.time_ns for model in judging) == since_ns
         assert [model.time_ns for model in judging] == sorted({model.time_ns for model in judging})
     assert monitor.pipeline.reference == judge
-    levels = monitor.pipeline.noise_levels
+    reference = monitor.pipeline.evaluation.reference
+    assert reference is not None
+    levels = reference.noise_levels
     assert (levels is not None) == (judge == "equations")
     if levels is not None:
         for signal, sd in levels["sensors"].items():

@@ -39,7 +39,7 @@ def test_a_chart_of_values_raises_its_alarm_and_resumes_bit_for_bit(name: str) -
     before = watch(first, values[:, : TRAINING + 80])
     second.from_bytes(first.to_bytes())
     assert before + watch(second, values, TRAINING + 80) == said
-    assert second.pipeline.expected_false_alarms == whole.pipeline.expected_false_alarms > 0.0
+    assert second.pipeline.baselines.expected_false_alarms == whole.pipeline.baselines.expected_false_alarms > 0.0
 
 
 @pytest.mark.parametrize(

@@ -196,9 +196,11 @@ def test_keys_without_room_are_logged_once_a_minute(capsys: pytest.CaptureFixtur
     recorder, minute_ns = Recorder("cstr", 0), 60_000_000_000
     received = recorder.on_message(encoded(messages.Sample(quality=GOOD)), 0)
     assert received is not None
+    lines = []
     for now_ns in (0, 1, minute_ns - 1, minute_ns, minute_ns + 1):
         recorder.reject_key(received, now_ns)
-    assert capsys.readouterr().out.count("not recorded: too many keys") == 2
+        lines.append(capsys.readouterr().out.count("not recorded: too many keys"))
+    assert lines == [1, 0, 0, 1, 0]
 
 
 def test_a_recorder_that_stops_raises_one_alarm_until_it_resumes_and_counts_what_is_missing() -> None:
@@ -253,3 +255,36 @@ def test_the_channel_of_a_message_is_of_the_product_if_key_and_payload_are(*, un
         channel = kept.channel
         assert (channel.key, channel.encoding) == (key, message.encoding)
         assert (channel.is_product, channel.is_readable) == (is_ours and not unreadable, not unreadable)
+
+
+@pytest.mark.parametrize(
+    ("message", "publish_time_ns", "sequence", "refused"),
+    [
+        (encoded(messages.Estimate(time_ns=5), "reactor/cstr/estimate/T"), 5, 0, {}),
+        (encoded(messages.Estimate(time_ns=-5), "reactor/cstr/estimate/T"), 9, 0, {"time": 1}),
+        (encoded(messages.Sample(time_ns=5, sequence=3, quality=GOOD), "plant/T"), 5, 3, {"key": 1}),
+        (encoded(messages.Sample(time_ns=0, sequence=3), "plant/T"), 0, 3, {"key": 1, "payload": 1}),
+        (encoded(messages.Sample(time_ns=-5, sequence=3), "plant/T"), 9, 3, {"key": 1, "time": 1}),
+        (encoded(messages.Sample(time_ns=-5, sequence=3)), 9, 3, {"time": 1}),
+        (encoded(messages.Sample(time_ns=5, sequence=3))._replace(payload=b"\xff"), 9, 0, {"payload": 1}),
+        (Encoded(KEY, b"{}", "application/json"), 9, 0, {"encoding": 1}),
+    ],
+)
+def test_a_message_has_its_own_time_and_number_where_they_can_be_read(
+    message: Encoded, publish_time_ns: int, sequence: int, refused: dict[str, int]
+) -> None:
+    recorder = Recorder("cstr", 0)
+    kept = recorder.on_message(message, 9)
+    assert kept is not None
+    assert (kept.log_time_ns, kept.publish_time_ns, kept.sequence) == (9, publish_time_ns, sequence)
+    assert health(recorder).refused_by_reason == refused
+
+
+def test_a_sample_that_is_too_large_is_recorded_as_one_that_cannot_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    message = encoded(messages.Sample(time_ns=5, sequence=3, quality=GOOD))
+    for room, sequence in ((len(message.payload), 3), (len(message.payload) - 1, 0)):
+        monkeypatch.setattr("recorder.core.MAX_PAYLOAD", room)
+        monkeypatch.setattr("reactorwatch.contract.codec.MAX_PAYLOAD", room)
+        kept = Recorder("cstr", 0).on_message(message, 9)
+        assert kept is not None
+        assert (kept.sequence, kept.channel.is_readable) == (sequence, sequence == 3)

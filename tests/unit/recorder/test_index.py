@@ -142,6 +142,7 @@ def changed_at(content: bytes, at: int, value: bytes) -> bytes:
 
 WHOLE = recording([SOUND])
 FOOTER_AT = len(WHOLE) - MAGIC_BYTES - FOOTER_BYTES
+SUMMARY_AT = WHOLE.rindex(DESCRIBED)
 
 
 @pytest.mark.parametrize(
@@ -152,6 +153,8 @@ FOOTER_AT = len(WHOLE) - MAGIC_BYTES - FOOTER_BYTES
         (WHOLE[:5], "is cut off;"),
         (WHOLE[:44], "is cut off;"),
         (WHOLE[:-1], "is cut off: the recorder was killed, or is still writing it"),
+        (changed_at(WHOLE, -1, b"?"), "is cut off: the recorder was killed"),
+        (changed_at(WHOLE, SUMMARY_AT + 1, b"\xff"), "its index is damaged ("),
         (changed_at(WHOLE, FOOTER_AT, b"\x03"), "is cut off: the recorder was killed"),
         (changed_at(WHOLE, FOOTER_AT + 1, b"\x15"), "is cut off: the recorder was killed"),
         (changed_at(WHOLE, FOOTER_AT + 9, (FOOTER_AT + 1).to_bytes(8, "little")), "its index is damaged;"),
@@ -173,6 +176,8 @@ def test_a_file_without_an_index_has_an_empty_one_and_one_that_ends_at_its_foote
     assert vars(read_summary(path)) == vars(Summary())
     path.write_bytes(changed_at(WHOLE, FOOTER_AT + 9, FOOTER_AT.to_bytes(8, "little")))
     assert vars(read_summary(path)) == vars(Summary())
+    path.write_bytes(WHOLE[:MAGIC_BYTES] + changed_at(WHOLE, FOOTER_AT + 9, bytes(8))[FOOTER_AT:])
+    assert vars(read_summary(path)) == vars(Summary()), "the shortest file"
     path.write_bytes(WHOLE)
     found = read_summary(path)
     assert (list(found.channels), len(found.chunk_indexes)) == ([1], 1)

@@ -35,8 +35,8 @@ def test_a_whole_file_is_read_without_damage(path: Path, *, tolerant: bool) -> N
 
 
 def test_a_file_whose_beginning_is_damaged_is_read_from_its_first_chunk(path: Path) -> None:
-    for at in (0, 3):
-        content = WHOLE[:at] + b"?" + WHOLE[at + 1 :]
+    for first, last in ((0, 1), (3, 4), (0, 20)):
+        content = WHOLE[:first] + b"?" * (last - first) + WHOLE[last:]
         assert read(path, content) == ([1, 4, 5, 9], ["the beginning cannot be read at byte 0"])
     with pytest.raises(InputError, match="got another kind of file"):
         read(path, b"?" + WHOLE[1:], tolerant=False)
@@ -107,7 +107,7 @@ def test_a_damaged_chunk_is_named_by_its_byte_and_the_others_are_read(path: Path
     assert damage.startswith(f"a chunk of {FIRST_END - HEADER_END} bytes (")
     assert damage.endswith(f") at byte {HEADER_END}")
     with pytest.raises(InputError, match=f"the chunk at byte {HEADER_END} cannot be read"):
-        read(path, content, tolerant=False)
+        list(Reader(path))
 
 
 def test_where_a_length_is_damaged_the_next_chunk_is_found(path: Path) -> None:
@@ -194,3 +194,18 @@ def test_the_start_of_a_file_has_its_first_metadata_and_its_writer(path: Path) -
     assert len(list(reader)) == 4
     assert [record.name for record in reader.metadata] == ["notes", "late"]
     assert (reader.profile, reader.library) == ("", "")
+
+
+def test_an_index_that_names_a_chunk_where_there_is_none_is_damage(path: Path) -> None:
+    claimed = b"".join(number.to_bytes(8, "little") for number in (1, 4, HEADER_END))
+    at = WHOLE.rindex(claimed) + 16
+    for offset in (HEADER_END + 1, 8):  # within the chunk; the header
+        path.write_bytes(WHOLE[:at] + offset.to_bytes(8, "little") + WHOLE[at + 8 :])
+        with pytest.raises(InputError, match=f"the index names a chunk where there is none at byte {offset}"):
+            list(Reader(path).in_order())
+
+
+def test_last_bytes_that_are_not_those_of_a_recording_are_damage(path: Path) -> None:
+    messages, (damage,) = read(path, WHOLE[:-1] + b"?")
+    assert messages == [1, 4, 5, 9]
+    assert "the last bytes are not those of a recording" in damage

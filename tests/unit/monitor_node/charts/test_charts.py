@@ -54,7 +54,7 @@ def test_all_charts_together_are_quiet_on_a_sound_plant_and_share_the_budget() -
     alone = watched(*sound_run(110.0, seed=2), MonitorConfig(charts=("shewhart",), isolation=False))
     widths = [watch.points("shewhart/T")[-1].upper_limit for watch in (run, alone)]
     assert widths[0] > widths[1]
-    assert run.monitor.pipeline.expected_false_alarms == pytest.approx(300 / (30 * 24 * 60), rel=0.01)
+    assert run.monitor.pipeline.baselines.expected_false_alarms == pytest.approx(300 / (30 * 24 * 60), rel=0.01)
 
 
 def test_a_wider_budget_makes_narrower_limits_as_the_run_lengths_require() -> None:

@@ -116,15 +116,30 @@ class ChecksMemory(Memory):
     signals: dict[str, Any]
 
 
+def checks_of(config: MonitorConfig) -> SignalChecks:
+    return SignalChecks(config, Annunciator(config), [ANY] * 3, np.zeros(1, types_of(config).numbers))
+
+
+def training_of(seed: int) -> CheckTraining:
+    values = np.random.default_rng(seed).normal(size=(2, 500)).tolist()
+    return CheckTraining(values, values, [0, 0], 1e9, 1e5)
+
+
+def test_a_training_changes_the_memory_of_each_check_and_replaces_none() -> None:
+    """The stored state holds the same objects."""
+    checks = checks_of(CONFIG)
+    stored = checks.memory
+    before = ChecksMemory(stored).to_bytes()
+    checks.start(training_of(5))
+    assert all(stored[name] is memory for name, memory in checks.memory.items())
+    assert ChecksMemory(stored).to_bytes() != before
+
+
 def test_rows_change_neither_a_memory_that_was_stored_before_nor_one_that_was_resumed_from() -> None:
     """A kept baseline has such a state, and may be restored more than once."""
-    config, values, units = MonitorConfig(isolation=False), [0.1, 440.0], ["", ""]
-    checks = [
-        SignalChecks(config, Annunciator(config), [ANY] * 3, np.zeros(1, types_of(config).numbers)) for _ in range(2)
-    ]
-    rng = np.random.default_rng(5)
-    training = rng.normal(size=(2, 500)).tolist()
-    checks[0].start(CheckTraining(training, training, [0, 0], 1e9, 1e5))
+    values, units = [0.1, 440.0], ["", ""]
+    checks = [checks_of(CONFIG) for _ in range(2)]
+    checks[0].start(training_of(5))
     kept = copy_of(ChecksMemory(checks[0].memory))
     before = kept.to_bytes()
     checks[1].resume(kept.signals, 0)

@@ -46,7 +46,7 @@ def test_a_row_in_one_compiled_step_gives_what_it_gives_stage_by_stage(leak: lis
     stepped, staged, steps = Monitor(BLACK_BOX, 0, points=points), stage_by_stage(BLACK_BOX, points=points), 0
     raised = 0
     for message in run:
-        steps += stepped.pipeline.is_ordinary
+        steps += stepped.pipeline.evaluation.is_ordinary
         publications = stepped.on_message(message, 0)
         assert publications == staged.on_message(message, 0)
         raised += any(isinstance(item.message, Alarm) for item in publications)
