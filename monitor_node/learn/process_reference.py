@@ -129,7 +129,7 @@ class ProcessReference(FilterReference):
         return self._memory
 
     @property
-    def known_plant(self) -> tuple[ProcessModel, NoiseLevels]:
+    def known_plant(self) -> PlantEquations:
         """Model and noise as if the constants were known: the filter's, with the disturbances alone beside the states.
 
         Rows narrow what is not known of the constants, so soon the filter judges nearly as this one does.
@@ -137,7 +137,8 @@ class ProcessReference(FilterReference):
         disturbances = tuple(filter(is_disturbance, self.equations.uncertain))
         model = widen_model(self.equations, disturbances, self._memory.learned)
         sds = dict(zip(self.model.state_names, self._memory.noise.process_sd, strict=True))
-        return model, NoiseLevels(self._memory.noise.measurement_sd, tuple(sds[name] for name in model.state_names))
+        noise = NoiseLevels(self._memory.noise.measurement_sd, tuple(sds[name] for name in model.state_names))
+        return PlantEquations(model, noise)
 
     @property
     def plant(self) -> PlantEquations:
@@ -145,8 +146,12 @@ class ProcessReference(FilterReference):
         return PlantEquations(self.equations, self.plant_noise)
 
     def row_filter(self, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> RowFilter | None:
-        """See `Reference`."""
-        return row_filter(self.model, inputs, outputs)
+        """See `FilterReference`."""
+        model, states = self.model, len(self.model.states)
+        if model.breakpoints or (model.input_names, model.output_names) != (inputs, outputs):
+            return None
+        sizes = states + states**2, len(outputs) + states
+        return RowFilter(_compiled_filter(model), model.values(), sizes, (0.0, LONGEST_ROW_MIN))
 
     def snapshot(self, output: int, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> ModelSnapshot:
         """Snapshot of the filter: its noise levels."""
@@ -293,21 +298,6 @@ class ProcessReference(FilterReference):
 def _compiled_filter(model: ProcessModel) -> CompiledFunction:
     """Machine code of the filter of a model, row by row."""
     return CompiledFunction(row_function(model))
-
-
-def row_filter(model: ProcessModel, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> RowFilter | None:
-    """The filter of a model as machine code, see `Reference`.
-
-    Args:
-        model: model of the filter.
-        inputs: names of the inputs of a row.
-        outputs: names of its outputs.
-    """
-    if model.breakpoints or (model.input_names, model.output_names) != (inputs, outputs):
-        return None
-    states = len(model.states)
-    sizes = states + states**2, len(outputs) + states
-    return RowFilter(_compiled_filter(model), model.values(), sizes, (0.0, LONGEST_ROW_MIN))
 
 
 def _median_sds(sds: Array) -> list[float]:

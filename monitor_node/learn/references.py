@@ -134,8 +134,8 @@ class Reference(ABC):
         return self.plant is not None
 
     @property
-    def known_plant(self) -> tuple[ProcessModel, NoiseLevels] | None:
-        """Model and noise as if the constants were known; None without equations."""
+    def known_plant(self) -> PlantEquations | None:
+        """Equations with the disturbances, and noise, as if the constants were known; None without equations."""
         return None
 
     @property
