@@ -73,7 +73,7 @@ def _digest(body: bytes) -> bytes:
 
 
 MAGIC = b"reactorwatch monitor"
-SEAL = Seal(MAGIC, 8, "state of a monitor")
+SEAL = Seal(MAGIC, 9, "state of a monitor")
 
 NOT_LEARNED_BY = frozenset({"process", "state_file", "state_every_s", "health_period_s", "diagnose_training"})
 """Settings that do not change what was learned; the model is identified by its equations, not by its file."""

@@ -2,7 +2,7 @@
 
 The covariance form of the textbooks fails in service: without excitation its forgetting divides the covariance by
 `forgetting` at every row until it overflows, and rounding makes it indefinite. Here the information matrix A is kept
-as factors R' D R (`rls_update`). Three things follow.
+as factors R' D R (below). Three things follow.
 
 *Nothing need be assumed.* D = 0 is a valid start: no prior, no "large P(0)". Without forgetting the result is the QR
 solution of the batch problem, and as accurate. A column that is dependent on those before it keeps the parameter 0
@@ -31,6 +31,23 @@ remains there, the parameters stay constant, and the first exciting rows identif
 white noise of variance s2 gives cov(theta) = s2 P W2/W, and the weighted sum of squares, which grows by
 residual^2 (1 - leverage) a row, has the expectation s2 (W - n W2/W). Without forgetting these are the familiar
 s2 P and N - n.
+
+*The update of a row* (`update_row`) brings it into the information matrix
+
+    A = sum of forgetting^age * phi phi' = R' D R,     R unit upper triangular, D diagonal.
+
+A row enters by square-root-free Givens rotations (Gentleman, J. Inst. Maths Applics 12 (1973) 329; in the
+form of Miller's algorithm AS 274, Applied Statistics 41 (1992) 458). For each pivot i, with the row x of weight w:
+
+    d' = d_i + w x_i^2     gain = w x_i / d'     w <- w d_i / d'     d_i <- d'
+    x_j <- x_j - x_i r_ij    then    r_ij <- r_ij + gain x_j         (j > i, and in the same way the output and z_i)
+
+The remaining weight at the end is 1 - phi' A^-1 phi, and the parameters solve R theta = z.
+
+Without forgetting, r_ij and z_i are sums of ever more, ever smaller terms, and rounding them is what costs accuracy:
+at condition 1e8 the parameters lose a digit or two against LAPACK. A second number therefore holds what the first one
+rounds away, found by Knuth's exact sum (The Art of Computer Programming, vol. 2, section 4.2.2, theorem B). With
+forgetting, rounding is forgotten too.
 """
 
 import math
@@ -41,12 +58,167 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.arrays import Array
+from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
-from reactorwatch.identification import rls_update
-from reactorwatch.identification.rls_update import LARGEST_VALUE
 from reactorwatch.stored_state import Memory
 
 DEFAULT_COVARIANCE_LIMIT = 1e6
+
+LARGEST_VALUE = 1e30
+"""Regressors and outputs at or beyond this are refused."""
+
+# Where nothing is known beforehand, a pivot below this share of its column's sum of squares is rounding, not
+# information: a condition beyond 1e13. Where something is, every pivot carries on what is known of those before it.
+RANK_SHARE = 1e-26
+# Nor is one below this, whatever its column; with LARGEST_VALUE it keeps every product finite.
+_LEAST_PIVOT = 1e-60
+
+# The numbers of an estimator of n parameters: n each of theta, z (the rotated outputs), d (the diagonal), q (the
+# columns' sums of squares) and what z rounds away; then SQUARES to ROWS; then R's n(n-1)/2 entries above the diagonal,
+# by rows, and what they round away.
+SQUARES, WEIGHT, WEIGHT2, TURN, ROWS = range(5)
+SUMS = 5
+
+
+def state_size(n: int) -> int:
+    """Number of numbers of an estimator with n parameters."""
+    return 5 * n + SUMS + n * (n - 1)
+
+
+@jit
+def rotate(
+    numbers: NDArray[np.float64],
+    row: NDArray[np.float64],
+    weight: float,
+    output: float,
+    first: int,
+    exact: bool,
+    rank_share: float,
+) -> float:
+    """Bring a row into R, D and z; returns the weight that remains.
+
+    Args:
+        numbers: numbers of the estimator, shape (state_size(n),).
+        row: regressor, shape (n,), which is rotated in place.
+        weight: weight of the row.
+        output: output of the row.
+        first: the regressor is zero before this index.
+        exact: True to compensate the rounding of the sums.
+        rank_share: a pivot that would stay below this share of its column's sum of squares is passed over.
+    """
+    n = row.size
+    fine = n * (n - 1) // 2
+    entry = 5 * n + SUMS + first * (n - 1) - first * (first - 1) // 2
+    for i in range(first, n):
+        value, old = row[i], numbers[2 * n + i]
+        weighted = weight * value
+        new = old + weighted * value
+        informs = new > rank_share * numbers[3 * n + i] + _LEAST_PIVOT
+        gain = weighted / new if informs else 0.0
+        target, small = numbers[n + i], numbers[4 * n + i]
+        rest = output - value * target - value * small
+        if informs:
+            weight *= old / new
+            numbers[2 * n + i] = new
+            output = rest
+        step = gain * rest + small
+        total = target + step
+        added = total - target
+        numbers[n + i] = total
+        numbers[4 * n + i] = (target - (total - added)) + (step - added)
+        for j in range(i + 1, n):
+            above = numbers[entry]
+            if exact:
+                small = numbers[entry + fine]
+                row[j] = row[j] - value * above - value * small
+                step = gain * row[j] + small
+                total = above + step
+                added = total - above
+                numbers[entry] = total
+                numbers[entry + fine] = (above - (total - added)) + (step - added)
+            else:
+                row[j] -= value * above
+                numbers[entry] = above + gain * row[j]
+            entry += 1
+    return weight
+
+
+@jit
+def solve(numbers: NDArray[np.float64], n: int) -> None:
+    """Set theta to the solution of R theta = z."""
+    entry = 5 * n + SUMS + n * (n - 1) // 2
+    for i in range(n - 1, -1, -1):
+        numbers[i] = numbers[n + i] + numbers[4 * n + i]
+        entry -= n - 1 - i
+        for j in range(i + 1, n):
+            numbers[i] -= numbers[entry + j - i - 1] * numbers[j]
+
+
+@jit
+def is_acceptable(regressor: NDArray[np.float64], output: float) -> bool:
+    """True if every value is a number smaller in magnitude than LARGEST_VALUE."""
+    fine = abs(output) < LARGEST_VALUE
+    for i in range(regressor.size):
+        fine = fine and abs(regressor[i]) < LARGEST_VALUE
+    return fine
+
+
+@jit
+def update_row(
+    numbers: NDArray[np.float64],
+    work: NDArray[np.float64],
+    regressor: NDArray[np.float64],
+    output: float,
+    forgetting: float,
+    renewal: float,
+    rank_share: float,
+) -> tuple[float, float, float, float]:
+    """Predict a row, then forget, rotate, solve, and renew the floor of one coordinate.
+
+    Args:
+        numbers: numbers of the estimator, shape (state_size(n),).
+        work: work space, shape (n,).
+        regressor: shape (n,).
+        output: the measured output.
+        forgetting: weight of a row relative to its successor.
+        renewal: weight of the floor row that one coordinate a row gets, in turn; 0 without forgetting.
+        rank_share: RANK_SHARE where nothing was known at the start, else 0.
+
+    Returns:
+        Prediction and residual before the update, the standard deviation of such a residual and the leverage; four NaN
+        if the row is not acceptable: then nothing changes.
+    """
+    if not is_acceptable(regressor, output):
+        return np.nan, np.nan, np.nan, np.nan
+    n = regressor.size
+    sums = numbers[5 * n : 5 * n + SUMS]
+    prediction = 0.0
+    for i in range(n):
+        value = regressor[i]
+        work[i] = value
+        prediction += value * numbers[i]
+        numbers[2 * n + i] *= forgetting
+        numbers[3 * n + i] += value * value
+    residual = output - prediction
+    # With forgetting, rounding is forgotten too.
+    left = rotate(numbers, work, 1.0, output, 0, forgetting == 1.0, rank_share)
+    solve(numbers, n)
+    squares, weight, weight2 = sums[SQUARES], sums[WEIGHT], sums[WEIGHT2]
+    share = weight2 / weight if weight > 0.0 else 1.0
+    free = weight - n * share
+    variance = squares / free if free > 0.0 else np.inf
+    residual_sd = np.sqrt(variance * (1.0 + share * (1.0 - left) / left)) if left > 0.0 else np.inf
+    sums[SQUARES] = forgetting * squares + residual * residual * left
+    sums[WEIGHT] = forgetting * weight + 1.0
+    sums[WEIGHT2] = forgetting * forgetting * weight2 + 1.0
+    sums[ROWS] += 1.0
+    if renewal > 0.0:
+        turn = int(sums[TURN])
+        work[:] = 0.0
+        work[turn] = 1.0
+        rotate(numbers, work, renewal, numbers[turn], turn, False, 0.0)
+        sums[TURN] = float(turn + 1 if turn + 1 < n else 0)
+    return prediction, residual, residual_sd, 1.0 - left
 
 
 class RlsMemory(Memory):
@@ -56,7 +228,7 @@ class RlsMemory(Memory):
         parameters: number of parameters.
         forgetting: weight of a row relative to its successor.
         covariance_limit: bound on the eigenvalues of P.
-        numbers: shape (state_size(parameters),), laid out as in `rls_update`.
+        numbers: shape (state_size(parameters),), laid out as above.
     """
 
     parameters: int
@@ -115,7 +287,7 @@ class RecursiveLeastSquares:
             covariance_limit = math.inf if forgetting == 1.0 else DEFAULT_COVARIANCE_LIMIT
         if not covariance_limit > 1.0 / LARGEST_VALUE:
             raise InputError(f"covariance_limit must be above {1.0 / LARGEST_VALUE}, got {covariance_limit}")
-        numbers = np.zeros(rls_update.state_size(parameters))
+        numbers = np.zeros(state_size(parameters))
         self._use(RlsMemory(parameters, float(forgetting), float(covariance_limit), numbers))
         start = 1.0 / (covariance_limit * forgetting ** (parameters - 1))
         self._numbers[2 * parameters : 3 * parameters] = start
@@ -132,12 +304,12 @@ class RecursiveLeastSquares:
         return estimator
 
     def _use(self, memory: RlsMemory) -> None:
-        size = rls_update.state_size(memory.parameters)
+        size = state_size(memory.parameters)
         if memory.numbers.shape != (size,):
             raise ValueError(f"{memory.parameters} parameters must have {size} numbers, got {memory.numbers.size}")
         self.memory, self._parameters = memory, memory.parameters
         self._covariance_limit = memory.covariance_limit
-        self._rank_share = rls_update.RANK_SHARE if math.isinf(self._covariance_limit) else 0.0
+        self._rank_share = RANK_SHARE if math.isinf(self._covariance_limit) else 0.0
         self._set_forgetting(memory.forgetting)
         self._numbers, self._work = memory.numbers, np.zeros(memory.parameters)
 
@@ -159,7 +331,7 @@ class RecursiveLeastSquares:
         row = np.ascontiguousarray(regressor, dtype=np.float64)
         if row.ndim != 1 or row.size != self._parameters:
             raise ValueError(f"regressor must have shape ({self._parameters},), got {row.shape}")
-        result = rls_update.update(
+        result = update_row(
             self._numbers, self._work, row, float(output), self._forgetting, self._renewal, self._rank_share
         )
         if result[0] != result[0]:
@@ -219,7 +391,7 @@ class RecursiveLeastSquares:
     @property
     def rows(self) -> int:
         """Number of rows learned from."""
-        return int(self._sums()[rls_update.ROWS])
+        return int(self._sums()[ROWS])
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -246,8 +418,8 @@ class RecursiveLeastSquares:
     def noise_variance(self) -> float:
         """Variance of the residuals; inf until there are more rows than parameters."""
         sums = self._sums()
-        free = sums[rls_update.WEIGHT] - self._parameters * self._weight_share()
-        return float(sums[rls_update.SQUARES] / free) if free > 0.0 else math.inf
+        free = sums[WEIGHT] - self._parameters * self._weight_share()
+        return float(sums[SQUARES] / free) if free > 0.0 else math.inf
 
     @property
     def parameter_covariance(self) -> NDArray[np.float64]:
@@ -293,7 +465,7 @@ class RecursiveLeastSquares:
 
     def _weight_share(self) -> float:
         sums = self._sums()
-        return float(sums[rls_update.WEIGHT2] / sums[rls_update.WEIGHT]) if sums[rls_update.WEIGHT] > 0.0 else 1.0
+        return float(sums[WEIGHT2] / sums[WEIGHT]) if sums[WEIGHT] > 0.0 else 1.0
 
 
 def _describe_invalid(regressor: NDArray[np.float64], output: float) -> str:
