@@ -15,12 +15,12 @@ from typing import Any
 import msgspec
 import structlog
 
-from diagnosis_node.trigger import DiagnosisConfig, DiagnosisRequest, DiagnosisTrigger
+from diagnosis_node.trigger import DiagnosisConfig, DiagnosisTrigger
 from reactorwatch.contract import keys
+from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import make_folder
-from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, stop_on_signals
 from reactorwatch.runtime.node_main import main
 from reactorwatch.runtime.start import instance_name, join
@@ -30,9 +30,7 @@ from recorder.files.writer import RecordingWriter
 log = structlog.get_logger()
 
 NODE = "diagnosis"
-RECORDING = "record.mcap"
-"""Name of the diagnosed recording in the folder of its report."""
-
+RECORDING = "record.mcap"  # the diagnosed recording, in the folder of its report
 DRAIN_TIMEOUT_S = 0.5
 
 
@@ -54,9 +52,9 @@ class DiagnosisRunner:
         """True while a diagnosis runs."""
         return self._thread is not None and self._thread.is_alive()
 
-    def start(self, request: DiagnosisRequest) -> None:
+    def start(self, alarm: Alarm, samples: list[RecordedMessage]) -> None:
         """Start a diagnosis; see `DiagnosisTrigger`."""
-        self._thread = threading.Thread(target=self._diagnose, args=(request,), name="diagnosis")
+        self._thread = threading.Thread(target=self._diagnose, args=(alarm, samples), name="diagnosis")
         self._thread.start()
 
     def wait(self) -> None:
@@ -82,47 +80,39 @@ class DiagnosisRunner:
         output, errors = self._process.communicate()
         return self._process.returncode, output, errors or "it was stopped"
 
-    def _diagnose(self, request: DiagnosisRequest) -> None:
+    def _diagnose(self, alarm: Alarm, samples: list[RecordedMessage]) -> None:
         try:
-            folder = self._write_record(request)
-            code, output, errors = self.execute([*self._command(folder), "--json"])
+            folder = self._write_record(alarm, samples)
+            command = ["diagnose", str(folder / RECORDING), "--plant", self._config.plant, "--out", str(folder)]
+            if self._config.process is not None:
+                command += ["--process", self._config.process]
+            if self._config.tolerance:
+                tolerances = (f"{name}={value!r}" for name, value in self._config.tolerance.items())
+                command += ["--tolerance", ",".join(tolerances)]
+            code, output, errors = self.execute([*command, "--json"])
             if code != 0:
                 why = (errors.strip().splitlines() or ["no reason was given"])[-1]
-                log.warning("not diagnosed", alarm=request.alarm, why=why, folder=str(folder))
+                log.warning("not diagnosed", alarm=alarm.alarm, why=why, folder=str(folder))
                 return
             result = msgspec.json.decode(output)
-            log.info("diagnosed", alarm=request.alarm, **_summary(result), report=str(folder / "report.html"))
+            log.info("diagnosed", alarm=alarm.alarm, **_summary(result), report=str(folder / "report.html"))
         except (InputError, OSError, msgspec.DecodeError) as error:
-            log.warning("not diagnosed", alarm=request.alarm, why=str(error))
+            log.warning("not diagnosed", alarm=alarm.alarm, why=str(error))
 
-    def _write_record(self, request: DiagnosisRequest) -> Path:
+    def _write_record(self, alarm: Alarm, samples: list[RecordedMessage]) -> Path:
         """Write the samples to a new folder, which is returned."""
-        name = f"{self._config.plant}-{datetime.fromtimestamp(request.raised_ns // 10**9, UTC):%Y%m%dT%H%M%SZ}"
+        name = f"{self._config.plant}-{datetime.fromtimestamp(alarm.raised_ns // 10**9, UTC):%Y%m%dT%H%M%SZ}"
         taken = sum(path.name == name or path.name.startswith(f"{name}-") for path in self._out.glob(f"{name}*"))
         folder = make_folder(self._out / (f"{name}-{taken + 1}" if taken else name), may_exist=False)
-        metadata = {"plant": self._config.plant, "alarm": request.alarm, "raised_ns": str(request.raised_ns)}
-        with atomic_write(folder / RECORDING) as temporary, RecordingWriter(temporary, metadata) as writer:
-            for time_ns, item in request.samples:
-                writer.write(
-                    RecordedMessage(item.key, item.payload, item.encoding, item.received_ns or time_ns, time_ns)
-                )
+        metadata = {"plant": self._config.plant, "alarm": alarm.alarm, "raised_ns": str(alarm.raised_ns)}
+        with RecordingWriter(folder / RECORDING, metadata) as writer:
+            for sample in samples:
+                writer.write(sample)
         return folder
 
-    def _command(self, folder: Path) -> list[str]:
-        command = ["diagnose", str(folder / RECORDING), "--plant", self._config.plant, "--out", str(folder)]
-        if self._config.process is not None:
-            command += ["--process", self._config.process]
-        if self._config.tolerance:
-            command += ["--tolerance", ",".join(f"{name}={value!r}" for name, value in self._config.tolerance.items())]
-        return command
 
-
-def run(config: DiagnosisConfig, bus_config: BusConfig) -> None:
-    """Diagnose after alarms until SIGINT or SIGTERM.
-
-    Raises:
-        InputError: the settings of the bus are invalid, or no folder is set.
-    """
+def run(config: DiagnosisConfig, bus_config: BusConfig, _metrics_config: MetricsConfig) -> None:
+    """Diagnose after alarms until SIGINT or SIGTERM."""
     if config.out is None:
         raise InputError("settings [diagnosis]: out must be a folder for the reports")
     diagnoses = DiagnosisRunner(config)
@@ -140,7 +130,7 @@ def run(config: DiagnosisConfig, bus_config: BusConfig) -> None:
         finally:
             diagnoses.end()
             if node.waiting is not None:
-                log.warning("not diagnosed", alarm=node.waiting[0], why="stopped before enough data came")
+                log.warning("not diagnosed", alarm=node.waiting.alarm, why="stopped before enough data came")
 
 
 def _summary(result: dict[str, Any]) -> dict[str, Any]:
@@ -155,11 +145,4 @@ def _summary(result: dict[str, Any]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(
-        main(
-            "diagnosis_node",
-            "diagnosis",
-            DiagnosisConfig,
-            lambda config, bus_config, _metrics: run(config, bus_config),
-        )
-    )
+    sys.exit(main("diagnosis_node", "diagnosis", DiagnosisConfig, run))

@@ -8,34 +8,24 @@ If the plant stops or no data arrive while a diagnosis is pending, it starts wit
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from math import inf
-from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, ClassVar
 
 import msgspec
 
+from reactorwatch.contract.alarm_states import CODES, OUT_OF_SIGHT
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS
-from reactorwatch.runtime.setting_rules import check_bounds
+from reactorwatch.runtime.setting_rules import MODEL_IS_PROCESS, OlderKeys, check_bounds
+from recorder import RecordedMessage
 
-HIDDEN_STATES = (
-    AlarmState.ALARM_STATE_SHELVED,
-    AlarmState.ALARM_STATE_SUPPRESSED_BY_DESIGN,
-    AlarmState.ALARM_STATE_OUT_OF_SERVICE,
-)
-"""States of alarms that trigger no diagnosis."""
-
-NO_DATA = "silence/"
-"""Start of the names of alarms about missing data, which no model explains."""
-
-MAX_SAMPLES = 300_000
-"""Largest number of stored samples, at any sampling rate."""
-
-TIMEOUT_NS = 60 * 10**9
-"""Time without a sample after which the plant is considered stopped."""
+HIDDEN_STATES = frozenset(CODES[state] for state in OUT_OF_SIGHT)  # alarms that trigger no diagnosis
+NO_DATA = "silence/"  # start of the names of alarms about missing data, which no model explains
+MAX_SAMPLES = 300_000  # at any sampling rate
+TIMEOUT_NS = 60 * 10**9  # time without a sample after which the plant is considered stopped
 
 
 class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -60,10 +50,7 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     process: str | None = None
     tolerance: dict[str, float] = {}
 
-    older_keys: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = MappingProxyType(
-        {"model": ("process", lambda name: name)}
-    )
-    """Older names of keys, each with the present one and the function from a value of the older to one of it."""
+    older_keys: ClassVar[OlderKeys] = MODEL_IS_PROCESS
 
     def __post_init__(self) -> None:
         check_plant(self.plant)
@@ -78,40 +65,29 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             )
 
 
-class DiagnosisRequest(NamedTuple):
-    """Request for a diagnosis.
-
-    Attributes:
-        alarm: name of the alarm.
-        raised_ns: time at which it was raised.
-        samples: (sample time, published message) in the order of receipt.
-    """
-
-    alarm: str
-    raised_ns: int
-    samples: tuple[tuple[int, Encoded], ...]
-
-
 class DiagnosisTrigger:
     """Starts a diagnosis after an alarm.
 
     Args:
         config: settings.
-        diagnose: starts a diagnosis, without waiting for its end.
+        diagnose: starts a diagnosis after an alarm, on samples in the order of receipt, without waiting for its end.
         busy: returns True while a diagnosis runs, which delays the next one.
 
     Attributes:
-        waiting: alarm of the pending diagnosis and the time when it was raised; None if there is none.
+        waiting: alarm of the pending diagnosis; None if there is none.
     """
 
     finished = False
 
     def __init__(
-        self, config: DiagnosisConfig, diagnose: Callable[[DiagnosisRequest], None], busy: Callable[[], bool]
+        self,
+        config: DiagnosisConfig,
+        diagnose: Callable[[Alarm, list[RecordedMessage]], None],
+        busy: Callable[[], bool],
     ) -> None:
         self._config, self._diagnose, self._busy = config, diagnose, busy
-        self._samples: deque[tuple[int, Encoded]] = deque(maxlen=MAX_SAMPLES)
-        self.waiting: tuple[str, int] | None = None
+        self._samples: deque[RecordedMessage] = deque(maxlen=MAX_SAMPLES)
+        self.waiting: Alarm | None = None
         self._suppressed_until_ns = -NEVER_NS
         self._timeout_ns = NEVER_NS
 
@@ -125,7 +101,10 @@ class DiagnosisTrigger:
             self._timeout_ns = now_ns + TIMEOUT_NS
             self._keep(content.time_ns, message)
         elif isinstance(content, Alarm):
-            self._on_alarm(content)
+            is_raised = content.event == "raised" and content.state not in HIDDEN_STATES
+            is_new = self.waiting is None and content.raised_ns >= self._suppressed_until_ns
+            if is_raised and is_new and not content.alarm.startswith(NO_DATA):
+                self.waiting = content
         return []
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
@@ -135,8 +114,8 @@ class DiagnosisTrigger:
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Start a pending diagnosis if no data arrive."""
         if self.waiting is not None and now_ns >= self._timeout_ns:
-            self._timeout_ns = now_ns + TIMEOUT_NS
-            self._start(self.waiting)
+            self._timeout_ns = now_ns + TIMEOUT_NS  # tried again then, if another diagnosis runs
+            self._start()
         return []
 
     def next_tick_ns(self) -> int:
@@ -147,27 +126,21 @@ class DiagnosisTrigger:
         """Publish nothing."""
         return []
 
-    def _on_alarm(self, alarm: Alarm) -> None:
-        is_raised = alarm.event == "raised" and alarm.state not in HIDDEN_STATES
-        is_new = self.waiting is None and alarm.raised_ns >= self._suppressed_until_ns
-        if is_raised and is_new and not alarm.alarm.startswith(NO_DATA):
-            self.waiting = (alarm.alarm, alarm.raised_ns)
-
     def _keep(self, time_ns: int, message: Encoded) -> None:
         """Store a sample and drop those before the window; all are dropped if the plant's time steps back before it."""
-        window_ns = int(self._config.window_min * MINUTE_NS)
-        if self._samples and time_ns < self._samples[0][0]:
+        if self._samples and time_ns < self._samples[0].publish_time_ns:
             self._samples.clear()
             self.waiting, self._suppressed_until_ns = None, -NEVER_NS
-        self._samples.append((time_ns, message))
-        while self._samples[0][0] < time_ns - window_ns:
+        key, payload, encoding, received_ns = message
+        self._samples.append(RecordedMessage(key, payload, encoding, received_ns or time_ns, time_ns))
+        while self._samples[0].publish_time_ns < time_ns - int(self._config.window_min * MINUTE_NS):
             self._samples.popleft()
-        if self.waiting is not None and time_ns >= self.waiting[1] + self._config.after_min * MINUTE_NS:
-            self._start(self.waiting)
+        if self.waiting is not None and time_ns >= self.waiting.raised_ns + self._config.after_min * MINUTE_NS:
+            self._start()
 
-    def _start(self, waiting: tuple[str, int]) -> None:
-        if self._busy() or not self._samples:
+    def _start(self) -> None:
+        if self.waiting is None or self._busy() or not self._samples:
             return
-        self.waiting = None
-        self._suppressed_until_ns = self._samples[-1][0] + int(self._config.apart_min * MINUTE_NS)
-        self._diagnose(DiagnosisRequest(*waiting, tuple(self._samples)))
+        alarm, self.waiting = self.waiting, None
+        self._suppressed_until_ns = self._samples[-1].publish_time_ns + int(self._config.apart_min * MINUTE_NS)
+        self._diagnose(alarm, list(self._samples))

@@ -1,26 +1,25 @@
 """The plant's settings, and those that its process completes: programmes, controllers, faults and actuators."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
-from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 from msgspec.structs import replace as with_changes
 
-from plant_node.instruments import Actuator
+from plant_node.instruments import Actuator, Sensor
 from plant_node.scenario import Settings, check_levels, scenario_settings, split_scenarios
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.process import Process, Signal
-from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.errors import InputError, describe_unknown, prefix_errors
 from reactorwatch.process import OPERATIONS
 from reactorwatch.process.controller import ContinuousController, Controller
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.process.library.cstr.controllers import LevelControl, TemperatureControl
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.operation import InputLevels
-from reactorwatch.runtime.setting_rules import check_bounds
+from reactorwatch.runtime.setting_rules import MODEL_IS_PROCESS, OlderKeys, check_bounds
 from reactorwatch.units import conversion
 
 
@@ -67,10 +66,7 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     presets: ClassVar[dict[str, Mapping[str, Any]]] = {
         preset.name: preset.settings for operation in OPERATIONS.values() for preset in operation.presets
     }
-    older_keys: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = MappingProxyType(
-        {"model": ("process", lambda name: name)}
-    )
-    """Older names of keys, each with the present one and the function from a value of the older to one of it."""
+    older_keys: ClassVar[OlderKeys] = MODEL_IS_PROCESS
 
     name: str = DEFAULT_PLANT
     period_min: Annotated[float, msgspec.Meta(ge=1e-4, le=60.0)] = 0.1
@@ -120,9 +116,6 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return None if self.duration_min is None else max(round(self.duration_min / self.period_min), 1)
 
 
-Bounds = tuple[float, float]
-
-
 @dataclass(frozen=True)
 class ProcessSettings:
     """Settings of the plant as its process has them, in the units of the equations.
@@ -133,8 +126,7 @@ class ProcessSettings:
         equations: the model, with the controllers that act in continuous time.
         faults: faults that are in the plant from the start.
         actuators: actuator of each input, by name.
-        noise_sd: standard deviation of each sensor's noise, by signal.
-        resolution: resolution of each sensor, by signal; 0: continuous.
+        sensors: sensor of each signal, by name, those of the inputs first.
     """
 
     scenarios: Mapping[str, Settings]
@@ -142,28 +134,23 @@ class ProcessSettings:
     equations: ProcessModel
     faults: tuple[FaultSpecification, ...]
     actuators: Mapping[str, Actuator]
-    noise_sd: Mapping[str, float]
-    resolution: Mapping[str, float]
+    sensors: Mapping[str, Sensor]
 
     def complete(self, config: PlantConfig) -> PlantConfig:
         """Copy of settings in which what the process decides is written out."""
         return with_changes(
             config,
-            noise_sd=dict(self.noise_sd),
-            resolution=dict(self.resolution),
+            noise_sd={name: item.noise_sd for name, item in self.sensors.items()},
+            resolution={name: item.resolution for name, item in self.sensors.items()},
             limits={name: (item.lower, item.upper) for name, item in self.actuators.items()},
             valve_limits_l_min=None,
         )
 
 
 def fit_settings(config: PlantConfig, process: Process) -> ProcessSettings:
-    """Complete settings by a process.
-
-    Raises:
-        InputError: a setting names something that the process lacks, or breaks a rule; or it has no equations.
-    """
+    """Complete settings by a process."""
     model = process.require_model()
-    try:
+    with prefix_errors("settings [plant]"):
         controllers, model = _controllers(config, process, model)
         bounds = _bounds(process, model)
         return ProcessSettings(
@@ -172,21 +159,18 @@ def fit_settings(config: PlantConfig, process: Process) -> ProcessSettings:
             model,
             tuple(parse_fault(text, process.faults).with_defaults(0.0, config.duration_min) for text in config.faults),
             _actuators(config, model, bounds),
-            _by_signal("noise_sd", config.noise_sd, process.operation.noise_sd, model),
-            _by_signal("resolution", config.resolution, resolutions(process), model),
+            _sensors(config, process, model),
         )
-    except (InputError, msgspec.ValidationError) as error:
-        raise InputError(f"settings [plant]: {error}") from error
 
 
 def to_model_unit(signal: Signal, model: ProcessModel) -> tuple[float, float]:
     """Scale and offset from the unit of a signal to that of the equations."""
     unit = model.units[signal.name]
-    return (1.0, 0.0) if signal.unit in ("", unit) else conversion(signal.unit, unit, f"signal {signal.name!r}")
+    return conversion(signal.unit or unit, unit, f"signal {signal.name!r}")
 
 
 def _scenarios(
-    config: PlantConfig, process: Process, model: ProcessModel, bounds: Mapping[str, Bounds]
+    config: PlantConfig, process: Process, model: ProcessModel, bounds: Mapping[str, tuple[float, float]]
 ) -> dict[str, Settings]:
     given = split_scenarios(config.scenario, model.input_names)
     found = {}
@@ -209,11 +193,8 @@ def _controllers(
         if isinstance(item, Controller):
             found[item.input] = item
         elif isinstance(item, ContinuousController):
-            try:
+            with prefix_errors("level_control" if item is config.level_control else type(item).__name__, ValueError):
                 model = item.extend(model)
-            except ValueError as error:
-                name = "level_control" if item is config.level_control else type(item).__name__
-                raise InputError(f"{name}: {error}") from error
         else:
             raise InputError(
                 f"process {process.name!r}: a controller must be a Controller, or have extend(model), "
@@ -223,14 +204,12 @@ def _controllers(
         if name not in model.input_names:
             raise InputError(f"controllers: {describe_unknown('input', name, model.input_names)}")
         known: Mapping[str, Any] = {} if name not in found else msgspec.structs.asdict(found[name])
-        try:
+        with prefix_errors(f"controllers: {name}", ValueError):
             found[name] = msgspec.convert({**known, **table, "input": name}, Controller)
-        except msgspec.ValidationError as error:
-            raise InputError(f"controllers: {name}: {error}") from error
     return found, model
 
 
-def _bounds(process: Process, model: ProcessModel) -> dict[str, Bounds]:
+def _bounds(process: Process, model: ProcessModel) -> dict[str, tuple[float, float]]:
     """Bounds of each input: of its signal, else of the equations."""
     signals = {signal.name: signal for signal in process.signals}
     found = {}
@@ -244,7 +223,9 @@ def _bounds(process: Process, model: ProcessModel) -> dict[str, Bounds]:
     return found
 
 
-def _actuators(config: PlantConfig, model: ProcessModel, bounds: Mapping[str, Bounds]) -> dict[str, Actuator]:
+def _actuators(
+    config: PlantConfig, model: ProcessModel, bounds: Mapping[str, tuple[float, float]]
+) -> dict[str, Actuator]:
     limits = dict(config.limits)
     if config.valve_limits_l_min is not None:
         if len(model.inputs) != 1:
@@ -274,10 +255,10 @@ def resolutions(process: Process) -> dict[str, float]:
     }
 
 
-def _by_signal(
-    name: str, given: Mapping[str, float], defaults: Mapping[str, float], model: ProcessModel
-) -> dict[str, float]:
-    for signal in given:
-        if signal not in model.units:
-            raise InputError(f"{name}: {describe_unknown('signal', signal, tuple(model.units))}")
-    return {signal: given.get(signal, defaults.get(signal, 0.0)) for signal in model.units}
+def _sensors(config: PlantConfig, process: Process, model: ProcessModel) -> dict[str, Sensor]:
+    for setting, given in (("noise_sd", config.noise_sd), ("resolution", config.resolution)):
+        for name in given:
+            if name not in model.units:
+                raise InputError(f"{setting}: {describe_unknown('signal', name, model.units)}")
+    noise_sd, resolution = {**process.operation.noise_sd, **config.noise_sd}, resolutions(process) | config.resolution
+    return {name: Sensor(name, noise_sd.get(name, 0.0), resolution.get(name, 0.0), config.seed) for name in model.units}

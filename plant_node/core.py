@@ -18,12 +18,12 @@ from typing import Literal
 import numpy as np
 
 from plant_node.config import PlantConfig, ProcessSettings, to_model_unit
-from plant_node.instruments import ControlLoop, ProcessNoise, Sensor, check_controller, check_set_point, close_loops
+from plant_node.instruments import ControlLoop, ProcessNoise, check_controller, check_set_point, close_loops
 from plant_node.scenario import Scenario, seed_of_input
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.description.process import Process
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, prefix_errors
 from reactorwatch.process.effect import TIMING
 from reactorwatch.process.fault import FaultSpecification
 from reactorwatch.process.integrate import SimulationError, Stepper
@@ -104,9 +104,7 @@ class Plant:
         self._seeds = [seed_of_input(config.seed, index) for index in range(len(model.inputs))]
         self._actuators = settings.actuators
         self._manual: dict[str, float] = {}  # of inputs without a controller
-        self._sensors = [
-            Sensor(name, settings.noise_sd[name], settings.resolution[name], config.seed) for name in model.units
-        ]
+        self._sensors = list(settings.sensors.values())
         for name in config.process_noise_sd:
             if name not in model.state_names:
                 valid = ", ".join(model.state_names)
@@ -326,10 +324,8 @@ class Plant:
         """The model with these faults; the physical ones come first, as timing faults shift their times."""
         model = self._base
         for fault in sorted(faults, key=lambda item: item.specification.effect.location == TIMING):
-            try:
+            with prefix_errors(f"fault {str(fault.specification)!r}", ValueError):
                 model = fault.specification.extend(model)
-            except ValueError as error:
-                raise InputError(f"fault {str(fault.specification)!r}: {error}") from error
         return model
 
     def _use(self, model: ProcessModel) -> None:

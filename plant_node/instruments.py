@@ -69,13 +69,7 @@ class Sensor:
     seed: int
 
     def reading(self, value: float, row: int, beyond: float = 0.0) -> float:
-        """Reading in a row of the run.
-
-        Args:
-            value: true value.
-            row: index of the row, from 0.
-            beyond: variance of the noise beyond the sensor's own.
-        """
+        """Reading of a value in a row of the run; `beyond` is the variance of the noise beyond the sensor's own."""
         if self.noise_sd or beyond:
             sd = hypot(self.noise_sd, sqrt(beyond)) if beyond else self.noise_sd
             value += sd * standard_normal(self.seed, f"sensor {self.signal}", row)
@@ -144,16 +138,7 @@ class ControlLoop:
 
 
 def check_controller(control: Controller, model: ProcessModel, actuator: Actuator | None) -> None:
-    """Check a controller against a model and its actuator.
-
-    Args:
-        control: the controller.
-        model: the process.
-        actuator: actuator of its input; None: there is no such input.
-
-    Raises:
-        InputError: the model has no such input or output, or a set point or the base is out of range.
-    """
+    """Check a controller against a model and the actuator of its input, None if the model has no such input."""
     if actuator is None or control.output not in model.output_names:
         needed = ("input", control.input) if actuator is None else ("output", control.output)
         got = model.input_names if actuator is None else model.output_names
@@ -170,11 +155,7 @@ def check_controller(control: Controller, model: ProcessModel, actuator: Actuato
 
 
 def check_set_point(model: ProcessModel, output: str, value: float) -> None:
-    """Check the set point of an output.
-
-    Raises:
-        InputError: it is no number, or out of the bounds of the state of that name.
-    """
+    """Check that the set point of an output is a number, within the bounds of the state of that name."""
     state = next((item for item in model.states if item.name == output), None)
     if state is None and not isfinite(value):
         raise InputError(f"set point of {output} must be a finite number, got {value:g}")
@@ -188,12 +169,8 @@ def close_loops(model: ProcessModel, loops: tuple[ControlLoop, ...], *, integral
     """Model of the closed loops in continuous time, at the set points of plant time 0.
 
     It has the steady state of the sampled loops, which is its purpose, but other transients. A controlled input is its
-    command without feedback: base and dither.
-
-    Args:
-        model: the process.
-        loops: the loops.
-        integral: true to add the integral parts as the last states, in the order of the loops that have them.
+    command without feedback: base and dither. `integral` adds the integral parts as the last states, in the order of
+    the loops that have them.
     """
     closed = model
     for loop in loops:
@@ -206,10 +183,7 @@ def close_loops(model: ProcessModel, loops: tuple[ControlLoop, ...], *, integral
             span = actuator.upper - actuator.lower
             state = variable(f"integral {given.name}", given.unit, (-span, span), given.scale, "integral part")
             command += state.symbol
-            closed = replace(
-                closed,
-                states=(*closed.states, state),
-                rhs=(*closed.rhs, feedback / control.integral_time_min),
-            )
+            rhs = (*closed.rhs, feedback / control.integral_time_min)
+            closed = replace(closed, states=(*closed.states, state), rhs=rhs)
         closed = closed.substitute(given.symbol, ca.fmin(ca.fmax(command, actuator.lower), actuator.upper))
     return closed

@@ -1,10 +1,8 @@
-"""Make a plant from its settings, and simulate its record without a bus; sample records with their known truth."""
+"""Make a plant from its settings, and simulate its record without a bus."""
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import msgspec
 import numpy as np
 from msgspec.structs import replace as with_changes
 
@@ -15,12 +13,8 @@ from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import build_process, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import convert_to_process
-from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.process import MODELS, OPERATIONS, effects_of
 from reactorwatch.process.effect import TIMING
-from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.operation import Example
 from reactorwatch.records.read_table import SignalColumn, read_table
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import read_extended_model
@@ -54,11 +48,7 @@ def plant_from(
 
 
 def load_process(config: PlantConfig) -> tuple[PlantConfig, Process]:
-    """Load the process of the settings; timing effects of an extended model become faults.
-
-    Raises:
-        InputError: as `find_process`.
-    """
+    """Load the process of the settings; timing effects of an extended model become faults."""
     choice = ProcessChoice(config.process)
     if choice.file is None or choice.file.suffix.lower() != ".json":
         return config, choice.load()
@@ -110,41 +100,3 @@ def simulate_record(
     columns = {signal: np.array([row.readings[signal] for row in measured]) for signal in plant.units}
     times = np.array([row.time_min for row in measured])
     return Record(times, columns, f"simulated {config.name}", units=plant.units)
-
-
-EXAMPLES: dict[str, Example] = {
-    name: example for operation in OPERATIONS.values() for name, example in operation.examples.items()
-}
-"""The sample records, by name."""
-
-
-def make_example(name: str, seed: int) -> tuple[Record, dict[str, Any]]:
-    """Simulate a sample record; returns it and its truth, as `FILE.truth.json` has it.
-
-    Args:
-        name: name in `EXAMPLES`.
-        seed: seed of the input and the noise.
-
-    Raises:
-        InputError: there is no such example, or the seed is out of range.
-    """
-    if name not in EXAMPLES:
-        raise InputError(describe_unknown("example", name, EXAMPLES))
-    example = EXAMPLES[name]
-    model = next(item for item in (make() for make in MODELS) if name in OPERATIONS[item.name].examples)
-    config = msgspec.convert({**example.settings, "seed": seed, "faults": example.faults}, PlantConfig)
-    simulated = model if example.with_law is None else example.with_law(model)
-    record = simulate_record(config, example.rows, simulated)
-    faults = [parse_fault(text, effects_of(model)) for text in example.faults]
-    causes = [
-        {
-            "cause": fault.effect.name,
-            "profile": fault.profile.name,
-            "size": fault.values["size"],
-            "unit": fault.effect.unit,
-            "onset_min": fault.values["onset"],
-        }
-        for fault in faults
-    ]
-    truth: dict[str, Any] = {"process": model.name, "seed": seed, "causes": causes}
-    return record, truth if example.law is None else truth | {"law": example.law}

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.errors import InputError, describe_unknown, prefix_errors
 from reactorwatch.process.model import Variable
 from reactorwatch.process.operation import InputLevels
 from reactorwatch.records.record import Record
@@ -178,11 +178,7 @@ class HeldRecord:
 
     @classmethod
     def of(cls, record: Record, item: Variable) -> "HeldRecord":
-        """Take an input from a record.
-
-        Raises:
-            InputError: the record lacks the input, or has gaps or impossible values in it.
-        """
+        """Take an input from a record."""
         name = item.name
         if name not in record.columns or not record.rows:
             raise InputError(f"{record.name}: must have a column {name!r} with at least one row to drive the plant")
@@ -217,11 +213,7 @@ KINDS: dict[str, type[Settings]] = {item.kind: item for item in (RandomSteps, Si
 
 
 def split_scenarios(setting: str | Mapping[str, Any], inputs: Sequence[str]) -> dict[str, str | Mapping[str, Any]]:
-    """Scenario of each input: one for all, as text, or a table by input; without an entry, random steps.
-
-    Raises:
-        InputError: a table for one input of several does not say for which, or names no input.
-    """
+    """Scenario of each input: one for all, as text, or a table by input; without an entry, random steps."""
     if isinstance(setting, str):
         return dict.fromkeys(inputs, setting)
     if len(inputs) == 1 and not set(setting) <= set(inputs):
@@ -235,15 +227,7 @@ def split_scenarios(setting: str | Mapping[str, Any], inputs: Sequence[str]) -> 
 
 
 def scenario_settings(setting: str | Mapping[str, Any], levels: InputLevels) -> Settings:
-    """Parse the scenario of an input.
-
-    Args:
-        setting: a kind, for its defaults; the path of a record; or a table with `kind` and its parameters.
-        levels: levels of the input.
-
-    Raises:
-        InputError: an unknown kind or key, or a value that breaks a rule.
-    """
+    """Parse the scenario of an input: a kind, the path of a record, or a table with `kind` and its parameters."""
     if isinstance(setting, str):
         is_file = "." in setting and setting not in KINDS
         setting = {"kind": FromFile.kind, "path": setting} if is_file else {"kind": setting}
@@ -259,19 +243,12 @@ def scenario_settings(setting: str | Mapping[str, Any], levels: InputLevels) -> 
             raise InputError(f"scenario {kind}: {describe_unknown('key', key, fields)}")
     if kind == FromFile.kind and "path" not in values:
         raise InputError("scenario file: 'path' must say which record drives the plant")
-    try:
-        settings: Settings = msgspec.convert({**levels.defaults(kind), **values}, KINDS[kind])
-    except msgspec.ValidationError as error:
-        raise InputError(f"scenario {kind}: {error}") from error
-    return settings
+    with prefix_errors(f"scenario {kind}", ValueError):
+        return msgspec.convert({**levels.defaults(kind), **values}, KINDS[kind])
 
 
 def check_levels(settings: Settings, item: Variable) -> None:
-    """Check that the levels of a scenario are within the bounds of its input; those of a record are checked later.
-
-    Raises:
-        InputError: they are not.
-    """
+    """Check that the levels of a scenario are within the bounds of its input; those of a record are checked later."""
     extremes: dict[str, float] = {}
     match settings:
         case RandomSteps() | Square():

@@ -3,11 +3,17 @@
 import math
 import re
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
 
 import msgspec
+
+OlderKeys: TypeAlias = Mapping[str, tuple[str, Callable[[Any], Any]]]
+"""Older names of keys, each with the present one and the function from a value of the older to one of it."""
+
+MODEL_IS_PROCESS: OlderKeys = types.MappingProxyType({"model": ("process", lambda name: name)})
+"""The older name of `process`."""
 
 PROTOCOLS = ("tcp", "tls", "udp", "ws")
 """Protocols of an endpoint."""

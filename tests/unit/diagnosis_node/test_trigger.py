@@ -2,22 +2,25 @@
 
 import pytest
 
-from diagnosis_node.trigger import TIMEOUT_NS, DiagnosisConfig, DiagnosisRequest, DiagnosisTrigger
+from diagnosis_node.trigger import TIMEOUT_NS, DiagnosisConfig, DiagnosisTrigger
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Sample
 from reactorwatch.records.record import MINUTE_NS
+from recorder import RecordedMessage
 
 CONFIG = DiagnosisConfig(window_min=50.0, after_min=10.0, apart_min=30.0, out="reports")
 
 
 class Live:
-    """A plant that is sampled once a minute, and what is request for."""
+    """A plant that is sampled once a minute, and the diagnoses that are requested."""
 
     def __init__(self, config: DiagnosisConfig = CONFIG) -> None:
-        self.request: list[DiagnosisRequest] = []
+        self.requests: list[tuple[Alarm, list[RecordedMessage]]] = []
         self.busy = False
-        self.node = DiagnosisTrigger(config, self.request.append, lambda: self.busy)
+        self.node = DiagnosisTrigger(
+            config, lambda alarm, samples: self.requests.append((alarm, samples)), lambda: self.busy
+        )
 
     def samples(self, first_min: int, last_min: int) -> None:
         for minute in range(first_min, last_min + 1):
@@ -31,7 +34,10 @@ class Live:
         self.node.on_message(_encoded("alarm", name, alarm), minute)
 
     def spans(self) -> list[tuple[float, float]]:
-        return [(item.samples[0][0] / MINUTE_NS, item.samples[-1][0] / MINUTE_NS) for item in self.request]
+        return [
+            (samples[0].publish_time_ns / MINUTE_NS, samples[-1].publish_time_ns / MINUTE_NS)
+            for _, samples in self.requests
+        ]
 
 
 def _encoded(kind: str, name: str, message: Sample | Alarm) -> Encoded:
@@ -43,10 +49,11 @@ def test_it_waits_until_there_is_something_to_see_and_takes_the_window() -> None
     live.samples(0, 100)
     live.alarm(100)
     live.samples(101, 109)
-    assert live.request == []
+    assert live.requests == []
     live.samples(110, 111)
     assert live.spans() == [(60.0, 110.0)]
-    assert (live.request[0].alarm, live.request[0].raised_ns) == ("shewhart/T", 100 * MINUTE_NS)
+    ((alarm, _),) = live.requests
+    assert (alarm.alarm, alarm.raised_ns) == ("shewhart/T", 100 * MINUTE_NS)
 
 
 def test_what_comes_soon_after_is_the_same_trouble() -> None:
@@ -59,7 +66,7 @@ def test_what_comes_soon_after_is_the_same_trouble() -> None:
     live.samples(121, 150)
     live.alarm(150, "mewma/all")
     live.samples(151, 170)
-    assert [item.alarm for item in live.request] == ["shewhart/T", "mewma/all"]
+    assert [alarm.alarm for alarm, _ in live.requests] == ["shewhart/T", "mewma/all"]
 
 
 def test_while_one_is_under_way_the_next_waits() -> None:
@@ -68,7 +75,7 @@ def test_while_one_is_under_way_the_next_waits() -> None:
     live.alarm(50)
     live.busy = True
     live.samples(51, 70)
-    assert live.request == []
+    assert live.requests == []
     live.busy = False
     live.samples(71, 71)
     assert live.spans() == [(21.0, 71.0)]
@@ -87,7 +94,7 @@ def test_what_is_no_trouble_of_the_process_is_not_diagnosed(name: str, event: st
     live.samples(0, 50)
     live.alarm(50, name, event, state=state)
     live.samples(51, 100)
-    assert live.request == []
+    assert live.requests == []
 
 
 def test_a_plant_that_ends_is_diagnosed_by_what_there_is() -> None:
@@ -98,7 +105,7 @@ def test_a_plant_that_ends_is_diagnosed_by_what_there_is() -> None:
     due_ns = live.node.next_tick_ns()
     assert due_ns == 54 + TIMEOUT_NS
     live.node.on_tick(due_ns - 1)
-    assert live.request == []
+    assert live.requests == []
     live.node.on_tick(due_ns)
     assert live.spans() == [(4.0, 54.0)]
 
@@ -108,7 +115,7 @@ def test_a_plant_that_restarts_has_no_past() -> None:
     live.samples(1000, 1050)
     live.alarm(1050)
     live.samples(0, 60)
-    assert live.request == []
+    assert live.requests == []
     live.alarm(60)
     live.samples(61, 70)
     assert live.spans() == [(20.0, 70.0)]

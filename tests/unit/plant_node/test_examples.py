@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 import reactorwatch as rw
-from plant_node.record import EXAMPLES, make_example
+from reactorwatch.cli.examples import make_example
 from reactorwatch.errors import InputError
 from reactorwatch.process import OPERATIONS
 from reactorwatch.process.library.cstr.examples import BOILING_FROM_K
 
 SEED = 3
+EXAMPLES = [name for item in OPERATIONS.values() for name, example in item.examples.items() if example.law is None]
 
 
 def faults_of(truth: dict[str, Any], end_min: float) -> list[str]:
@@ -23,9 +24,9 @@ def faults_of(truth: dict[str, Any], end_min: float) -> list[str]:
     return texts
 
 
-@pytest.mark.parametrize("name", [name for name, example in EXAMPLES.items() if example.law is None])
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_a_simulation_with_the_stated_causes_leaves_the_noise(name: str) -> None:
-    record, truth = make_example(name, SEED)
+    record, truth, _ = make_example(name, SEED)
     simulated = rw.simulate(record, truth["process"], faults=faults_of(truth, float(record.time_min[-1])))
     noise_sd = OPERATIONS[truth["process"]].noise_sd
     assert noise_sd
@@ -36,7 +37,7 @@ def test_a_simulation_with_the_stated_causes_leaves_the_noise(name: str) -> None
 
 @pytest.mark.parametrize("name", ["leak", "fouling", "analyser_drift"])
 def test_a_backtest_names_the_hidden_cause_and_contains_no_error_of_this_software(name: str) -> None:
-    record, truth = make_example(name, SEED)
+    record, truth, _ = make_example(name, SEED)
     result = rw.backtest(record)
     assert "error of this software" not in result.text
     (cause,) = truth["causes"]
@@ -44,7 +45,7 @@ def test_a_backtest_names_the_hidden_cause_and_contains_no_error_of_this_softwar
 
 
 def test_the_unknown_law_cools_the_contents_where_they_are_hot() -> None:
-    record, truth = make_example("unknown", SEED)
+    record, truth, _ = make_example("unknown", SEED)
     simulated = rw.simulate(record).columns["T"]
     error, hot = record.columns["T"] - simulated, simulated > BOILING_FROM_K + 2.0
     assert truth["causes"] == []
@@ -53,7 +54,7 @@ def test_the_unknown_law_cools_the_contents_where_they_are_hot() -> None:
 
 
 def test_the_truth_names_the_process_the_seed_and_every_cause() -> None:
-    _, truth = make_example("two_causes", SEED)
+    _, truth, _ = make_example("two_causes", SEED)
     assert (truth["process"], truth["seed"]) == ("cstr", SEED)
     assert [(item["cause"], item["unit"]) for item in truth["causes"]] == [
         ("coolant_flow", "1"),

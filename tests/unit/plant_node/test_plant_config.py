@@ -46,7 +46,7 @@ def test_all_settings_go_through_a_file() -> None:
         "wait_for": ["monitor"],
     }
     config = read(table)
-    assert fit(table).noise_sd == {"qc": 0.0, "C": 0.002, "T": 0.1}
+    assert {name: item.noise_sd for name, item in fit(table).sensors.items()} == {"qc": 0.0, "C": 0.002, "T": 0.1}
     assert config.rows == 300
     assert read(msgspec.to_builtins(config)) == config
 

@@ -7,14 +7,14 @@ import reactorwatch as rw
 from monitor_node.causes.isolation import causes_of
 from monitor_node.causes.scan import GlrScan
 from monitor_node.causes.window import window_of
-from plant_node.record import make_example
+from reactorwatch.cli.examples import make_example
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.process.library.cascaded_tanks.model import tanks
 
 
 @pytest.mark.parametrize("name", ["leak", "cascaded_tanks", "three_tanks"])
 def test_the_example_s_cause_is_the_first_suspect_and_no_stage_fails(name: str) -> None:
-    record, truth = make_example(name, 3)
+    record, truth, _ = make_example(name, 3)
     result = rw.backtest(record, process="cstr" if name == "leak" else name)
     assert "error of this software" not in result.text
     suspected = [alarm.suspect[0].cause for alarm in result.alarms if alarm.suspect]
@@ -23,7 +23,7 @@ def test_the_example_s_cause_is_the_first_suspect_and_no_stage_fails(name: str) 
 
 
 def test_an_effect_with_constants_leaves_the_scan_of_the_others_as_it_is() -> None:
-    record, _ = make_example("cascaded_tanks", 3)
+    record, _, _ = make_example("cascaded_tanks", 3)
     model, noise = tanks(), NoiseLevels((0.05,), (0.0, 0.0))
     columns = [record.columns[name][1400:1800] for name in ("u", "x2")]
     rows = [

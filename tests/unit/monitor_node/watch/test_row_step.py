@@ -2,11 +2,11 @@
 
 import reactorwatch as rw
 from monitor_node.watch import row_step
-from plant_node.record import make_example
+from reactorwatch.cli.examples import make_example
 
 
 def watch(name: str) -> None:
-    record, _ = make_example(name, 3)
+    record, _, _ = make_example(name, 3)
     result = rw.backtest(record, process="cstr" if name == "leak" else name, charts=("shewhart", "ewma"))
     assert result.samples > 2000
 
