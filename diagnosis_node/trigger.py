@@ -9,7 +9,6 @@ If the plant stops or no data arrive while a diagnosis is pending, it starts wit
 
 from collections import deque
 from collections.abc import Callable
-from math import inf
 from typing import Annotated, ClassVar
 
 import msgspec
@@ -18,6 +17,7 @@ from reactorwatch.contract.alarm_states import CODES, OUT_OF_SIGHT
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
+from reactorwatch.errors import positive
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS
 from reactorwatch.runtime.setting_rules import MODEL_IS_PROCESS, OlderKeys, check_bounds
 from recorder import RecordedMessage
@@ -56,8 +56,7 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         check_plant(self.plant)
         check_bounds(DiagnosisConfig, msgspec.structs.asdict(self))
         for output, value in self.tolerance.items():
-            if not 0.0 < value < inf:
-                raise ValueError(f"tolerance of {output} must be a positive number, got {value:g}")
+            positive(f"tolerance of {output}", value)
         if not self.after_min < self.window_min:
             raise ValueError(
                 f"window_min must be more than after_min, got {self.window_min:g} and {self.after_min:g}; "
