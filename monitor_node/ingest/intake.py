@@ -5,7 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 import msgspec
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.alignment import Aligner, AlignmentMemory, ReplayFilter
+from monitor_node.ingest.alignment import Aligner
+from monitor_node.ingest.duplicates import AlignmentMemory, ReplayFilter
 from monitor_node.ingest.rows import Row
 from monitor_node.ingest.samples import (
     LARGEST_NUMBER,

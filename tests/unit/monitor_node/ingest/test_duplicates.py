@@ -4,7 +4,8 @@ from copy import deepcopy
 
 import pytest
 
-from monitor_node.ingest.alignment import Aligner, AlignmentMemory, ReplayFilter
+from monitor_node.ingest.alignment import Aligner
+from monitor_node.ingest.duplicates import AlignmentMemory, ReplayFilter
 
 PERIOD = 100
 SIGNALS = ("C", "T")
