@@ -35,11 +35,7 @@ DRAIN_TIMEOUT_S = 0.5
 
 
 class DiagnosisRunner:
-    """Records samples and diagnoses them in a thread and a process, one diagnosis at a time.
-
-    Args:
-        config: settings; `out` is the folder for the reports.
-    """
+    """Records samples and diagnoses them in a thread and a process, one diagnosis at a time."""
 
     def __init__(self, config: DiagnosisConfig) -> None:
         self._config, self._out = config, Path(config.out or "")

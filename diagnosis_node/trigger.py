@@ -9,7 +9,6 @@ If the plant stops or no data arrive while a diagnosis is pending, it starts wit
 
 from collections import deque
 from collections.abc import Callable
-from math import inf
 from typing import Annotated, ClassVar
 
 import msgspec
@@ -17,8 +16,10 @@ import msgspec
 from reactorwatch.contract.alarm_states import CODES, OUT_OF_SIGHT
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, Sample
+from reactorwatch.errors import positive
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS
+from reactorwatch.runtime.node import Node
 from reactorwatch.runtime.setting_rules import MODEL_IS_PROCESS, OlderKeys, check_bounds
 from recorder import RecordedMessage
 
@@ -56,8 +57,7 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         check_plant(self.plant)
         check_bounds(DiagnosisConfig, msgspec.structs.asdict(self))
         for output, value in self.tolerance.items():
-            if not 0.0 < value < inf:
-                raise ValueError(f"tolerance of {output} must be a positive number, got {value:g}")
+            positive(f"tolerance of {output}", value)
         if not self.after_min < self.window_min:
             raise ValueError(
                 f"window_min must be more than after_min, got {self.window_min:g} and {self.after_min:g}; "
@@ -65,7 +65,7 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             )
 
 
-class DiagnosisTrigger:
+class DiagnosisTrigger(Node):
     """Starts a diagnosis after an alarm.
 
     Args:
@@ -76,8 +76,6 @@ class DiagnosisTrigger:
     Attributes:
         waiting: alarm of the pending diagnosis; None if there is none.
     """
-
-    finished = False
 
     def __init__(
         self,
@@ -107,10 +105,6 @@ class DiagnosisTrigger:
                 self.waiting = content
         return []
 
-    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """Refuse any command."""
-        return CommandReply(accepted=False, text="this node has no commands"), []
-
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Start a pending diagnosis if no data arrive."""
         if self.waiting is not None and now_ns >= self._timeout_ns:
@@ -121,10 +115,6 @@ class DiagnosisTrigger:
     def next_tick_ns(self) -> int:
         """Time at which the plant is considered stopped, if a diagnosis is pending."""
         return NEVER_NS if self.waiting is None else self._timeout_ns
-
-    def on_stop(self, now_ns: int) -> list[Publication]:
-        """Publish nothing."""
-        return []
 
     def _keep(self, time_ns: int, message: Encoded) -> None:
         """Store a sample and drop those before the window; all are dropped if the plant's time steps back before it."""

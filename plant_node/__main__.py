@@ -11,8 +11,6 @@ from plant_node.node import COMMANDS, NODE, PlantNode
 from plant_node.record import plant_from
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.description.process import Process
-from reactorwatch.records.record import Record
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
@@ -28,22 +26,9 @@ def run(
     config: PlantConfig,
     bus_config: BusConfig,
     metrics_config: MetricsConfig = MetricsConfig(),  # noqa: B008 (it is frozen)
-    process: Process | None = None,
-    driver: Record | None = None,
 ) -> None:
-    """Simulate a plant on the bus until the end of its duration, SIGINT or SIGTERM.
-
-    Args:
-        config: settings of the plant.
-        bus_config: settings of the bus.
-        metrics_config: settings of the metrics page.
-        process: the process; None: that of the settings.
-        driver: a record whose inputs drive the plant instead of the scenario of `config`.
-
-    Raises:
-        InputError: settings that cannot be used.
-    """
-    plant = plant_from(config, process, driver)
+    """Simulate a plant on the bus until the end of its duration, SIGINT or SIGTERM."""
+    plant = plant_from(config)
     log.info("plant", seed=config.seed, settings=msgspec.to_builtins(config))
     token = keys.instance_token(config.name, NODE, instance_name())
     with (

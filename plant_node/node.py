@@ -26,6 +26,7 @@ from reactorwatch.contract.messages_pb2 import (
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.records.record import to_time_ns
+from reactorwatch.runtime.node import Node
 from reactorwatch.version import version
 
 NODE = "plant"
@@ -41,8 +42,8 @@ BEHIND_S = 1.0  # a longer lag is logged
 LOG_INTERVAL_NS = 60_000_000_000
 
 
-class PlantNode:
-    """See `reactorwatch.runtime.event_loop.Node`.
+class PlantNode(Node):
+    """Publishes rows of the plant when they are due.
 
     Args:
         plant: the simulated plant, at its first row.
@@ -93,10 +94,6 @@ class PlantNode:
             self._health_due_ns = now_ns + round(self._config.health_period_s * 1e9)
             publications.append(self._health(now_ns, "holding" if self._plant.trouble else "running"))
         return publications
-
-    def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
-        """Ignore messages: a plant subscribes to none."""
-        return []
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """Execute a command from the next row on, or reply with the reason for refusing it."""

@@ -8,6 +8,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.node import Node
 from recorder.config import MB, RecorderConfig
 from recorder.core import NODE, PRIORITIES, ReceivedMessage, Recorder
 from recorder.files.writer import WriteError
@@ -18,8 +19,8 @@ RETRY_NS = 2_000_000_000
 """Time between two attempts to resume on a full disk."""
 
 
-class RecorderNode:
-    """Records received messages; see `reactorwatch.runtime.event_loop.Node`.
+class RecorderNode(Node):
+    """Records received messages.
 
     It starts with a new file, while what a killed recorder left is recovered. Its health reports are published and
     received like any message, so they are not written here. The exception is the last one, which would arrive after the
@@ -107,11 +108,6 @@ class RecorderNode:
         file_ns = self._next_retry_ns if self._core.is_stopped else self._rotation.next_due_ns()
         interval_ns = self._black_box.next_due_ns
         return min(self._next_health_ns, file_ns, *([] if interval_ns is None else [interval_ns]))
-
-    @property
-    def finished(self) -> bool:
-        """False: it records until it is stopped."""
-        return False
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Record and publish the last health report."""

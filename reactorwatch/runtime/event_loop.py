@@ -14,13 +14,13 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from queue import Empty, SimpleQueue
 from types import FrameType
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.runtime.bus import MAX_BATCH, Bus, Request
 from reactorwatch.runtime.clock import SteadyClock
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.node import Node
 from reactorwatch.runtime.security.audit import audit
 
 MAX_WAIT_S = 3600.0
@@ -32,29 +32,6 @@ MAX_INBOX_BYTES = 64 << 20  # of payload
 POLL_S = 0.1
 _END = b"\0"  # no signal has this number
 BATCH = 256  # messages handled before the loop reads the clock again
-
-
-class Node(Protocol):
-    """A core, or a core with its files, as the loop drives it."""
-
-    def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
-        """Handle a message on a subscribed key."""
-
-    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
-        """Handle a command; the reply is None if another node answers it."""
-
-    def on_tick(self, now_ns: int) -> list[Publication]:
-        """Handle the deadline that `next_tick_ns` named."""
-
-    def next_tick_ns(self) -> int:
-        """Time of the next tick, by the clock that `now_ns` is read from."""
-
-    @property
-    def finished(self) -> bool:
-        """True if the node has nothing left to do and the loop ends."""
-
-    def on_stop(self, now_ns: int) -> list[Publication]:
-        """Return the node's last publications; the loop ends."""
 
 
 _Item: TypeAlias = tuple[Callable[..., list[Publication]], tuple[object, ...], int, int]

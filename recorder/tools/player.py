@@ -13,9 +13,9 @@ from typing import cast
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Body, Encoded, Publication
-from reactorwatch.contract.messages_pb2 import CommandReply
+from reactorwatch.contract.codec import Body, Publication
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS, Record, to_time_ns
+from reactorwatch.runtime.node import Node
 from recorder import RecordedMessage
 from recorder.keep import STATES
 from recorder.samples import RunSplitter, decode_messages
@@ -138,8 +138,8 @@ def _schedule(tape: Iterable[Publication]) -> Iterator[tuple[Publication, int]]:
     yield from ((latched, latched.message.time_ns) for latched in first or ())
 
 
-class Player:
-    """Publishes messages when they are due; see `reactorwatch.runtime.event_loop.Node`.
+class Player(Node):
+    """Publishes messages when they are due.
 
     Args:
         open_tape: returns the publications from the start, each time it is called.
@@ -195,18 +195,6 @@ class Player:
     def finished(self) -> bool:
         """True if every message was published."""
         return self._next is None
-
-    def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
-        """Ignore messages; it subscribes to none."""
-        return []
-
-    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """Never called: a replay declares no commands."""
-        raise AssertionError(question.key)
-
-    def on_stop(self, now_ns: int) -> list[Publication]:
-        """Publish nothing."""
-        return []
 
     def set_pace(self, now_ns: int, *, rate: float | None = None, paused: bool | None = None) -> None:
         """Change the rate, pause, or resume after the rest of the time to the next message."""

@@ -16,9 +16,10 @@ import rerun as rr
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message, encoding_of
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
+from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.description.process import Process
 from reactorwatch.runtime.bus import Bus
+from reactorwatch.runtime.node import Node
 from recorder.columns import LISTED, SEGMENT_MESSAGES, RunReader
 from recorder.panels import PANELS
 from recorder.samples import content_of
@@ -161,8 +162,8 @@ def _change(alarm: messages.Alarm, time_ns: int, event: str, state: messages.Ala
     return change
 
 
-class LiveDashboard:
-    """Draws received messages; see `reactorwatch.runtime.event_loop.Node`.
+class LiveDashboard(Node):
+    """Draws received messages.
 
     Args:
         recording: stream to a viewer.
@@ -204,10 +205,6 @@ class LiveDashboard:
         if self._count >= SEGMENT_MESSAGES or now_ns >= self._next_ns:
             self._draw(now_ns)
         return []
-
-    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """Never called: a dashboard declares no commands."""
-        raise AssertionError(question.key)
 
     def on_alive(self, token: str, is_alive: bool, _now_ns: int) -> list[Publication]:
         """Query a node that appears for its alarms."""
