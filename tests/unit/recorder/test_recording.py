@@ -6,7 +6,7 @@ import pytest
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication, encode
-from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
+from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Estimate, Sample
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.index import LATEST_NS
@@ -50,6 +50,7 @@ def times(entries: list[RecordedMessage]) -> list[int]:
         ([(1, 4), (2, 3), (3, 9), (9, 10)], [[(1, 4), (2, 3), (3, 9)], [(9, 10)]]),
         ([(1, 10), (2, 3), (4, 5)], [[(1, 10), (2, 3), (4, 5)]]),
         ([(1, 2), (2, 3), (3, 4)], [[(1, 2)], [(2, 3)], [(3, 4)]]),
+        ([(0, 1), (2, 5), (3, 4)], [[(0, 1)], [(2, 5), (3, 4)]]),
     ],
 )
 def test_spans_that_overlap_are_one_group_and_those_that_touch_are_not(
@@ -93,6 +94,15 @@ def test_a_damaged_file_is_a_source_only_where_damage_is_tolerated_and_starts_at
     assert [stored.log_time_ns for stored in merge_messages(sources)] == [5, 30, 31]
 
 
+def test_the_metadata_of_a_folder_are_those_of_its_first_file_and_those_of_each(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", sample(20), metadata={"case": "second"})
+    write(tmp_path / "b.mcap", sample(10), metadata={"case": "first"})
+    recording = Recording(tmp_path)
+    assert recording.metadata["case"] == "first"
+    assert [item["case"] for item in recording.metadata_by_file] == ["first", "second"]
+    assert [record.metadata["case"] for record in recording.metadata_records] == ["first", "second"]
+
+
 def test_a_folder_is_read_without_its_empty_files(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap")
     assert Recording(tmp_path).files == [tmp_path / "a.mcap"], "unless there are no others"
@@ -112,7 +122,10 @@ def test_the_plants_are_those_with_samples_and_one_of_several_is_named(tmp_path:
         recording.one_plant("east")
     assert times(list(recording.messages(plant="south"))) == [1, 3]
     assert times(list(recording.messages([keys.ALARM]))) == []
-    alone = Recording(write(tmp_path / "b.mcap", sample(1, "south")))
+    estimate = encode(Publication(keys.key("west", keys.ESTIMATE, "T"), Estimate(time_ns=2)))
+    other = RecordedMessage(estimate.key, estimate.payload, estimate.encoding, 2, 2)
+    alone = Recording(write(tmp_path / "b.mcap", sample(1, "south"), other))
+    assert alone.plants == ("south",), "one without samples is not counted"
     assert alone.one_plant() == alone.one_plant("south") == "south"
     assert alone.process(None) is None
 
@@ -159,6 +172,8 @@ def test_the_newest_file_that_is_being_written_is_the_live_one(tmp_path: Path) -
     assert live_file(tmp_path) == Recording(tmp_path).live == tmp_path / "b.mcap.part"
     assert times(list(Recording(tmp_path).messages())) == [2]
     assert live_file(tmp_path / "a.mcap.part") is None
+    write(tmp_path / "0.mcap", sample(1))
+    assert live_file(tmp_path) is None, "there is a complete one"
     for writer in writers:
         writer.abandon()
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from mcap.records import Attachment
 
 from reactorwatch.contract.codec import encoding_of
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
@@ -203,7 +204,7 @@ def test_a_recording_is_renamed_when_it_is_closed_and_a_second_close_does_nothin
 
 
 def test_a_sample_has_its_number_modulo_2_to_the_32_and_anything_else_has_0(tmp_path: Path) -> None:
-    sample = Sample(sequence=2**32 + 5, time_ns=1, quality=QUALITY_GOOD)
+    sample = Sample(sequence=2**33 - 2, time_ns=1, quality=QUALITY_GOOD)
     message = RecordedMessage("reactor/cstr/sample/T", sample.SerializeToString(), encoding_of(Sample), 1, 1)
     with RecordingWriter(tmp_path / "run.mcap", {}) as writer:
         writer.write(message)
@@ -213,7 +214,7 @@ def test_a_sample_has_its_number_modulo_2_to_the_32_and_anything_else_has_0(tmp_
         (stored.sequence, isinstance(stored.channel, StoredChannel) and stored.channel.schema is not None)
         for stored in Reader(tmp_path / "run.mcap")
     ]
-    assert found == [(5, True), (0, False), (0, False)]
+    assert found == [(2**32 - 2, True), (0, False), (0, False)]
 
 
 def test_a_recording_has_a_channel_for_each_key_encoding_and_use_and_one_schema_for_each_type(tmp_path: Path) -> None:
@@ -264,3 +265,14 @@ def test_a_recording_of_a_name_that_is_taken_is_refused_with_the_cure(tmp_path: 
     path.rename(part)
     with pytest.raises(InputError, match=f"`reactorwatch recover {part}` saves what is whole in it"):
         check_free(path)
+
+
+def test_messages_before_an_attachment_are_in_the_file_ahead_of_it(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap", {})
+    writer.write(ENTRIES[0])
+    writer.add_attachment(Attachment(create_time=1, log_time=1, name="a", media_type="text/plain", data=b"x"))
+    assert intact_messages(tmp_path / "run.mcap.part") == [ENTRIES[0]]
+    writer.close()
+    reader = Reader(tmp_path / "run.mcap")
+    assert len(list(reader)) == 1
+    assert [item.name for item in reader.attachments()] == ["a"]

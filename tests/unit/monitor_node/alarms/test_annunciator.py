@@ -56,6 +56,17 @@ def test_back_in_is_a_tenth_within_the_limit_that_was_crossed(sign: int) -> None
     assert desk.alarm().memory.state is State.RETURNED_UNACKNOWLEDGED
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_dead_band_is_measured_from_the_centre_of_the_chart(sign: int) -> None:
+    desk = Desk()
+    active = []
+    for minute, deviation in enumerate((3.1, 2.71, 2.69)):
+        judgement = Judgement(440.0 + sign * deviation, 440.0, 437.0, 443.0, deviation > 3.0)
+        desk.judge(desk.alarm(), minute, judgement)
+        active.append(desk.alarm().memory.is_active)
+    assert active == [True, True, False]
+
+
 # --- incidents -----------------------------------------------------------------------------------------------
 
 
