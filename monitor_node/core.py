@@ -122,8 +122,8 @@ class Monitor:
         """Process messages on keys of the plant's samples, in order; returns publications."""
         publications: list[Publication] = []
         self.memory.received += len(messages)
-        received_ns = min(message.received_ns for message in messages)
-        if received_ns and now_ns - received_ns > self.stats.lag_ns:
+        received_ns = min((item.received_ns for item in messages if item.received_ns), default=now_ns)
+        if now_ns - received_ns > self.stats.lag_ns:
             self.stats.lag_ns = now_ns - received_ns
         if self.intake.take(messages, publications):
             self._on_receipt(now_ns)

@@ -69,6 +69,11 @@ def fingerprint(key: str, payload: bytes) -> int:
     return hash((key, payload))
 
 
+RENEWED_EVERY, LARGEST_REUSED = 1_000, 256
+"""A message that is decoded into another frees nothing that it held: so a new one is used after as many messages, and
+for a payload of more bytes."""
+
+
 class Recorder:
     """Decodes and counts messages, and holds the recorder's alarms.
 
@@ -99,7 +104,7 @@ class Recorder:
         self.is_stopped = False
         self.alarms = OwnAlarms(plant)
         self._counters: dict[str, tuple[Channel, SequenceCounter]] = {}  # by key, the least recently used first
-        self._sample = messages.Sample()  # each sample is decoded into it, as none is held
+        self._sample = messages.Sample()  # samples are decoded into it, as none is held
         self._evicted = SequenceCounter()  # counts of evicted keys
         self._no_room_ns = 0  # time of the last rejected message
         self._logged_ns: int | None = None  # time of the last log line about it
@@ -127,19 +132,24 @@ class Recorder:
             return None if is_recorded else self._receive_other(key, payload, encoding, received_ns)
         counters[key] = counted
         channel, counter = counted
+        if not self._received % RENEWED_EVERY or len(payload) > LARGEST_REUSED:
+            self._sample = messages.Sample()
         sample = self._sample
         try:
             sample.ParseFromString(payload)
         except ProtobufDecodeError:
             return None if is_recorded else self._receive_other(key, payload, encoding, received_ns)
         time_ns, sequence = sample.time_ns, sample.sequence
+        is_valid = time_ns >= 0 and sample.quality  # 0: it is unspecified
+        if is_valid:  # one that an earlier file holds as well: those around it in this file are not lost
+            counter.update(sequence, time_ns)
+        if is_recorded:
+            return None
         if time_ns < 0:
             time_ns = self._correct_time(received_ns)
-        elif not sample.quality:  # it is unspecified
+        elif not is_valid:
             self._refused["payload"] += 1
-        else:  # one that an earlier file holds as well: those around it in this file are not lost
-            counter.update(sequence, time_ns)
-        return None if is_recorded else ReceivedMessage(channel, sequence, received_ns, time_ns, payload)
+        return ReceivedMessage(channel, sequence, received_ns, time_ns, payload)
 
     def _receive_other(self, key: str, payload: bytes, encoding: str, received_ns: int) -> ReceivedMessage:
         """Decode a message that is not a sample of the product, or not one that can be read."""

@@ -353,7 +353,8 @@ def channel_of(key: str, encoding: str, *, is_readable: bool, latched: bool = Fa
     channel = _CHANNELS.get(name)
     if channel is None:
         is_product = is_readable and keys.parse(key) is not None
-        channel = _CHANNELS[name] = Channel(key, encoding, is_product, is_readable, latched)
+        # two threads may ask at once
+        channel = _CHANNELS.setdefault(name, Channel(key, encoding, is_product, is_readable, latched))
     return channel
 
 

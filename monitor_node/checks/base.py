@@ -105,7 +105,8 @@ class SignalCheck:
         options: options of its alarms, see `Annunciator.declare`.
         can_be_false: whether chance can raise its alarms, one an output, which then share the promised false alarms.
         is_invalid_while_active: whether a value is no measurement while its alarm is active.
-        memory: all that it remembers but the alarms, as it is stored: changed, and never replaced; None: nothing.
+        memory: all that it remembers but the alarms, as it is stored: changed by training and rows, never replaced;
+            None: nothing.
         invalid: one flag a value of the newest row: it is no measurement; empty: all are.
     """
 

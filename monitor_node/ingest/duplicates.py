@@ -84,16 +84,21 @@ class ReplayFilter:
 
     Attributes:
         has_begun: True if a sample has come.
-        is_over: True if no signal has a sample left to filter.
     """
 
     def __init__(self, memory: AlignmentMemory) -> None:
-        self.has_begun = self.is_over = False
+        self.has_begun = False
         self._newest: list[GapTracker | None] = [
             None if item.expected is None else replace(item) for item in memory.sequences
         ]
+        self._unfinished = sum(item is not None for item in self._newest)
         waiting = {time_ns: row.numbers for time_ns, row in memory.pending.items()}
         self._numbers = {time_ns: list(numbers) for time_ns, numbers in (memory.emitted | waiting).items()}
+
+    @property
+    def is_over(self) -> bool:
+        """True if no signal has a sample left to filter."""
+        return not self._unfinished
 
     def is_duplicate(self, index: int, time_ns: int, sequence: int) -> bool:
         """True if a sample was processed before.
@@ -106,7 +111,6 @@ class ReplayFilter:
         self.has_begun = True
         newest = self._newest[index]
         if newest is None:
-            self.is_over = not any(self._newest)
             return False
         numbers = self._numbers.get(time_ns)
         if numbers is not None and numbers[index] is None:
@@ -115,4 +119,5 @@ class ReplayFilter:
         older = numbers is None and newest.is_past(sequence, time_ns)
         if not (known or older) and (numbers is not None or sequence == newest.expected):
             self._newest[index] = None
+            self._unfinished -= 1
         return known or older

@@ -257,7 +257,7 @@ class RlsUpdate(msgspec.Struct, frozen=True, gc=False):
 class RecursiveLeastSquares:
     """y = regressor . parameters + noise, learned row by row.
 
-    Regressors should be of the order of 1 (`regressor.Scaling`): `covariance_limit` counts in their units.
+    Regressors should be of the order of 1 (`structure.Scaling`): `covariance_limit` counts in their units.
 
     >>> rls = RecursiveLeastSquares(2)
     >>> for k in range(5):

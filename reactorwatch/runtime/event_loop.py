@@ -31,7 +31,7 @@ MAX_INBOX_BYTES = 64 << 20  # of payload
 """Beyond either the bus's thread is blocked, and with it the publishers that are too fast for the node."""
 POLL_S = 0.1
 _END = b"\0"  # no signal has this number
-BATCH = 256  # messages handled before the loop reads the clock again
+BATCH = 256  # messages after which no further item is handled before the loop reads the clock again
 
 
 _Item: TypeAlias = tuple[Callable[..., list[Publication]], tuple[object, ...], int, int]
@@ -336,7 +336,7 @@ class EventLoop:
         self._publish(self._node.on_stop(self._clock.now_ns()))
 
     def _run_once(self) -> None:
-        """Tick if it is due; otherwise wait for items, and handle up to `BATCH` messages."""
+        """Tick if it is due; otherwise wait for items, and handle them up to that which completes `BATCH` messages."""
         wait_s = (self._node.next_tick_ns() - self._clock.now_ns()) / 1e9
         if wait_s <= 0:
             self._on_backlog(self._inbox.has_backlog)

@@ -139,10 +139,10 @@ class Reader:
         self._wanted, self._tolerant = wanted, tolerant
         self._attached: list[tuple[int, int]] = []
         with wrap_read_errors(path), open_recording(path) as stream:
-            self._size = os.fstat(stream.fileno()).st_size
-            if not self._size:
+            if not os.fstat(stream.fileno()).st_size:
                 raise InputError(f"{path}: expected an MCAP recording, got an empty file")
             self._bytes = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        self._size = len(self._bytes)
         self._start = len(MCAP0_MAGIC)
         if tolerant and self._bytes[: self._start] != MCAP0_MAGIC:
             chunk = self._next_chunk(0)

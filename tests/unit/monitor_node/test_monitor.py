@@ -303,6 +303,14 @@ def test_foreign_names_do_not_fill_the_log() -> None:
     assert len(report) < 500
 
 
+def test_the_lag_of_a_batch_is_that_of_the_oldest_message_with_a_time_of_receipt(leak: list[Encoded]) -> None:
+    monitor = Monitor(CONFIG, 0)
+    received_ns = (10**9, 0, 3 * 10**9)
+    batch = [message._replace(received_ns=ns) for message, ns in zip(leak, received_ns, strict=False)]
+    monitor.on_messages(batch, 5 * 10**9)
+    assert health(monitor).lag_ms == 4000.0
+
+
 def test_a_monitor_that_did_not_run_when_something_was_due_counts_it() -> None:
     """Its health is due every five seconds; it was frozen, or its clock was set, between the second and the third."""
     monitor, second = Monitor(CONFIG, 10**18), 10**9

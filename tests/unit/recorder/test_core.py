@@ -1,5 +1,8 @@
 """Messages as the recorder stores them."""
 
+import os
+from pathlib import Path
+
 import pytest
 
 from reactorwatch.contract import keys
@@ -152,6 +155,22 @@ def test_what_is_no_sample_is_not_counted_as_one_whether_an_earlier_file_holds_i
         assert (recorder.on_message(message, 1) is None) is bool(known)
         report = health(recorder)
         assert (report.lost, report.duplicated, report.out_of_order) == (0, 0, 0)
+        assert not known or set(report.refused_by_reason) <= {"key"}  # that of the first message
+
+
+def resident_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the memory of a process is read from /proc")
+@pytest.mark.parametrize(("unit_bytes", "count"), [(1_000_000, 150), (200, 200_000)])
+def test_samples_leave_no_memory_behind(unit_bytes: int, count: int) -> None:
+    recorder, message = Recorder("cstr", 0), encoded(messages.Sample(time_ns=1, quality=GOOD, unit="g" * unit_bytes))
+    recorder.on_message(message, 1)
+    before = resident_bytes()
+    for _ in range(count):
+        recorder.on_message(message, 1)
+    assert resident_bytes() - before < 10_000_000
 
 
 @pytest.mark.parametrize(

@@ -162,6 +162,20 @@ def test_a_stretch_that_is_not_over_when_the_recorder_stops_is_kept_as_far_as_it
     assert len(of_others(box)) == 9
 
 
+@pytest.mark.parametrize("left", [slice(-4), slice(0), slice(100)])
+def test_a_stretch_whose_copy_is_damaged_is_copied_again_at_the_next_start(tmp_path: Path, left: slice) -> None:
+    fed = recorder(tmp_path, START, black_box_min=1.0)
+    fed.receive([*samples(30), alarm("ewma/T"), *samples(60, 30)], SECOND)
+    fed.pass_time(2 * MINUTE)
+    fed.stop()
+    (box,) = (tmp_path / "black-box").iterdir()
+    whole = of_others(box)
+    box.write_bytes(box.read_bytes()[left])
+    recorder(tmp_path, fed.now_ns + SECOND, black_box_min=1.0).stop()
+    (again,) = set((tmp_path / "black-box").iterdir()) - {box}
+    assert of_others(again) == whole
+
+
 def test_all_of_a_stretch_is_in_the_file_when_it_is_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its last sample came a moment before its end, and would be flushed later."""
     fed = recorder(tmp_path / "run.mcap", START, black_box_min=0.5, flush_period_s=1.0)
