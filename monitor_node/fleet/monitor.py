@@ -28,6 +28,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import NEVER_NS
+from reactorwatch.runtime.node import Node
 
 MOST_PLANTS = 100_000
 
@@ -96,7 +97,7 @@ def prepare(kinds: Sequence[PlantKind], *, points: bool) -> None:
             pass
 
 
-class FleetMonitor:
+class FleetMonitor(Node):
     """Monitors of many plants.
 
     A plant is verified by a liveliness token of one of its nodes, by a stored state, or by aligned rows. Anyone may
@@ -305,11 +306,6 @@ class FleetMonitor:
     def next_tick_ns(self) -> int:
         """Earliest deadline of the plants."""
         return self._heap[0][0] if self._heap else NEVER_NS
-
-    @property
-    def finished(self) -> bool:
-        """Always False: a monitor runs until it is stopped."""
-        return False
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish the health of all plants' monitors for the last time."""

@@ -330,7 +330,6 @@ class ArxReference(Reference):
 
     kind = "arx"
     is_identified = True
-    learns = True
 
     def __init__(self, config: MonitorConfig, *, points: bool) -> None:
         self.config, self.points, self.structure = config, points, arx_structure(config)

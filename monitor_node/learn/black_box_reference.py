@@ -89,7 +89,6 @@ class BlackBoxReference(FilterReference):
     """
 
     kind = "black-box"
-    learns = True
 
     def __init__(self, memory: BlackBoxMemory) -> None:
         self._memory, self.model = memory, memory.model

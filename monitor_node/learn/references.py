@@ -70,13 +70,11 @@ class Reference(ABC):
     Attributes:
         kind: `equations`, `black-box` or `arx`, as published.
         is_identified: True if the identified models predict, which are then not updated beside it.
-        learns: True if it learns the plant from the rows that it judges.
         obstacles: reasons why rows are not judged now, each with what it is about.
     """
 
     kind: ClassVar[str]
     is_identified: ClassVar[bool] = False
-    learns: ClassVar[bool] = False
     obstacles: Mapping[str, str] = MappingProxyType({})
 
     @property
@@ -109,12 +107,8 @@ class Reference(ABC):
     def restart(self) -> None:
         """Restart with the next row: the plant's clock was set, or there was a gap."""
 
-    def set_learning(self, learning: bool) -> None:
-        """Learn from the rows to come, or not: while nothing is wrong, or a fault would be learned as ordinary.
-
-        It is called only where the reference `learns`.
-        """
-        raise NotImplementedError
+    def set_learning(self, learning: bool) -> None:  # noqa: B027 # without memory of the plant there is nothing to do
+        """Learn from the rows to come, or not: while nothing is wrong, or a fault would be learned as ordinary."""
 
     @property
     def weakness(self) -> str:

@@ -373,8 +373,7 @@ class PlantPipeline:
         if stuck is not None and evaluation.suspicion is not None:
             publications.extend(self._search_causes(evaluation.suspicion, row, stuck))
         if stuck is not None or board.has_unexplained:
-            if reference.learns:
-                reference.set_learning(not board.has_unexplained)
+            reference.set_learning(not board.has_unexplained)
             if not board.has_unexplained:
                 memory.incident = None
             else:
