@@ -223,11 +223,7 @@ def start_part(*arguments: object) -> "subprocess.Popen[str]":
 
 
 def _line(process: "subprocess.Popen[str]") -> str:
-    """The next line that a process prints.
-
-    Raises:
-        SystemExit: the process ended without it; its errors are above.
-    """
+    """The next line that a process prints."""
     assert process.stdout is not None
     line = process.stdout.readline()
     if not line:
