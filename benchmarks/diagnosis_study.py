@@ -28,8 +28,8 @@ from benchmarks.hidden.tables import confusion_table, failures, main_table
 from benchmarks.stamp import stamp
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.runtime.parallel import choose_executor
-from reactorwatch.runtime.parallel.jobs import Failed
+from reactorwatch.runtime.executors import choose_executor
+from reactorwatch.runtime.jobs import Failed
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.judge import Judged, failed, judge
 

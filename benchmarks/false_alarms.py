@@ -21,8 +21,8 @@ from reactorwatch.contract.codec import encode
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
-from reactorwatch.runtime.parallel import choose_executor
-from reactorwatch.runtime.parallel.jobs import Executor
+from reactorwatch.runtime.executors import choose_executor
+from reactorwatch.runtime.jobs import Executor
 from recorder.tools.player import samples_of
 
 RUNS, PER_30_DAYS = 80, 200.0

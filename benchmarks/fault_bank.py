@@ -32,8 +32,8 @@ from benchmarks.faults.score import rows_to_false_alarm
 from benchmarks.faults.study import Widths, fault_free_statistics, run_case, run_fault_free
 from benchmarks.faults.tables import as_json, print_fault_free, print_summary, print_table
 from benchmarks.stamp import stamp
-from reactorwatch.runtime.parallel import choose_executor
-from reactorwatch.runtime.parallel.jobs import Executor, Failed, in_job_order
+from reactorwatch.runtime.executors import choose_executor
+from reactorwatch.runtime.jobs import Executor, Failed, in_job_order
 
 SEEDS, FAULT_FREE_RUNS, CALIBRATION_RUNS = 20, 200, 400
 QUICK_SEEDS, QUICK_FAULT_FREE_RUNS, QUICK_CALIBRATION_RUNS = 2, 6, 60

@@ -17,8 +17,8 @@ from benchmarks.faults.bank import AFTER_MIN, BANK, Case, cases
 from benchmarks.faults.runs import record_of
 from benchmarks.faults.watch import newest_suspects, watch
 from benchmarks.promise.pool import share_interval
-from reactorwatch.runtime.parallel import choose_executor
-from reactorwatch.runtime.parallel.jobs import Failed
+from reactorwatch.runtime.executors import choose_executor
+from reactorwatch.runtime.jobs import Failed
 
 BUDGET_PER_30_DAYS = 30.0
 EARLIEST_MIN, SPAN_MIN = 200.0, 40.0

@@ -24,7 +24,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.metrics import Metrics
-from reactorwatch.runtime.security.audit import is_query
+from reactorwatch.runtime.security.acl import is_query
 from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
 from reactorwatch.runtime.start import instance_name
 

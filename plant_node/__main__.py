@@ -14,10 +14,9 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
-from reactorwatch.runtime.liveliness import wait_alive
 from reactorwatch.runtime.metrics import Metrics, serve_metrics
 from reactorwatch.runtime.node_main import main
-from reactorwatch.runtime.start import instance_name, join
+from reactorwatch.runtime.start import instance_name, join, wait_alive
 
 log = structlog.get_logger()
 

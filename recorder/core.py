@@ -23,7 +23,7 @@ from reactorwatch.contract.codec import MAX_PAYLOAD, DecodeError, Encoded, Publi
 from reactorwatch.contract.commands import check_signature, decode_command
 from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.reorder_buffer import Gap
 from reactorwatch.version import version
 from recorder import Channel, StoredMessage
 from recorder.keep import channel_of

@@ -23,7 +23,7 @@ from reactorwatch.contract import keys
 from reactorwatch.description.plants import PlantProcesses
 from reactorwatch.errors import InputError
 from reactorwatch.records.folder import make_folder
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.reorder_buffer import Gap
 from recorder import RecordedMessage, StoredMessage
 from recorder.config import MB, RecorderConfig
 from recorder.core import ReceivedMessage, fingerprint

@@ -20,7 +20,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import QUALITY_BAD, QUALITY_UNSPECIFIED, Sample
 from reactorwatch.records.record import LARGEST_VALUE
-from reactorwatch.runtime.delivery.gap_tracker import GapTracker
+from reactorwatch.runtime.gap_tracker import GapTracker
 from recorder import RecordedMessage
 
 MAX_GAPS = 256  # stored gaps of a signal; a late sample of an older gap is counted as a duplicate

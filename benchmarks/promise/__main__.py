@@ -8,7 +8,7 @@ from benchmarks import false_alarms
 from benchmarks.promise import black_box, costs, faults, statements
 from benchmarks.promise.not_quite import print_plants
 from benchmarks.promise.plants import KINDS
-from reactorwatch.runtime.parallel import choose_executor
+from reactorwatch.runtime.executors import choose_executor
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -23,8 +23,8 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import start_state
 from reactorwatch.records.record import Record
-from reactorwatch.runtime.parallel import choose_executor
-from reactorwatch.runtime.parallel.jobs import Executor
+from reactorwatch.runtime.executors import choose_executor
+from reactorwatch.runtime.jobs import Executor
 from recorder.tools.player import samples_of
 
 PERIOD_MIN, TRAINING_MIN, SPAN_MIN, PROMISE_PER_30_DAYS = 0.1, 100.0, 1500.0, 30.0

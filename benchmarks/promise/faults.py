@@ -23,8 +23,8 @@ from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import to_minutes
-from reactorwatch.runtime.parallel import choose_executor
-from reactorwatch.runtime.parallel.jobs import Executor
+from reactorwatch.runtime.executors import choose_executor
+from reactorwatch.runtime.jobs import Executor
 from recorder.tools.player import samples_of
 
 SEEDS, PER_30_DAYS = 3, 1.0

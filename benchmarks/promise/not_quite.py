@@ -8,7 +8,7 @@ import numpy as np
 import reactorwatch as rw
 from benchmarks.promise.plants import INPUTS, KINDS, simulate
 from benchmarks.promise.pool import median_interval, poisson_interval, run_jobs, share_interval
-from reactorwatch.runtime.parallel.jobs import Executor
+from reactorwatch.runtime.jobs import Executor
 
 SEED, SEED_STEP = 100, 1000
 """Seed of the first plant of the first set, and the difference to that of the next set."""

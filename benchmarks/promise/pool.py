@@ -6,7 +6,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.stats import beta, binom, chi2
 
-from reactorwatch.runtime.parallel.jobs import Executor, Failed, in_job_order
+from reactorwatch.runtime.jobs import Executor, Failed, in_job_order
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

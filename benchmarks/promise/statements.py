@@ -19,8 +19,8 @@ from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import Encoded, encode
-from reactorwatch.runtime.parallel import choose_executor
-from reactorwatch.runtime.parallel.jobs import Executor
+from reactorwatch.runtime.executors import choose_executor
+from reactorwatch.runtime.jobs import Executor
 from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.ewma import Ewma, designed_limit
 from reactorwatch.spc.charts.shewhart import Shewhart, designed_width

@@ -16,7 +16,7 @@ from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import fill_folder, make_folder
 from reactorwatch.records.output import check_output_folder
 from reactorwatch.records.record import Record
-from reactorwatch.runtime.parallel.jobs import Failed
+from reactorwatch.runtime.jobs import Failed
 from reactorwatch.terminal import printable_lines
 
 PAGE = "study.md"

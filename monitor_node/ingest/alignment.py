@@ -16,7 +16,7 @@ from math import nan
 
 from monitor_node.ingest.duplicates import AlignmentMemory, PendingRow
 from monitor_node.ingest.rows import Row
-from reactorwatch.runtime.delivery.gap_tracker import GapTracker
+from reactorwatch.runtime.gap_tracker import GapTracker
 
 REMEMBERED = 4  # times the reordering: emitted rows kept to detect duplicates; step back that means a restart
 MOST_LOST = 2**62  # more than any plant publishes; corrupt sequence numbers must not overflow the count in a message

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from msgspec import field
 
-from reactorwatch.runtime.delivery.gap_tracker import GapTracker
+from reactorwatch.runtime.gap_tracker import GapTracker
 from reactorwatch.stored_state import Memory
 
 

@@ -29,7 +29,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from monitor_node.ingest.alignment import REMEMBERED
-from reactorwatch.runtime.delivery.gap_tracker import GapTracker
+from reactorwatch.runtime.gap_tracker import GapTracker
 from reactorwatch.spc.silence import Spacing
 
 CONFIRMED, COUNTED = 8, 3

@@ -27,8 +27,8 @@ from reactorwatch.records.cells import quote_formula
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.folder import fill_folder
 from reactorwatch.records.input_file import list_files
-from reactorwatch.runtime.parallel import choose_executor
-from reactorwatch.runtime.parallel.jobs import Failed, in_job_order
+from reactorwatch.runtime.executors import choose_executor
+from reactorwatch.runtime.jobs import Failed, in_job_order
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
 

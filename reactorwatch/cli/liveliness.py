@@ -5,7 +5,7 @@ import threading
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.liveliness import wait_alive
+from reactorwatch.runtime.start import wait_alive
 
 
 def wait_for_node(config: BusConfig, plant: str, node: str, timeout_s: float) -> bool:

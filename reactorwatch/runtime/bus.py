@@ -6,7 +6,7 @@ from typing import Protocol, TypedDict, Unpack
 from google.protobuf.message import Message
 
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.reorder_buffer import Gap
 
 MAX_BATCH = 2000
 """Messages of one call of a batch handler."""

@@ -19,9 +19,9 @@ from typing import TypeAlias
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.runtime.bus import MAX_BATCH, Bus, Request
 from reactorwatch.runtime.clock import SteadyClock
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from reactorwatch.runtime.node import Node
-from reactorwatch.runtime.security.audit import audit
+from reactorwatch.runtime.reorder_buffer import Gap
+from reactorwatch.runtime.security.acl import audit
 
 MAX_WAIT_S = 3600.0
 MAX_DRAIN_FACTOR = 10

@@ -1,12 +1,16 @@
-"""Start of a node: it joins the bus under a name of its own, and waits for what the machine refuses at the moment."""
+"""Start of a node: it joins the bus under its own name, and waits for other nodes and what the machine refuses.
+
+A node shows a liveliness token once it is subscribed.
+"""
 
 import os
 import random
 import re
 import secrets
 import socket
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -28,6 +32,8 @@ log = structlog.get_logger()
 
 GONE_WITHIN_S = LEASE_S + 2.0
 """Time after which the token of an instance that died without closing its connection has disappeared."""
+LOG_INTERVAL_S = 30.0
+"""Time between two lines in the log about what is waited for."""
 LOOK_AGAIN_S = (0.1, 0.5)
 """Bounds of the random time between two looks: of two instances that start at once, one looks first."""
 
@@ -124,3 +130,37 @@ def wait_ready(
         bus.publish(encode(Publication(keys.key(plant, keys.HEALTH, node), health)))
 
     return retry(attempt, stop.wait, on_failure)
+
+
+def wait_alive(bus: Bus, plant: str, nodes: Collection[str], stop: StopSignal, waiting: str) -> bool:
+    """Wait until nodes of a plant are alive, all at the same time.
+
+    Args:
+        bus: an open bus.
+        plant: name of the plant.
+        nodes: names of the nodes.
+        stop: ends the wait.
+        waiting: name of the waiting node, for a line in the log now and every half minute.
+
+    Returns:
+        True once they are all alive; False if a stop was requested first.
+    """
+    changed = threading.Event()
+    alive: set[str] = set()
+
+    def on_token(key: str, is_alive: bool) -> None:
+        topic = keys.parse(key)
+        if topic is not None:
+            (alive.add if is_alive else alive.discard)(topic.name)
+            changed.set()
+
+    stop.call_on_set(changed.set)
+    if nodes:
+        bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), on_token)
+    while True:
+        changed.clear()  # before the check: a later change wakes the wait below
+        missing = [node for node in nodes if node not in alive]
+        if stop.is_set or not missing:
+            return not stop.is_set
+        log.info("waiting", node=waiting, for_=", ".join(missing))
+        changed.wait(LOG_INTERVAL_S)

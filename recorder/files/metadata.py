@@ -2,7 +2,7 @@
 
 There is one of the file itself (the version that wrote it, and details of its origin), one of each plant's process (its
 signals with their units and roles, and its equations) and one of each gap: messages lost on the bus. Publishers number
-their messages (`reactorwatch.runtime.delivery.reorder_buffer`), so the number and the range of lost messages is known.
+their messages (`reactorwatch.runtime.reorder_buffer`), so the number and the range of lost messages is known.
 
 Equations of the catalogue are stored by name, with the constants that differ and the deviations that the model holds,
 and other ones as data (`stored_equations`). Effects of a user's code are neither: a recording of a process that has
@@ -23,7 +23,7 @@ from reactorwatch.limits import parse_json
 from reactorwatch.process import EFFECTS_OF
 from reactorwatch.process.extended_model import ExtendedModel, extended_model_of, is_complete, parse_extended_model
 from reactorwatch.records.record import Record
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.reorder_buffer import Gap
 
 METADATA = "reactorwatch"
 """Name of the record that a writer of this software starts a file with."""

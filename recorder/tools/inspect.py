@@ -9,7 +9,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.reorder_buffer import Gap
 from recorder import RecordedMessage
 from recorder.files.metadata import gaps_of, own_metadata, processes_in
 from recorder.files.reader import Reader, read_start

@@ -26,9 +26,8 @@ from reactorwatch.records.record import NEVER_NS, to_time_ns
 from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
-from reactorwatch.runtime.liveliness import wait_alive
 from reactorwatch.runtime.node_main import main
-from reactorwatch.runtime.start import instance_name, join
+from reactorwatch.runtime.start import instance_name, join, wait_alive
 from recorder.config import ReplayConfig
 from recorder.files.recording import Recording
 from recorder.tools.convert import plant_name

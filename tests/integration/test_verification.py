@@ -13,7 +13,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import decode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Sample
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.reorder_buffer import Gap
 from reactorwatch.version import UNKNOWN, build_metadata, describe_build
 from recorder import RecordedMessage
 from recorder.files.copies import cut, recover, sample_window

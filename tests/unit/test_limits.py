@@ -24,9 +24,9 @@ from reactorwatch.limits import Limits, limits, parse_json, parse_toml, set_limi
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.runtime.config import read_settings
+from reactorwatch.runtime.executors import ProcessExecutor
+from reactorwatch.runtime.jobs import SerialExecutor
 from reactorwatch.runtime.model_file import read_extended_model
-from reactorwatch.runtime.parallel.jobs import SerialExecutor
-from reactorwatch.runtime.parallel.process_pool import ProcessExecutor
 from tests.unit.runtime.work import limits_in_force
 
 ROOT = Path(__file__).parents[2]

@@ -30,9 +30,8 @@ from reactorwatch.runtime.bus_zenoh.messages import (
     zenoh_expression,
 )
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.delivery.delivery import Delivery, SequencedMessage
-from reactorwatch.runtime.delivery.reorder_buffer import Gap, ReorderBuffer
-from reactorwatch.runtime.delivery.streams import STREAM_PARTS, keys_of, stream_of
+from reactorwatch.runtime.delivery import STREAM_PARTS, Delivery, SequencedMessage, keys_of, stream_of
+from reactorwatch.runtime.reorder_buffer import Gap, ReorderBuffer
 from reactorwatch.runtime.security.acl import CACHE_SUFFIX, NO_QUERYABLE
 
 log = structlog.get_logger()

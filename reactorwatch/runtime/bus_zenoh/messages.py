@@ -7,7 +7,7 @@ from typing import TypeAlias
 import zenoh
 
 from reactorwatch.contract.codec import MAX_PAYLOAD, Encoded
-from reactorwatch.runtime.delivery.streams import STREAM_PARTS
+from reactorwatch.runtime.delivery import STREAM_PARTS
 
 MAX_ENCODING = 1000
 MAX_KEY = 1000

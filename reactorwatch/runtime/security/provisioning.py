@@ -10,18 +10,22 @@ SITE/cstr/viewer/ ...
 import datetime
 import json
 import re
+import secrets
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import tomli_w
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import serialization
 
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
+from reactorwatch.limits import parse_json
 from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.input_file import read_regular
 from reactorwatch.runtime.security.acl import ROLES, SERIAL_BYTES, access_control, common_name
 from reactorwatch.runtime.security.certificates import (
     Identity,
@@ -31,7 +35,6 @@ from reactorwatch.runtime.security.certificates import (
     read_common_name,
     read_key,
 )
-from reactorwatch.runtime.security.site_register import Register, read_register
 from reactorwatch.runtime.setting_rules import LAST_PORT
 
 AUTHORITY, ROUTER = "authority", "router"
@@ -46,6 +49,54 @@ MAX_DAYS = 3650.0
 MAX_COMMON_NAME = 64
 """Letters of a certificate's common name (RFC 5280, ub-common-name)."""
 MAX_PLANT_NAME = MAX_COMMON_NAME - max(len(common_name("", role.name)) for role in ROLES) - 2 * SERIAL_BYTES - 1
+
+
+class Register(msgspec.Struct, forbid_unknown_fields=True):
+    """Addresses of a site's router, and valid common names of its certificates: `SITE/authority/site.json`.
+
+    Attributes:
+        endpoint: the address at which nodes connect to the router.
+        listen: the address at which it listens.
+        names: common names of certificates by holder, such as `cstr/monitor`, where earlier ones were revoked.
+        revoked: common names that the router refuses, oldest first.
+    """
+
+    endpoint: str
+    listen: str
+    names: dict[str, str] = {}
+    revoked: list[str] = []
+
+    def name_of(self, holder: str) -> str:
+        """Common name of a holder's certificates."""
+        plant, _, role = holder.partition("/")
+        return self.names.get(holder) or common_name(plant, role)
+
+    def revoke(self, holder: str) -> str:
+        """Revoke all present certificates of a holder; returns their common name."""
+        name = self.name_of(holder)
+        plant, _, role = holder.partition("/")
+        self.revoked.append(name)
+        self.names[holder] = f"{common_name(plant, role)}.{secrets.token_hex(SERIAL_BYTES)}"
+        return name
+
+    def write(self, path: Path) -> None:
+        """Write the file, completely or not at all."""
+        with atomic_write(path) as part:
+            part.write_bytes(msgspec.json.encode(self) + b"\n")
+
+
+def read_register(path: Path) -> Register | None:
+    """Read the register of a site; None if there is none.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    if not path.exists():
+        return None
+    try:
+        return msgspec.convert(parse_json(read_regular(path)), Register)
+    except (OSError, InputError, msgspec.ValidationError) as error:
+        raise InputError(f"{path}: cannot be read as what `certify` has written there: {error}") from error
 
 
 def make_site(

@@ -15,7 +15,7 @@ from benchmarks.promise.pool import median_interval, poisson_interval, run_jobs,
 from plant_node.record import simulate_record
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.runtime.parallel.jobs import SerialExecutor
+from reactorwatch.runtime.jobs import SerialExecutor
 
 ROOT = Path(__file__).parents[3]
 RANDOM_STEPS = INPUTS["a new flow in 90 to 111 each minute"]

@@ -15,7 +15,7 @@ from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.node import MonitorNode
 from reactorwatch.contract.codec import Publication
 from reactorwatch.diagnosis.result import NAMED
-from reactorwatch.runtime.parallel.jobs import SerialExecutor
+from reactorwatch.runtime.jobs import SerialExecutor
 
 from ...running import WITHIN_S
 from .warm_plant import CONFIG, LATE, TRAINED, Run, changes

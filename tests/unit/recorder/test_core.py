@@ -8,7 +8,7 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Encoded, Publication, encode, encode_message, encoding_of
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.reorder_buffer import Gap
 from recorder import RecordedMessage
 from recorder.core import DISK_ALARM, KEYS_ALARM, Recorder, fingerprint
 

@@ -8,7 +8,7 @@ from mcap.records import Metadata
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.reorder_buffer import Gap
 from recorder.config import RecorderConfig
 from recorder.files.copies import Window, cut, recover
 from recorder.files.metadata import GAP, gap_metadata, parse_gap

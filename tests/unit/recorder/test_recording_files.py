@@ -7,7 +7,7 @@ import pytest
 
 from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.reorder_buffer import Gap
 from recorder.config import RecorderConfig
 from recorder.core import ReceivedMessage, Recorder
 from recorder.files.metadata import gap_metadata, gaps_of, own_metadata, parse_gap, processes_in

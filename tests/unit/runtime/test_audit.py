@@ -18,7 +18,7 @@ from reactorwatch.contract.messages_pb2 import (
     ShelveAlarm,
 )
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal
-from reactorwatch.runtime.security.audit import audit
+from reactorwatch.runtime.security.acl import audit
 from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
 

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import pytest
 
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.runtime.delivery import reorder_buffer
-from reactorwatch.runtime.delivery.delivery import Delivery, SequencedMessage
-from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime import reorder_buffer
+from reactorwatch.runtime.delivery import Delivery, SequencedMessage
+from reactorwatch.runtime.reorder_buffer import Gap
 from tests.running import WITHIN_S
 
 SECOND = 10**9
@@ -43,7 +43,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     """Clock of the delivery, which a test sets."""
     clock = SimpleNamespace(now_ns=SECOND)
     times = SimpleNamespace(monotonic_ns=lambda: clock.now_ns, time_ns=time.time_ns)
-    monkeypatch.setattr("reactorwatch.runtime.delivery.delivery.time", times)
+    monkeypatch.setattr("reactorwatch.runtime.delivery.time", times)
     return clock
 
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reactorwatch.runtime.delivery.gap_tracker import GapTracker
+from reactorwatch.runtime.gap_tracker import GapTracker
 
 
 class Remembering(GapTracker):

@@ -7,11 +7,11 @@ import sys
 
 import pytest
 
-from reactorwatch.runtime.heap import LARGE_BYTES
+from reactorwatch.runtime.bus_zenoh.sessions import LARGE_BYTES
 
 SIZES = f"""
 import ctypes, sys
-from reactorwatch.runtime import heap
+from reactorwatch.runtime.bus_zenoh import sessions as heap
 class Counts(ctypes.Structure):
     _fields_ = [(f"field{{place}}", ctypes.c_size_t) for place in range(10)]
 library = ctypes.CDLL(None)

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import pytest
 
 from reactorwatch.runtime.delivery import reorder_buffer, stream_state
-from reactorwatch.runtime.delivery.reorder_buffer import (
+from reactorwatch.runtime.reorder_buffer import (
     ORPHAN_TIMEOUT_NS,
     POLL_NS,
     RECOVERY_TIMEOUT_NS,

@@ -1,5 +1,6 @@
-"""Pool of processes on this machine: each runs one job at a time and returns the result over its own pipe.
+"""Executors of jobs: processes of this machine, or by `dask_workers` those of a cluster.
 
+Each process of the pool runs one job at a time and returns the result over its own pipe.
 The standard library's pool breaks as a whole when one of its processes dies, and does not name the job. Here the end of
 a pipe identifies both, so the others continue and a new process retries that job.
 
@@ -20,8 +21,19 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, cast
 
+from reactorwatch.errors import InputError
 from reactorwatch.limits import Limits, limits
-from reactorwatch.runtime.parallel.jobs import RETRIES, Failed, Job, Result, internal_error, run_job, worker_death
+from reactorwatch.runtime.jobs import (
+    RETRIES,
+    Executor,
+    Failed,
+    Job,
+    Result,
+    SerialExecutor,
+    internal_error,
+    run_job,
+    worker_death,
+)
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that libraries of linear algebra read when they are loaded."""
@@ -175,3 +187,29 @@ def _do_jobs(work: Callable[[Job], Result], given: Limits, pipe: "Connection[Any
                 pipe.send(internal_error(error))
     except (EOFError, OSError):
         return
+
+
+def choose_executor(processes: int | None = None, scheduler: str | None = None) -> Executor:
+    """Choose an executor.
+
+    Args:
+        processes: number of processes on this machine; None: one for each core that this process may use. One: this
+            process.
+        scheduler: address of a Dask cluster's scheduler, such as `tcp://127.0.0.1:8786`; None: this machine.
+
+    Raises:
+        InputError: both are given, there are no processes, or there is no such cluster.
+    """
+    if scheduler is not None:
+        if processes is not None:
+            raise InputError("--jobs is for this machine, and --scheduler for a cluster; give one of them")
+        from reactorwatch.runtime.dask_workers import DaskExecutor
+
+        return DaskExecutor(scheduler)
+    from reactorwatch.runtime.executors import ProcessExecutor, available_cores
+
+    if processes is None:
+        processes = available_cores()
+    if processes < 1:
+        raise InputError(f"--jobs must be at least 1, got {processes}")
+    return SerialExecutor() if processes == 1 else ProcessExecutor(processes)

@@ -1,15 +1,24 @@
-"""Ordered delivery of a subscription's messages; a thread gives up those that are missing too long."""
+"""Ordered delivery of a subscription's messages; a thread gives up those that are missing too long.
+
+Publishers number their messages in streams, groups of keys. A subscriber drops a number that it has already seen as a
+repetition. So numbers must be counted among messages that only one role may publish: otherwise the holder of another
+role's certificate could publish on its own keys with the publisher's name and next numbers, and have the publisher's
+messages dropped. The access rules (`acl`) define which role publishes on a key; a stream is all of one kind of one
+plant that one role may publish.
+"""
 
 import threading
 import time
 from collections.abc import Callable, Iterable
+from functools import lru_cache
 from itertools import islice
 from math import inf
 from typing import NamedTuple
 
+from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.runtime.delivery.reorder_buffer import Gap, ReorderBuffer
-from reactorwatch.runtime.delivery.streams import stream_of
+from reactorwatch.runtime.reorder_buffer import Gap, ReorderBuffer
+from reactorwatch.runtime.security.acl import ROLES, Role
 
 MAX_STREAMS_QUERIED = 100
 """Streams whose publishers are queried again at once: with more than that the network broke down, and the queries would
@@ -180,3 +189,56 @@ class Delivery:
         self._query_all_ns = {name: due_ns for name, due_ns in self._query_all_ns.items() if due_ns > now_ns}
         self._query_all_ns[stream] = now_ns + QUERY_ALL_INTERVAL_NS
         self.receive(self._query_stream(stream, inf))
+
+
+STREAM_PARTS = 3
+"""Parts of a key that a stream has in common: root, plant and kind."""
+MAX_CACHED = 1000
+"""Names below a plant whose role is cached: all plants have the same ones, and made-up names evict each other."""
+
+_KEY_SPACES = sorted(
+    ((expression, role) for role in ROLES for expression in role.key_space),
+    key=lambda item: item[0].count("/"),
+    reverse=True,
+)
+"""Narrowest first: the monitor's expression also matches the recorder's own alarms."""
+
+
+@lru_cache(maxsize=MAX_CACHED)
+def role_of_key(name: str) -> Role | None:
+    """Role that may publish on a key; None if no role may.
+
+    Args:
+        name: the key below its plant.
+
+    >>> [role_of_key(name).name for name in ("alarm/ewma/T", "alarm/recording/disk", "health/plant")]
+    ['monitor', 'recorder', 'plant']
+    >>> role_of_key("health/somebody") is None
+    True
+    """
+    return next((role for expression, role in _KEY_SPACES if keys.matches(expression, name)), None)
+
+
+def stream_of(key: str) -> str:
+    """Stream of a key: root, plant and kind, and the role where it does not publish all of the kind.
+
+    >>> stream_of("reactor/cstr/chart/ewma/T"), stream_of("reactor/cstr/alarm/recording/disk")
+    ('reactor/cstr/chart', 'reactor/cstr/alarm/@recorder')
+    """
+    parts = key.split("/")
+    kind = "/".join(parts[:STREAM_PARTS])
+    if parts[0] != keys.ROOT or len(parts) < STREAM_PARTS:
+        return kind
+    role = role_of_key("/".join(parts[2:]))
+    if role is None:
+        return f"{kind}/@none"
+    return kind if f"{parts[2]}/**" in role.key_space else f"{kind}/@{role.name}"
+
+
+def keys_of(stream: str) -> str:
+    """Key expression that matches all keys of a stream, and perhaps those of other roles.
+
+    >>> keys_of("reactor/cstr/alarm/@recorder")
+    'reactor/cstr/alarm/**'
+    """
+    return "/".join((*stream.split("/")[:STREAM_PARTS], "**"))

@@ -12,7 +12,7 @@ from typing import Any
 
 from reactorwatch.errors import InputError
 from reactorwatch.limits import limits
-from reactorwatch.runtime.parallel.jobs import Failed, Job, Result, internal_error, one_line, run_job, worker_death
+from reactorwatch.runtime.jobs import Failed, Job, Result, internal_error, one_line, run_job, worker_death
 from reactorwatch.version import version as own_version
 
 CONNECT_WITHIN_S = 10.0

@@ -1,1 +1,0 @@
-"""Delivery of messages in the order of their publication, without gaps."""
