@@ -107,7 +107,7 @@ def monitor(
     from monitor_node.config import MonitorConfig
     from monitor_node.fleet.config import FleetConfig
     from reactorwatch.cli.supervise import diagnosis_settings, run_diagnosis_node
-    from reactorwatch.records.output import check_folder_name
+    from reactorwatch.records.write import check_folder_name
     from reactorwatch.runtime.config import LogConfig, section
 
     tables, bus = _settings(target)
@@ -146,7 +146,7 @@ def record(
     ] = None,
 ) -> None:
     """Record everything on the bus into an MCAP file."""
-    from reactorwatch.records.output import check_folder_name
+    from reactorwatch.records.write import check_folder_name
     from reactorwatch.runtime.config import section
     from recorder.__main__ import run
     from recorder.config import RecorderConfig
@@ -205,8 +205,8 @@ def replay(
         pace = {"name": name, "speed": parse_pace(rate, "--rate"), "process": chosen.process}
         played = PlayedRecord(check_recording(file), table.stated)
         raise typer.Exit(run_until_stopped(target, None, pace, None, None, played))
+    from reactorwatch.records.decode import is_table
     from reactorwatch.records.record import MINUTE_NS
-    from reactorwatch.records.source_text import is_table
     from reactorwatch.runtime.config import section
     from recorder.config import ReplayConfig
     from recorder.tools.replay import run_replay
