@@ -253,7 +253,7 @@ def check_alive(config: BusConfig, plant: str, nodes: Sequence[str], timeout_s: 
     changed, stop = threading.Condition(), StopSignal()
     until_s = time.monotonic() + timeout_s
 
-    def expected() -> Sequence[str]:
+    def wanted_nodes() -> Sequence[str]:
         return nodes or ("replay" if "replay" in alive else "plant", "monitor", "recorder")
 
     def on_token(key: str, is_alive: bool) -> None:
@@ -273,10 +273,10 @@ def check_alive(config: BusConfig, plant: str, nodes: Sequence[str], timeout_s: 
         try:
             bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), on_token)
             with changed:
-                changed.wait_for(lambda: alive.issuperset(expected()), max(until_s - time.monotonic(), 0.0))
+                changed.wait_for(lambda: alive.issuperset(wanted_nodes()), max(until_s - time.monotonic(), 0.0))
         finally:
             bus.close()
-    found = {node: node in alive for node in expected()}
+    found = {node: node in alive for node in wanted_nodes()}
     if as_json:
         states = [{"node": node, "alive": is_alive} for node, is_alive in found.items()]
         print_screen_text(json_line({"plant": plant, "nodes": states}))
