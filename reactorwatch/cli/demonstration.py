@@ -22,6 +22,7 @@ from reactorwatch.cli.bus_settings import (
     write_node_settings,
 )
 from reactorwatch.cli.display import format_age, print_report
+from reactorwatch.cli.kernels import compile_at_first_start
 from reactorwatch.cli.plant_settings import WAIT_FOR, complete_plant_settings
 from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.processes import Processes
@@ -112,6 +113,7 @@ def run(flags: dict[str, Any], fault: str | None, out: Path | None, site: Path |
         processes={PLANT: flags["process"] or DEFAULT_PROCESS},
         about={"seed": str(plant.seed)},
     )
+    compile_at_first_start()
     with open_router(site, join) as bus:
         make_folder(folder, "--out")
         tables = {"plant": plant, "monitor": monitor}
