@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from reactorwatch.runtime.delivery import reorder_buffer, stream_state
+from reactorwatch.runtime import reorder_buffer
 from reactorwatch.runtime.reorder_buffer import (
     ORPHAN_TIMEOUT_NS,
     POLL_NS,
@@ -283,14 +283,14 @@ def test_a_late_listener_gathers_as_long_as_older_ones_come_and_not_as_long_as_n
 
 
 def test_no_more_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream_state, "MAX_HELD", 100)
+    monkeypatch.setattr(reorder_buffer, "MAX_HELD", 100)
     order = ReorderBuffer[int]()
     fed(order, [0])
     assert fed(order, list(range(2, 103))) == [Gap(STREAM, 1, 1, 1, 1, 0), *range(2, 103)]
 
 
 def test_no_more_bytes_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream_state, "MAX_HELD_BYTES", 1000)
+    monkeypatch.setattr(reorder_buffer, "MAX_HELD_BYTES", 1000)
     order = ReorderBuffer[int](size=lambda _: 100)
     fed(order, [0])
     assert fed(order, list(range(2, 13))) == [Gap(STREAM, 1, 1, 1, 1, 0), *range(2, 13)]
@@ -299,7 +299,7 @@ def test_no_more_bytes_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyP
 
 def test_during_the_history_no_more_messages_wait_than_the_capacity(monkeypatch: pytest.MonkeyPatch) -> None:
     """What did not find room is told as missing."""
-    monkeypatch.setattr(stream_state, "MAX_HELD", 10)
+    monkeypatch.setattr(reorder_buffer, "MAX_HELD", 10)
     order = ReorderBuffer[int](await_history=True)
     assert fed(order, range(100)) == []
     told = [*order.end_history(0), *fed(order, [100, 101])]
@@ -321,14 +321,14 @@ def test_idle_publishers_are_evicted_and_the_active_one_is_not(
 
 
 def test_keys_without_number_are_not_all_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream_state, "MAX_KEYS", 10)
+    monkeypatch.setattr(reorder_buffer, "MAX_KEYS", 10)
     order = ReorderBuffer[int]()
     assert [item for number in range(100) for item in fed(order, [number], key=f"x{number}")] == list(range(100))
     assert len(order._streams[1, STREAM].keys) == 10
 
 
 def test_the_fast_way_is_for_keys_that_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream_state, "MAX_KEYS", 10)
+    monkeypatch.setattr(reorder_buffer, "MAX_KEYS", 10)
     order = ReorderBuffer[int]()
     fed(order, [0], key="x0")
     for number in range(1, 100):
