@@ -1,7 +1,6 @@
 """Cost of the charts a row, and effect of autocorrelation on their false alarms.
 
-Cost: those of one signal, in the single form and, a plant, in the form for thousands; and all charts of one plant as
-the monitor runs them, of two outputs. Goals: 20 and 1 microseconds.
+Cost: those of one signal; and all charts of one plant as the monitor runs them, of two outputs. Goal: 20 microseconds.
 False alarms: mean run length of charts designed for independent data on AR(1) data of unit variance, by simulation,
 beside the run length computed for independent data.
 """
@@ -17,16 +16,15 @@ from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.charts import ChartWatch
 from monitor_node.config import ChartName, MonitorConfig
 from monitor_node.ingest.rows import Interval, MeasuredRow
-from reactorwatch.spc import run_length
 from reactorwatch.spc.charts.base import SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS
-from reactorwatch.spc.charts.cusum import Cusum
-from reactorwatch.spc.charts.ewma import Ewma
-from reactorwatch.spc.charts.shewhart import Shewhart
-from reactorwatch.spc.compiled_chart import Bank, CompiledChart
+from reactorwatch.spc.charts.cusum import Cusum, cusum_run_length
+from reactorwatch.spc.charts.ewma import Ewma, ewma_run_length
+from reactorwatch.spc.charts.shewhart import Shewhart, shewhart_run_length
+from reactorwatch.spc.compiled_chart import OUT, CompiledChart, SignalMemory, X, columns_of
 from reactorwatch.spc.prewhitening import Prewhitening
 
-ROWS, PLANTS, REPEATS, RUNS = 20_000, 10_000, 5, 4_000
+ROWS, REPEATS, RUNS = 20_000, 5, 4_000
 PHIS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9)
 
 
@@ -56,16 +54,13 @@ def costs() -> None:
     """Print the cost of a row."""
     rng = np.random.default_rng(1)
     values = rng.standard_normal(ROWS).tolist()
-    plants = rng.standard_normal(PLANTS)
-    single_total = bank_total = 0.0
-    print(f"{'cost a row':<12}{'single':>12}{f'{PLANTS:,} plants':>18}")
+    total = 0.0
+    print(f"{'cost a row':<12}{'single':>12}")
     for chart in all_charts():
-        bank = Bank([chart] * PLANTS)
         single = best_of(partial(update_all, chart.update, values)) / ROWS
-        each = best_of(partial(update_all, bank.update, [plants] * 20)) / (20 * PLANTS)
-        single_total, bank_total = single_total + single, bank_total + each
-        print(f"{chart.name:<12}{single * 1e6:9.2f} us{each * 1e6:15.4f} us")
-    print(f"{'all':<12}{single_total * 1e6:9.2f} us{bank_total * 1e6:15.4f} us   (goals: 20 and 1)")
+        total += single
+        print(f"{chart.name:<12}{single * 1e6:9.2f} us")
+    print(f"{'all':<12}{total * 1e6:9.2f} us   (goal: 20)")
 
 
 def of_a_plant() -> None:
@@ -99,31 +94,33 @@ def of_a_plant() -> None:
         print(f"{', '.join(charts)}: {each * 1e6:.2f} us a row of one plant   (goal: 20)")
 
 
-def simulated_run_length(charts: Sequence[CompiledChart], phi: float, seed: int) -> tuple[float, float]:
+def simulated_run_length(chart: CompiledChart, phi: float, seed: int) -> tuple[float, float]:
     """Mean run length on AR(1) data of unit variance, and its standard error."""
     rng = np.random.default_rng(seed)
-    bank = Bank(charts)
-    x = rng.standard_normal(len(charts))
-    running, lengths = np.ones(len(charts), dtype=np.bool_), np.zeros(len(charts))
+    columns = columns_of(type(chart), SignalMemory(chart.name, np.tile(chart.memory.numbers, RUNS)))
+    x = rng.standard_normal(RUNS)
+    running, lengths = np.ones(RUNS, dtype=np.bool_), np.zeros(RUNS)
     while running.any():
         lengths += running
-        running &= ~bank.update(x, running).out
-        x = phi * x + np.sqrt(1.0 - phi * phi) * rng.standard_normal(len(charts))
-    return float(lengths.mean()), float(lengths.std() / np.sqrt(len(charts)))
+        columns[X] = x
+        chart.kernel(columns)
+        running &= columns[OUT] <= 0.0
+        x = phi * x + np.sqrt(1.0 - phi * phi) * rng.standard_normal(RUNS)
+    return float(lengths.mean()), float(lengths.std() / np.sqrt(RUNS))
 
 
 def autocorrelation() -> None:
     """Print the run lengths without a shift, by the autocorrelation."""
     charts: list[tuple[str, CompiledChart, float]] = [
-        ("Shewhart 3 sigma", Shewhart(0.0, 1.0), run_length.shewhart(0.0)),
-        ("CUSUM h 4", Cusum(0.0, 1.0, h=4.0), run_length.cusum(0.0, h=4.0)),
-        ("CUSUM h 5", Cusum(0.0, 1.0, h=5.0), run_length.cusum(0.0, h=5.0)),
-        ("EWMA 0.1, L 2.814", Ewma(0.0, 1.0, 0.1, 2.814), run_length.ewma(0.0, 0.1, 2.814)),
+        ("Shewhart 3 sigma", Shewhart(0.0, 1.0), shewhart_run_length(0.0)),
+        ("CUSUM h 4", Cusum(0.0, 1.0, h=4.0), cusum_run_length(0.0, h=4.0)),
+        ("CUSUM h 5", Cusum(0.0, 1.0, h=5.0), cusum_run_length(0.0, h=5.0)),
+        ("EWMA 0.1, L 2.814", Ewma(0.0, 1.0, 0.1, 2.814), ewma_run_length(0.0, 0.1, 2.814)),
     ]
     print("\n| phi | " + " | ".join(name for name, _, _ in charts) + " |\n" + "|---" * (len(charts) + 1) + "|")
     print("| 0, computed | " + " | ".join(f"{length:.0f}" for _, _, length in charts) + " |")
     for phi in PHIS:
-        found = [simulated_run_length([chart] * RUNS, phi, seed=1) for _, chart, _ in charts]
+        found = [simulated_run_length(chart, phi, seed=1) for _, chart, _ in charts]
         print(f"| {phi:g} | " + " | ".join(f"{mean:.0f} ± {error:.0f}" for mean, error in found) + " |")
 
 

@@ -2,7 +2,7 @@
 
 Cost: in the single form. Goal: 3 microseconds.
 False alarms: of a first-order ARX plant with AR(1) noise, as a multiple of the number promised. Omega of the covariance
-is learned by cosines as in `reactorwatch.spc.parameter_drift`; with the weights of Newey & West at the bandwidth 1.3
+is learned by cosines as in `reactorwatch.spc.charts.parameters`; with the weights of Newey & West at the bandwidth 1.3
 sqrt(rows), its degrees of freedom 1.5 rows over that; and as the textbook has it, s^2 H. At rest: the reactor with
 noise, trained on steps of the coolant flow; the largest T2 over its limit afterwards.
 """
@@ -13,12 +13,10 @@ from math import sqrt
 import numpy as np
 from scipy import signal
 
+from reactorwatch.arrays import Array
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.spc import parameter_drift
-from reactorwatch.spc.charts.base import Array
-from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.run_length.parameters import parameter_limit
+from reactorwatch.spc.charts.parameters import ParameterT2, learn, parameter_limit
 
 NAMES = ["a1", "b1", "c"]
 FORGETTING, WEIGHT, ARL0 = 0.99, 0.01, 5000.0
@@ -80,7 +78,7 @@ def false_alarms(training: int, correlation: float) -> list[tuple[float, float]]
         seen = regressors[:training]
         residuals = y[101 : 101 + training] - seen @ reference
         charts = [
-            parameter_drift.learn(seen, residuals, FORGETTING, training, ARL0, NAMES, past_outputs=1),
+            learn(seen, residuals, FORGETTING, training, ARL0, NAMES, past_outputs=1),
             other(seen, residuals, textbook=False),
             other(seen, residuals, textbook=True),
         ]
@@ -106,7 +104,7 @@ def in_service(name: str, later: Array, rng: np.random.Generator) -> None:
         differences = parameters - parameters[REFERENCE - 1]
         residuals = scaled_y[3 : 3 + TRAINING] - regressors[:TRAINING] @ parameters[REFERENCE - 1]
         names = ["a1", "a2", "a3", "b1", "b2", "b3", "c"]
-        chart = parameter_drift.learn(regressors[:TRAINING], residuals, 0.999, REFERENCE, 1e6, names, past_outputs=3)
+        chart = learn(regressors[:TRAINING], residuals, 0.999, REFERENCE, 1e6, names, past_outputs=3)
         pairs = list(zip(differences[TRAINING:], regressors[TRAINING:], strict=True))
         without = max(chart.update(d).statistic for d, _ in pairs) / chart.limit
         with_it = max(chart.update(d, row).statistic for d, row in pairs) / chart.limit
@@ -117,7 +115,7 @@ def cost() -> None:
     """Print the cost of a row, of the seven parameters of order 3."""
     rng = np.random.default_rng(1)
     names = [str(number) for number in range(7)]
-    chart = parameter_drift.learn(rng.standard_normal((1000, 7)), rng.standard_normal(1000), 0.999, 1000, 1e6, names, 3)
+    chart = learn(rng.standard_normal((1000, 7)), rng.standard_normal(1000), 0.999, 1000, 1e6, names, 3)
     rows = list(rng.standard_normal((20_000, 7)))
     best = np.inf
     for _ in range(REPEATS):

@@ -21,12 +21,11 @@ from plant_node.record import simulate_record
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.runtime.parallel import choose_executor
 from reactorwatch.runtime.parallel.jobs import Executor
-from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.ewma import Ewma, designed_limit
+from reactorwatch.spc.charts.base import Baseline
+from reactorwatch.spc.charts.ewma import Ewma, designed_limit, ewma_run_length
 from reactorwatch.spc.charts.shewhart import Shewhart, designed_width
+from reactorwatch.spc.false_alarm_budget import QUANTILE, TrainingErrors
 from reactorwatch.spc.prewhitening import Prewhitening, learn
-from reactorwatch.spc.run_length.ewma import ewma
-from reactorwatch.spc.training_errors import QUANTILE, TrainingErrors
 from recorder.tools.player import samples_of
 
 PLANTS, TRAININGS, COEFFICIENTS = 1000, (100, 1000, 5000), (0.0, 0.5)
@@ -146,7 +145,7 @@ def _true_rates(learned: Prewhitening, coefficient: float) -> tuple[float, float
     averaged = lfilter([WEIGHT], [1.0, WEIGHT - 1.0], response)
     spread = float(np.sqrt(averaged @ averaged * (2.0 - WEIGHT) / WEIGHT))
     limit = min(designed_limit(ARL0, WEIGHT, learned) / spread, 6.0)  # beyond, the rate is nothing
-    return point * ARL0, ARL0 / ewma(abs(mean) / spread, WEIGHT, limit)
+    return point * ARL0, ARL0 / ewma_run_length(abs(mean) / spread, WEIGHT, limit)
 
 
 def stated_sizes() -> dict[str, float]:

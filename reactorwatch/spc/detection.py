@@ -21,7 +21,7 @@ import numpy as np
 from scipy import linalg, special
 
 from reactorwatch.arrays import Array
-from reactorwatch.spc.m_of_n import false_alarm_rates
+from reactorwatch.spc.run_length import false_alarm_rates
 
 POWER = 0.9
 """Share of the cases in which a deviation is seen in time."""

@@ -16,7 +16,7 @@ sensitive to their errors; the size of these is stored beside them, and limits a
 """
 
 from collections.abc import Sequence
-from math import inf, nan
+from math import inf, nan, sqrt
 from typing import Any
 
 import msgspec
@@ -161,6 +161,29 @@ def _sd_variance(error: Array, freedom: int) -> float:
         return independent
     batches = squares[: size * BATCHES].reshape(BATCHES, size).mean(axis=1)
     return max(independent, float(batches.var(ddof=1)) / (4.0 * mean**2 * BATCHES))
+
+
+def memory_sds(e: Array, weight: float) -> tuple[float, ...]:
+    """Standard deviation of each signal that charts with a memory use; 1 if its residual is white.
+
+    An autoregression of few coefficients may miss a correlation over many rows. It shows in averages: theirs should
+    have the variance weight / (2 - weight). Where it is larger by more than chance allows, limits follow it.
+
+    Args:
+        e: prewhitened residuals, shape (rows, signals); NaN where there is none.
+        weight: weight of the newest row in the averages.
+    """
+    sds = []
+    for column in e.T:
+        column = column[np.isfinite(column)]
+        average, squares = 0.0, 0.0
+        for value in column.tolist():
+            average += weight * (value - average)
+            squares += average * average
+        ratio = squares / max(len(column), 1) * (2.0 - weight) / weight
+        independent = max(len(column) * weight / 2.0, 1.0)
+        sds.append(sqrt(ratio) if ratio > 1.0 + 3.0 * sqrt(2.0 / independent) else 1.0)
+    return tuple(sds)
 
 
 WHITENER = np.dtype(

@@ -29,7 +29,7 @@ from scipy.special import ndtri
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
-from reactorwatch.spc import false_alarm_budget
+from reactorwatch.spc.false_alarm_budget import widen_limit
 from reactorwatch.spc.prewhitening import (
     LARGEST_ORDER,
     WHITENER,
@@ -254,7 +254,7 @@ def design_limit(statistics: Array, learned: Prewhitening, arl0: float) -> float
         learned: prewhitening of the residual.
         arl0: run length without a fault, in rows.
     """
-    normal = false_alarm_budget.widen_limit(-float(ndtri(0.5 / (arl0 * HYPOTHESES))), 1.0, learned)
+    normal = widen_limit(-float(ndtri(0.5 / (arl0 * HYPOTHESES))), 1.0, learned)
     blocks = np.array_split(np.nan_to_num(statistics) ** 2, max(statistics.size // ONSETS, 1))
     largest = np.sort([float(block.max()) for block in blocks if block.size])
     upper = len(largest) // 2

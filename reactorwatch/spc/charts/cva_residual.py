@@ -17,15 +17,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from reactorwatch.spc.charts.base import Array, Setting
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart, standardise
+from reactorwatch.arrays import Array
+from reactorwatch.spc.charts.base import Setting
+from reactorwatch.spc.statistics_chart import EXPLAINED, Model, StatisticsChart, standardise
 from reactorwatch.spc.value_chart import ValueBaseline
 
 ROWS = 3
 """Rows of the past and of the future."""
-
-EXPLAINED = 0.9
-"""Share of the squared canonical correlations that the state has."""
 
 LEAST_VARIANCE = 1e-10
 """Share of the largest variance of a direction; directions with less are left out."""

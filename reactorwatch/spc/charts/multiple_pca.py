@@ -18,9 +18,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy import special
 
-from reactorwatch.spc.charts.base import Array, Setting
-from reactorwatch.spc.principal_components import Components, components_of, parts_of
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart, standardise
+from reactorwatch.arrays import Array
+from reactorwatch.spc.charts.base import Setting
+from reactorwatch.spc.statistics_chart import Components, Model, StatisticsChart, components_of, parts_of, standardise
 from reactorwatch.spc.value_chart import ValueBaseline
 
 DIMENSION = 3

@@ -13,11 +13,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from reactorwatch.spc.charts.base import Array, Setting, SignalSetting
-from reactorwatch.spc.charts.residual_space import BLOCKS
-from reactorwatch.spc.principal_components import components_of, parts_of
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart
-from reactorwatch.spc.value_chart import ValueBaseline
+from reactorwatch.arrays import Array
+from reactorwatch.spc.charts.base import Setting, SignalSetting
+from reactorwatch.spc.statistics_chart import Model, StatisticsChart, components_of, parts_of
+from reactorwatch.spc.value_chart import BLOCKS, ValueBaseline
 
 STAGES = 20
 """Number of intervals of a batch; courses are linear within one."""

@@ -18,10 +18,10 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from reactorwatch.spc.charts.base import Array, Setting, SignalSetting
-from reactorwatch.spc.charts.residual_space import BLOCKS
+from reactorwatch.arrays import Array
+from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.statistics_chart import Model, StatisticsChart, standardise
-from reactorwatch.spc.value_chart import ValueBaseline
+from reactorwatch.spc.value_chart import BLOCKS, ValueBaseline
 
 MOST_COMPONENTS = 8
 """Largest number of components; there is always one less than signals, so that something is left for SPE."""

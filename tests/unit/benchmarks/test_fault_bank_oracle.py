@@ -10,7 +10,7 @@ from benchmarks.faults.bank import BANK, Case
 from benchmarks.faults.oracle import log_likelihood_ratio, oracle_delay_min
 from benchmarks.faults.oracle_suspect import oracle_suspect
 from benchmarks.faults.runs import record_of, truth_of
-from reactorwatch.spc import run_length
+from reactorwatch.spc.charts.cusum import cusum_run_length
 
 ARL0 = 432_000.0
 
@@ -56,7 +56,7 @@ def test_a_fault_that_is_not_there_is_not_found() -> None:
 def test_pages_test_with_that_threshold_has_at_least_the_promised_run_length(shift: float) -> None:
     arl0 = 2000.0
     # In units of sigma: allowance shift / 2, limit ln(arl0) / shift; one side has twice the run length of two.
-    one_sided = 2 * run_length.cusum(0.0, shift / 2, log(arl0) / shift)
+    one_sided = 2 * cusum_run_length(0.0, shift / 2, log(arl0) / shift)
     assert one_sided >= arl0
 
 

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Array
-from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.run_length.control_limits import mewma_limit
-from reactorwatch.spc.run_length.parameters import parameter_limit, prepare_limit
+from reactorwatch.spc.charts.mewma import mewma_limit
+from reactorwatch.spc.charts.parameters import ParameterT2, parameter_limit, prepare_limit
 from reactorwatch.stored_state import copy_of
 from tests.unit.spc.members import COVARIANCE, ROOT, difference
 
@@ -180,7 +179,7 @@ def test_what_is_prepared_is_not_computed_again(monkeypatch: pytest.MonkeyPatch)
     def fail(*_: object) -> float:
         raise AssertionError("computed again")
 
-    monkeypatch.setattr("reactorwatch.spc.run_length.parameters.mewma", fail)
+    monkeypatch.setattr("reactorwatch.spc.charts.parameters.mewma_run_length", fail)
     assert parameter_limit(1e5, 3, 0.01, 500.0, 0.1) > 0.0
     assert parameter_limit(1e5, 3, 0.02, 500.0, 0.1) == expected
 
