@@ -57,7 +57,7 @@ USUAL_PER_30_DAYS = 1.0
 """False alarms of a plant that are promised where the settings ask for no number."""
 
 SHORTEST_ARL0 = 10 * SHORTEST_DESIGN
-"""Shortest run length of an alarm: rates by tails alone, which errors of the training widen, want rare signals."""
+"""Shortest run length of an alarm, in rows: more frequent alarms are no promise."""
 
 CONFIDENCE, QUANTILE = 0.9, 0.93
 """Confidence of the bound of a plant's rate, and the quantile that is taken: rates by tails are good to some percent

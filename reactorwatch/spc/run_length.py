@@ -33,10 +33,7 @@ LONGEST = 1e12
 """Longest run length that double precision resolves: beyond it 1 - K is rounding error."""
 
 SHORTEST_DESIGN, LONGEST_DESIGN = 5.0, 1e8
-"""Run lengths that limits are computed for: fewer samples are no chart, and of more the roots lose digits."""
-
-MOST_CELLS = 1 << 20
-"""Most cells of matrices that are solved at once: 8 MB."""
+"""Run lengths that limits are computed for: well within those that double precision resolves."""
 
 
 # --- arguments and results ---------------------------------------------------------------------------------------
@@ -197,7 +194,7 @@ def false_alarm_rates(raise_count: int, window: int, probabilities_out: Array) -
     check_rule(raise_count, window, 1)
     after_in, after_out = _rule_transitions(raise_count, window)
     states = len(after_in)
-    block, rates = max(1, MOST_CELLS // states**2), []
+    block, rates = max(1, (1 << 20) // states**2), []  # so many matrices are 8 MB
     for start in range(0, len(probabilities_out), block):
         p = probabilities_out[start : start + block, None, None]
         matrices = np.eye(states) - (after_in * (1 - p) + after_out * p)

@@ -7,8 +7,8 @@ autoregression is learned. It gives the variance of their exponentially weighted
 limit, as they do for charts of residuals (`false_alarm_budget`). The chart plots the largest of the averages, in
 standard deviations.
 
-Two bounds change nothing in sound rows: a cube root counts at most `OUTLIER` standard deviations, so one wild row
-is no lasting change; an average stays below `RELEASE` limits, so the alarm of a large change ends soon after it.
+Two bounds change nothing in sound rows: a cube root counts at most six standard deviations, so one wild row
+is no lasting change; an average stays below 1.25 limits, so the alarm of a large change ends soon after it.
 """
 
 from abc import abstractmethod
@@ -41,12 +41,6 @@ from reactorwatch.stored_state import Memory
 
 EXPLAINED = 0.9
 """Share of the variance that principal components have, and of the squared canonical correlations a state."""
-
-OUTLIER = 6.0
-"""Largest deviation of a row's cube root that counts, in standard deviations."""
-
-RELEASE = 1.25
-"""Largest average, in limits."""
 
 Model: TypeAlias = dict[str, Array]
 """Arrays of a model, by name."""
@@ -263,9 +257,9 @@ class StatisticsChart(ValueChart):
         memory.before = window[max(len(window) - self.rows_before, 0) :]
         if len(window) > self.rows_before:
             off = np.cbrt(self.statistics(self.model, window)) - self.model["root_means"]
-            off = np.minimum(off, OUTLIER * self.model["root_sds"]) / self.model["average_sds"]
+            off = np.minimum(off, 6.0 * self.model["root_sds"]) / self.model["average_sds"]
             averages = (1.0 - self.weight) * memory.averages + self.weight * off
-            memory.averages = np.minimum(averages, RELEASE * self.limit)
+            memory.averages = np.minimum(averages, 1.25 * self.limit)
             if memory.averages.max() > 0.5 * self.limit:  # from there on it may be an alarm, which names the signals
                 parts = self.parts(self.model, window) - self.model["usual_parts"]
                 memory.parts = (1.0 - self.weight) * memory.parts + self.weight * parts

@@ -64,9 +64,8 @@ CEILING = 2.0
 LARGEST_LIMIT = 200.0
 """Largest limit whose run length is computed: its integral equation then has 640 nodes."""
 
-_MEMORIES = 2
 _MEAN, _ALLOWANCE, _LIMIT, _START = range(SETTINGS, SETTINGS + 4)
-_HIGH, _LOW, _END = range(_START + _MEMORIES, _START + _MEMORIES + 3)
+_HIGH, _LOW, _END = range(_START + 2, _START + 2 + 3)
 
 
 @jit
@@ -103,7 +102,7 @@ class Cusum(CompiledChart):
 
     name = "cusum"
     settings = (Setting("cusum_allowance", 0.25, 0.05, 5.0),)
-    memories = _MEMORIES
+    memories = 2
     numbers = _END - SETTINGS
     kernel = staticmethod(_judge)
 

@@ -25,12 +25,6 @@ from reactorwatch.spc.value_chart import ValueBaseline
 ROWS = 3
 """Rows of the past and of the future."""
 
-LEAST_VARIANCE = 1e-10
-"""Share of the largest variance of a direction; directions with less are left out."""
-
-ROWS_A_VALUE = 3
-"""Rows of the training for each value of the past."""
-
 
 class CvaResidual(StatisticsChart):
     """The average of Tr2."""
@@ -80,14 +74,14 @@ class CvaResidual(StatisticsChart):
     @classmethod
     def obstacle(cls, values: Array, names: Sequence[str], signals: Mapping[str, tuple[str, ...]]) -> str:
         """See `ValueChart`."""
-        needed = ROWS_A_VALUE * ROWS * len(names)
+        needed = 3 * ROWS * len(names)  # three rows for each value of the past
         if (why := super().obstacle(values, names, signals)) or len(values) >= needed:
             return why
         return f"the training has {len(values)} complete rows, {needed} are needed for {len(names)} signals"
 
 
 def inverse_root(covariance: Array) -> Array:
-    """Matrix that makes values of a covariance white, shape (kept directions, values)."""
+    """Matrix that makes values of a covariance white, shape (directions, values), without directions of no variance."""
     values, vectors = np.linalg.eigh(covariance)
-    kept = values > LEAST_VARIANCE * values[-1]
+    kept = values > 1e-10 * values[-1]
     return np.asarray((vectors[:, kept] / np.sqrt(values[kept])).T)

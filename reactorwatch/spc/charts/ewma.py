@@ -43,10 +43,9 @@ from reactorwatch.spc.run_length import (
     stationary_distribution,
 )
 
-_MEMORIES = 2
 _MEAN, _WEIGHT, _LIMIT, _START = range(SETTINGS, SETTINGS + 4)
 # The memory: the average, and (1 - lambda)^(2t), which is 0 from the start for fixed limits.
-_AVERAGE, _MISSING, _END = range(_START + _MEMORIES, _START + _MEMORIES + 3)
+_AVERAGE, _MISSING, _END = range(_START + 2, _START + 2 + 3)
 
 
 @jit
@@ -84,7 +83,7 @@ class Ewma(CompiledChart):
 
     name = "ewma"
     settings = (Setting("ewma_weight", 0.1, 1e-3, 1.0),)
-    memories = _MEMORIES
+    memories = 2
     numbers = _END - SETTINGS
     kernel = staticmethod(_judge)
 

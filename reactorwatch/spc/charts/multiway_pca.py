@@ -21,8 +21,6 @@ from reactorwatch.spc.value_chart import BLOCKS, ValueBaseline
 STAGES = 20
 """Number of intervals of a batch; courses are linear within one."""
 
-FEWEST_BATCHES = 2 * BLOCKS
-
 FALL = 0.5
 """Fall of the progress, as a share of its range, with which a new batch begins."""
 
@@ -46,9 +44,9 @@ class MultiwayPca(StatisticsChart):
         """See `ValueChart`."""
         if why := super().obstacle(values, names, signals):
             return why
-        count = len(batch_starts(values[:, list(names).index(signals["multiway_pca_progress"][0])]))
-        few = f"the training has {count} batches, {FEWEST_BATCHES} are needed (the progress falls between batches)"
-        return few if count < FEWEST_BATCHES else ""
+        count, needed = len(batch_starts(values[:, list(names).index(signals["multiway_pca_progress"][0])])), 2 * BLOCKS
+        few = f"the training has {count} batches, {needed} are needed (the progress falls between batches)"
+        return few if count < needed else ""
 
     @classmethod
     def edges(cls, baseline: ValueBaseline) -> list[int]:

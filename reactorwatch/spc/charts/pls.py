@@ -26,9 +26,6 @@ from reactorwatch.spc.value_chart import BLOCKS, ValueBaseline
 MOST_COMPONENTS = 8
 """Largest number of components; there is always one less than signals, so that something is left for SPE."""
 
-LEAST_COVARIANCE = 1e-8
-"""Length of X'Y, in shares of its first, below which there are no more components."""
-
 
 class Projection(NamedTuple):
     """Components of signals that predict others.
@@ -49,7 +46,7 @@ class Projection(NamedTuple):
         weights, loadings, of_quality, first = [], [], [], 0.0
         for _ in range(count):
             directions, sizes, _ = np.linalg.svd(x.T @ y, full_matrices=False)
-            if sizes[0] <= LEAST_COVARIANCE * first:
+            if sizes[0] <= 1e-8 * first:  # X'Y is used up but for rounding
                 break
             first = max(first, float(sizes[0]))
             scores = x @ directions[:, 0]

@@ -43,9 +43,8 @@ from reactorwatch.spc.run_length import check_length, limit_for, run_lengths, sh
 RULES = (1, 2, 3, 4)
 """Run rules, see above."""
 
-_MEMORIES = 5
 _MEAN, _THIRD, _LOWER, _UPPER, _RULE1, _RULE2, _RULE3, _RULE4, _START = range(SETTINGS, SETTINGS + 9)
-_RUN, _ZONE1, _ZONE2, _ZONE3, _ZONE4, _END = range(_START + _MEMORIES, _START + _MEMORIES + 6)
+_RUN, _ZONE1, _ZONE2, _ZONE3, _ZONE4, _END = range(_START + 5, _START + 5 + 6)
 
 
 @jit
@@ -101,7 +100,7 @@ class Shewhart(CompiledChart):
 
     name = "shewhart"
     has_memory = False
-    memories = _MEMORIES
+    memories = 5
     numbers = _END - SETTINGS
     kernel = staticmethod(_judge)
 
@@ -111,7 +110,7 @@ class Shewhart(CompiledChart):
         wanted = checked_rules(rules)
         lower, upper = finite(mean) - width * sigma, mean + width * sigma
         flags = [1.0 if rule in wanted else 0.0 for rule in RULES]
-        super().__init__([mean, width * sigma / 3.0, lower, upper, *flags], np.zeros(_MEMORIES).tolist())
+        super().__init__([mean, width * sigma / 3.0, lower, upper, *flags], np.zeros(5).tolist())
 
     @classmethod
     def fastest(cls, arl0: float, shift: float, dimension: int, rules: tuple[int, ...]) -> Design:
