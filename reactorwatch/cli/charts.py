@@ -114,9 +114,14 @@ def design(
     as_json: Json = False,
 ) -> None:
     """The chart that detects a shift fastest at a rate of false alarms."""
-    from reactorwatch.spc.charts.catalogue import design as fastest
+    from reactorwatch.spc.charts.catalogue import CHARTS
+    from reactorwatch.spc.run_length import check_design
 
-    found = fastest(chart, arl0, shift, dimension=dimension, rules=_rules(rules))
+    kinds = {kind.name: kind for kind in CHARTS if "fastest" in vars(kind)}
+    if chart not in kinds:
+        raise InputError(f"chart must be one of {', '.join(kinds)}, got {chart!r}")
+    check_design(arl0, shift, dimension)
+    found = kinds[chart].fastest(arl0, shift, dimension, _rules(rules))
     if as_json:
         print_lines(json_line(found))
         return

@@ -32,6 +32,9 @@ from reactorwatch.errors import InputError
 LONGEST = 1e12
 """Longest run length that double precision resolves: beyond it 1 - K is rounding error."""
 
+MOST_SHIFTED_SIGNALS = 50
+"""Most signals whose run length after a shift is computed: the nodes of its two dimensions grow with them."""
+
 SHORTEST_DESIGN, LONGEST_DESIGN = 5.0, 1e8
 """Run lengths that limits are computed for: well within those that double precision resolves."""
 
@@ -59,6 +62,17 @@ def shift_size(shift: float) -> float:
     if not (isfinite(shift) and abs(shift) <= 100.0):
         raise InputError(f"shift must be in [-100, 100] sigma, got {shift}")
     return abs(float(shift))
+
+
+def check_design(arl0: float, shift: float, dimension: int) -> None:
+    """Check what a chart is designed for.
+
+    Raises:
+        InputError: the run length is not in [5, 1e8], the shift not in [0.1, 10] or the dimension not in [1, 50].
+    """
+    check_range("arl0", arl0, SHORTEST_DESIGN, LONGEST_DESIGN)
+    check_range("shift", shift, 0.1, 10.0)
+    check_range("dimension", dimension, 1, MOST_SHIFTED_SIGNALS)
 
 
 def check_length(length: float) -> float:

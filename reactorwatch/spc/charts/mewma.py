@@ -51,6 +51,7 @@ from reactorwatch.spc.charts.ewma import ewma_run_length
 from reactorwatch.spc.charts.t2 import Whitening, joint_limit, joint_rates, t2_run_length
 from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.spc.run_length import (
+    MOST_SHIFTED_SIGNALS,
     check_length,
     check_range,
     fastest_parameter,
@@ -64,8 +65,8 @@ from reactorwatch.stored_state import Memory
 SMALLEST_WEIGHT, SMALLEST_WEIGHT_WITHOUT_SHIFT = 0.01, 1e-4
 """Smallest weights whose run length is computed: without a shift there is one dimension, with far fewer nodes."""
 
-MOST_SHIFTED_SIGNALS, LARGEST_LIMIT = 50, 200.0
-"""Most signals and largest limit whose run length after a shift is computed: the nodes grow with both."""
+LARGEST_LIMIT = 200.0
+"""Largest limit whose run length after a shift is computed: the nodes of its two dimensions grow with it."""
 
 
 @jit
