@@ -98,21 +98,6 @@ def test_a_wrong_number_of_parameters_is_refused() -> None:
         chart().update([0.1, 0.1, 0.1], [1.0] * 4)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((NAMES, np.eye(2), 16.0), "root must be rows of 3 finite numbers, one a parameter"),
-        ((NAMES, [], 16.0), "root must have a row for each direction that is charted, got none"),
-        ((NAMES, np.eye(3), 0.0), "limit must be a positive number, got 0.0"),
-        ((NAMES, np.eye(3), 16.0, np.eye(2)), "inputs must be rows of 3 finite numbers"),
-        ((NAMES, np.eye(3), 16.0, None, 1.0), r"forgetting must be in \(0, 1\), got 1.0"),
-    ],
-)
-def test_settings_out_of_range_are_named(arguments: tuple[object, ...], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        ParameterT2(*arguments)  # type: ignore[arg-type]
-
-
 def test_a_damaged_memory_is_refused() -> None:
     memory = chart().memory
     memory.excitation = np.array([[1.0, 0.0]])
