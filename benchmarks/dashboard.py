@@ -23,7 +23,7 @@ from plant_node.record import simulate_record
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication, encode
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from recorder import RecordedMessage
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter

@@ -27,7 +27,7 @@ from benchmarks.hidden.suspects import SuspectsJudged, judge_suspects
 from benchmarks.hidden.tables import confusion_table, failures, main_table
 from benchmarks.stamp import stamp
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.runtime.parallel import choose_executor
 from reactorwatch.runtime.parallel.jobs import Failed
 from tests.hidden_effect.draw import draw

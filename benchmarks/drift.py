@@ -13,7 +13,7 @@ from math import sqrt
 import numpy as np
 from scipy import signal
 
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.spc import parameter_drift
 from reactorwatch.spc.charts.base import Array

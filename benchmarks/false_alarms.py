@@ -18,7 +18,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import encode
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.parallel import choose_executor

@@ -17,8 +17,8 @@ from benchmarks.faults.runs import NOISE_SD, SIGNAL, Truth, measurements_of, pro
 from monitor_node.causes.isolation import causes_of
 from reactorwatch.arrays import Array
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.integrate import SimulationError
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.simulate import SimulationError
 from reactorwatch.records.record import Record
 
 CAUSES = causes_of(cstr())
@@ -27,6 +27,9 @@ REACH = 3.0
 """Sizes up to this times the large one of the bank are tried."""
 
 _STEPS, _HALVINGS, _GAIN = 25, 8, 0.1
+
+_DIFFERENCE = 1e-4
+"""Step of the derivatives by the size, in typical sizes."""
 
 
 def oracle_suspect(case: Case, record: Record, truth: Truth) -> str:
@@ -52,14 +55,20 @@ def _misfit(effect: Effect, case: Case, record: Record, truth: Truth, since: int
     name = f"{effect.name}.size"
     shape = profile_changes(case, effect.name)
 
+    def residuals_at(size: float) -> Array:
+        run = simulator.run(time_min, flows, start, shape | {name: size})
+        residuals: Array = ((measured - run.outputs) / NOISE_SD).ravel()
+        return residuals
+
     def at(size: float) -> tuple[float, Array, Array]:
         """Sum of squares, residuals and their derivatives but for the sign."""
+        step = -_DIFFERENCE * effect.typical  # towards sizes that are within the bounds
+        step = step if effect.lower <= size + step <= effect.upper else -step
         try:
-            run, sensitivities = simulator.run_with_sensitivities(time_min, flows, start, [name], shape | {name: size})
+            residuals, moved = residuals_at(size), residuals_at(size + step)
         except SimulationError:  # no plant goes there
             return inf, np.zeros(1), np.zeros(1)
-        residuals = ((measured - run.outputs) / NOISE_SD).ravel()
-        return float(residuals @ residuals), residuals, (sensitivities.outputs[:, :, 0] / NOISE_SD).ravel()
+        return float(residuals @ residuals), residuals, (residuals - moved) / step
 
     largest = REACH * next(item.sizes[-1] for item in BANK if item.cause == effect.name)
     lower, upper = max(effect.lower, -largest), min(effect.upper, largest)

@@ -19,7 +19,7 @@ from monitor_node.learn.black_box_reference import BlackBoxMemory
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Alarm
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import start_state
 from reactorwatch.records.record import Record

@@ -22,7 +22,7 @@ def compile_kernels() -> None:
     from reactorwatch.cli.progress import task
     from reactorwatch.contract.codec import encode
     from reactorwatch.diagnosis.diagnose import diagnose
-    from reactorwatch.process.library.cstr.model import cstr
+    from reactorwatch.process.library.cstr import cstr
     from recorder.tools.player import samples_of
 
     record = simulate_record(PlantConfig(seed=1, faults=(FAULT,)), ROWS)

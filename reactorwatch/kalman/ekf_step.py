@@ -16,9 +16,8 @@ import casadi as ca
 import numpy as np
 
 from reactorwatch.codegen.compiled_function import CompiledFunction
-from reactorwatch.process.effect_states import reset_function
-from reactorwatch.process.integrate import state_time_step, symbolic_step
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.simulate import reset_function, state_time_step, symbolic_step
 
 MODEL_CACHE_SIZE = 64
 """Number of models whose functions are cached: making one takes some ten milliseconds and a megabyte."""

@@ -26,8 +26,8 @@ from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.kalman.ekf_step import transition
 from reactorwatch.kalman.input_uncertainty import InputUncertainty
-from reactorwatch.process.integrate import LONGEST_STEP_MIN
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.simulate import LONGEST_STEP_MIN
 
 _LEAST_PIVOT = 1e-12
 _LONGEST_PIECE_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a piece is two steps; times are rounded

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.input_uncertainty import InputUncertainty
-from reactorwatch.process.integrate import LONGEST_STEP_MIN
+from reactorwatch.process.simulate import LONGEST_STEP_MIN
 
 LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are rounded
 

@@ -18,8 +18,8 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, output_function
-from reactorwatch.process.effect_states import reset_function, rest_function, with_derivatives
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.simulate import reset_function, rest_function, with_derivatives
 from reactorwatch.process.steady_state import SteadyState, SteadyStates
 
 START_SD = 3.0

@@ -29,8 +29,8 @@ from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.kalman.noise_estimation import initial_sensor_sd
 from reactorwatch.process import effects_of, named_effects
 from reactorwatch.process.effect import TIMING, Effect
-from reactorwatch.process.input_effects import InputLag
 from reactorwatch.process.model import Parameter, ProcessModel, parameter, variable
+from reactorwatch.process.signal_effects import InputLag
 
 CONSTANT, WANDER, NOISE = "constant", "wander", "noise"
 """Kinds of additional states: `constant feed_temperature`, `wander T`, `noise T`."""

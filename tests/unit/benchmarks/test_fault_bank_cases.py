@@ -10,7 +10,7 @@ from benchmarks.faults.runs import NOISE_SD, fault_free, record_of, truth_of
 from monitor_node.causes.isolation import causes_of
 from reactorwatch.arrays import Array
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import start_state

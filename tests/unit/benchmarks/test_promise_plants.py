@@ -13,7 +13,7 @@ from benchmarks.promise.not_quite import Outcome, Plant, delay, print_counts, pr
 from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
 from benchmarks.promise.pool import median_interval, poisson_interval, run_jobs, share_interval
 from plant_node.record import simulate_record
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.runtime.parallel.jobs import SerialExecutor
 

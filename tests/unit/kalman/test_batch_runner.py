@@ -10,7 +10,7 @@ from reactorwatch.kalman.batch_runner import LEAST_ROWS, run_together
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.kalman.innovations import FilterResult
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 
 ROWS = 2 * LEAST_ROWS
 LEVELS = [NoiseLevels((1e-3 * (1 + n), 0.2), (1e-4, 0.02 * n)) for n in range(6)]

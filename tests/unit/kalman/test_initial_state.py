@@ -11,8 +11,7 @@ from plant_node.record import simulate_record
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states
 
