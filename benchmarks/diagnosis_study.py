@@ -192,11 +192,7 @@ def section(found: dict[str, list[Judged]], seed: int, suspects: Sequence[Suspec
 
 
 def with_section(page: str, text: str) -> str:
-    """A page with what stands between the marks exchanged.
-
-    Raises:
-        ValueError: the page lacks a mark.
-    """
+    """A page with what stands between the marks exchanged."""
     if BEGIN not in page or END not in page:
         raise ValueError(f"{PAGE.name} must hold the marks {BEGIN} and {END}")
     before, after = page.split(BEGIN)[0], page.split(END)[1]

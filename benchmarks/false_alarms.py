@@ -31,15 +31,10 @@ NOISE_SD, COEFFICIENT, SETTLING_ROWS = (0.002, 0.3), 0.5, 100
 
 
 class FalseAlarms(NamedTuple):
-    """Alarms of several runs.
+    """Alarms of several runs."""
 
-    Attributes:
-        raised: number of alarms by name.
-        promised: number of alarms that the monitor promised.
-    """
-
-    raised: Counter[str]
-    promised: float
+    raised: Counter[str]  # number of alarms by name
+    promised: float  # number of alarms that the monitor promised
 
     @property
     def ratio(self) -> float:
@@ -48,13 +43,7 @@ class FalseAlarms(NamedTuple):
 
 
 def count_false_alarms(seeds: Iterable[int], per_30_days: float, *, diagnose_training: bool = True) -> FalseAlarms:
-    """Count the alarms of runs without a fault.
-
-    Args:
-        seeds: seeds of runs of `SPAN_MIN`.
-        per_30_days: promised false alarms in 30 days.
-        diagnose_training: see `MonitorConfig`; four fifths of the time of a run.
-    """
+    """Count the alarms of runs without a fault."""
     simulator, raised, promised = Simulator(cstr()), Counter[str](), 0.0
     config = MonitorConfig(false_alarms_per_30_days=per_30_days, isolation=False, diagnose_training=diagnose_training)
     rows = round(SPAN_MIN / PERIOD_MIN)

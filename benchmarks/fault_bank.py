@@ -100,28 +100,14 @@ def arguments() -> argparse.Namespace:
 
 
 class Everywhere:
-    """Runs a function over many arguments, in order, under a bar.
-
-    Args:
-        executor: executor of the jobs.
-        progress: bar on the terminal.
-    """
+    """Runs a function over many arguments, in order, under a bar."""
 
     def __init__(self, executor: Executor, progress: Progress) -> None:
         self._executor = executor
         self._progress = progress
 
     def do(self, title: str, work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
-        """The results, in order.
-
-        Args:
-            title: text beside the bar.
-            work: the function.
-            arguments: for each of its arguments, the values.
-
-        Raises:
-            RuntimeError: a job failed.
-        """
+        """The results, in order."""
         jobs = list(zip(*arguments, strict=True))
         outcomes = in_job_order(self._executor.map_unordered(partial(_spread, work), jobs))
         found: list[Result] = []
@@ -137,13 +123,7 @@ def _spread(work: Callable[..., Result], job: tuple[Any, ...]) -> Result:
 
 
 def report_widths(everywhere: Everywhere, runs: int, budgets: Sequence[float]) -> Widths:
-    """The widths at which the report's limits keep the promised rates in runs without a fault.
-
-    Args:
-        everywhere: executor of the runs.
-        runs: number of runs.
-        budgets: false alarms in 30 days that are promised.
-    """
+    """The widths at which the report's limits keep the promised rates in runs without a fault."""
     statistics = everywhere.do(
         "limits of the report's method",
         partial(fault_free_statistics, rows=CALIBRATION_ROWS),

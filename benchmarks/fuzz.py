@@ -60,11 +60,7 @@ TABLES: dict[str, Any] = {"bus": BusConfig, "plant": PlantConfig, "monitor": Mon
 
 
 class Mutator:
-    """Makes random messages and mutates bytes.
-
-    Args:
-        seed: seed of the random numbers.
-    """
+    """Makes random messages and mutates bytes."""
 
     def __init__(self, seed: int) -> None:
         self.draw = random.Random(seed)

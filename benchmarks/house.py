@@ -46,11 +46,7 @@ def product_lines() -> dict[str, int]:
 
 
 def floors(graph: grimp.ImportGraph, package: str) -> tuple[int, int]:
-    """Numbers of rooms and of floors of a package.
-
-    Raises:
-        graphlib.CycleError: rooms import each other in a circle.
-    """
+    """Numbers of rooms and of floors of a package."""
     depth = package.count(".") + 2
 
     def room(module: str) -> str:
@@ -97,9 +93,6 @@ def count_moves(*, live: bool) -> tuple[int, int]:
     """Moves of an ordinary row's last sample, the median of those before the onset, and of the first alarm's.
 
     Counted in a second run: in the first one kernels are compiled.
-
-    Args:
-        live: True to publish points and to search causes.
     """
     _count_moves_once(live=live)
     return _count_moves_once(live=live)

@@ -186,42 +186,25 @@ class Heard:
 
 @dataclass(frozen=True)
 class Found:
-    """Content of a recording.
+    """Content of a recording."""
 
-    Attributes:
-        published: number of samples published.
-        recorded: number of samples recorded.
-        missing: number of samples missing by sequence number.
-        twice: number of repeated samples.
-        out_of_order: number of samples behind one that was published after them.
-        slowest_put_s: longest time of publishing a batch of samples.
-    """
-
-    published: int
-    recorded: int
-    missing: int
-    twice: int
-    out_of_order: int
-    slowest_put_s: float
+    published: int  # number of samples published
+    recorded: int  # number of samples recorded
+    missing: int  # number of samples missing by sequence number
+    twice: int  # number of repeated samples
+    out_of_order: int  # number of samples behind one that was published after them
+    slowest_put_s: float  # longest time of publishing a batch of samples
 
 
 @dataclass(frozen=True)
 class Load:
-    """A publisher and a recorder under load.
+    """A publisher and a recorder under load."""
 
-    Attributes:
-        proxy: proxy on the link of one of them.
-        publisher: publisher of the samples.
-        bus: link of the publisher.
-        heard: count of the messages that the recorder has received.
-        found: content of each recording, after the end.
-    """
-
-    proxy: Proxy
-    publisher: Publisher
-    bus: ZenohBus
-    heard: Heard
-    found: list[Found]
+    proxy: Proxy  # proxy on the link of one of them
+    publisher: Publisher  # publisher of the samples
+    bus: ZenohBus  # link of the publisher
+    heard: Heard  # count of the messages that the recorder has received
+    found: list[Found]  # content of each recording, after the end
 
     def wait_for_rows(self, span_s: float) -> None:
         """Wait for the rows of a number of seconds."""
@@ -230,15 +213,7 @@ class Load:
 
 @contextlib.contextmanager
 def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: int, rate_per_s: int) -> Iterator[Load]:
-    """A publisher and a recorder at a router.
-
-    Args:
-        folder: folder of the recording.
-        router: address of the router.
-        whose: node whose link goes through the proxy.
-        cache_messages: number of messages in the cache of the publisher.
-        rate_per_s: number of samples published in a second.
-    """
+    """A publisher and a recorder at a router."""
     proxy = Proxy(router)
     direct = BusConfig(endpoint=router, cache_messages=cache_messages)
     via = BusConfig(endpoint=proxy.endpoint, cache_messages=cache_messages)

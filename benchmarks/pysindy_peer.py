@@ -56,25 +56,15 @@ FIRST_ROW = 100
 
 @dataclass(frozen=True)
 class Compared:
-    """Errors of both methods on one record.
+    """Errors of both methods on one record."""
 
-    Attributes:
-        seed: seed of the record.
-        truth: hidden causes.
-        before: error of the simulation of the nominal model on rows held out, over the true noise; larger of C and T.
-        extended: error of the extended model, over the noise.
-        pysindy: error of the model that pysindy found, over the noise.
-        said: cause named by the diagnosis.
-        terms: number of terms that pysindy added to the balances of C and of T.
-    """
-
-    seed: int
-    truth: str
-    before: float
-    extended: float
-    pysindy: float
-    said: str
-    terms: tuple[int, int]
+    seed: int  # seed of the record
+    truth: str  # hidden causes
+    before: float  # error of the simulation of the nominal model on rows held out, over the true noise
+    extended: float  # error of the extended model, over the noise
+    pysindy: float  # error of the model that pysindy found, over the noise
+    said: str  # cause named by the diagnosis
+    terms: tuple[int, int]  # number of terms that pysindy added to the balances of C and of T
 
 
 def main() -> None:

@@ -48,19 +48,11 @@ KEPT = 30 * RATE_PER_S // SIGNALS
 
 @dataclass(frozen=True)
 class Killed:
-    """Recording after a kill.
+    """Recording after a kill."""
 
-    Attributes:
-        messages: number of samples in the recovered file.
-        lost_s: time from the last sample in the file to the kill.
-        missing: number of samples between the first and the last of the file, by sequence number, that no file holds.
-        late: number of samples published after the recorder was alive and before the first in its file that no file
-            holds.
-    """
-
-    messages: int
-    lost_s: float
-    missing: int
+    messages: int  # number of samples in the recovered file
+    lost_s: float  # time from the last sample in the file to the kill
+    missing: int  # number of samples between the first and the last of the file, by sequence number, that no file holds
     late: int
 
 

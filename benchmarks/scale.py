@@ -147,8 +147,8 @@ def monitor(endpoint: str, plants: int, expected: int, sharp: bool) -> None:
     bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, uncached=UNCACHED, many_keys=True)
     assert bus is not None
     node = Counting(SHARP if sharp else FAST, stop)
+    taken = node.learn(plants)  # first: memory that another fleet has freed would be used again, and not be counted
     core = 0.0 if sharp else without_bus(plants)
-    taken = node.learn(plants)
     node.samples, node.expected, node.known = 0, expected, KNOWN_ROWS * SIGNALS * plants
     serving = threading.Thread(target=watch, args=(node, bus, stop))
     serving.start()
@@ -223,11 +223,7 @@ def start_part(*arguments: object) -> "subprocess.Popen[str]":
 
 
 def _line(process: "subprocess.Popen[str]") -> str:
-    """The next line that a process prints.
-
-    Raises:
-        SystemExit: the process ended without it; its errors are above.
-    """
+    """The next line that a process prints."""
     assert process.stdout is not None
     line = process.stdout.readline()
     if not line:

@@ -57,21 +57,15 @@ LATE_ROWS = 150
 
 
 class Outcome(NamedTuple):
-    """Result of a back-test.
+    """Result of a back-test."""
 
-    Attributes:
-        alarms: number of alarms.
-        expected: number of false alarms to be expected.
-        suspect: first suspect of the last alarm that names one, with its probability; empty without one.
-        verdict: what the baseline was changed for; empty if it was not.
-        seconds: duration of the back-test.
-    """
-
-    alarms: int
-    expected: float
-    suspect: tuple[str, float]
-    verdict: str
-    seconds: float
+    alarms: int  # number of alarms
+    expected: float  # number of false alarms to be expected
+    suspect: tuple[
+        str, float
+    ]  # first suspect of the last alarm that names one, with its probability; empty without one
+    verdict: str  # what the baseline was changed for; empty if it was not
+    seconds: float  # duration of the back-test
 
 
 def watch(record: Record, *, diagnosed: bool) -> Outcome:

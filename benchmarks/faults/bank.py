@@ -30,19 +30,12 @@ BOTH, RISING, FALLING = (1, -1), (1,), (-1,)
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of the bank.
+    """A fault of the bank."""
 
-    Attributes:
-        cause: name of an effect of the catalogue.
-        profile: `step` or `ramp`.
-        sizes: small, medium and large, in the effect's unit, above 0.
-        signs: signs that its sizes take in turn, from seed to seed.
-    """
-
-    cause: str
-    profile: str
-    sizes: tuple[float, float, float]
-    signs: tuple[int, ...] = BOTH
+    cause: str  # name of an effect of the catalogue
+    profile: str  # `step` or `ramp`
+    sizes: tuple[float, float, float]  # small, medium and large, in the effect's unit, above 0
+    signs: tuple[int, ...] = BOTH  # signs that its sizes take in turn, from seed to seed
 
     @property
     def name(self) -> str:
@@ -95,21 +88,13 @@ is never counted as the right suspect; how often a twin came first is printed be
 
 @dataclass(frozen=True)
 class Case:
-    """One run of the bank.
+    """One run of the bank."""
 
-    Attributes:
-        fault: the fault.
-        grade: one of `GRADES`.
-        size: size with its sign, in the effect's unit.
-        onset_min: onset in minutes of the plant.
-        seed: seed of the input and the noise.
-    """
-
-    fault: Fault
-    grade: str
-    size: float
-    onset_min: float
-    seed: int
+    fault: Fault  # the fault
+    grade: str  # one of `GRADES`
+    size: float  # size with its sign, in the effect's unit
+    onset_min: float  # onset in minutes of the plant
+    seed: int  # seed of the input and the noise
 
     @property
     def specification(self) -> str:
@@ -124,11 +109,7 @@ class Case:
 
 
 def cases(seeds: int) -> list[Case]:
-    """Cases of all faults in all sizes.
-
-    Args:
-        seeds: number of runs of each case.
-    """
+    """Cases of all faults in all sizes."""
     found = []
     for place, fault in enumerate(BANK):
         for grade, size in zip(GRADES, fault.sizes, strict=True):

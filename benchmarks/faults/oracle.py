@@ -26,27 +26,13 @@ from reactorwatch.arrays import Array
 
 
 def log_likelihood_ratio(measured: Array, nominal: Array, faulty: Array, noise_sd: Array) -> Array:
-    """Increments of L of each row, shape (rows,).
-
-    Args:
-        measured: measurements, shape (rows, signals).
-        nominal: y0, shape (rows, signals).
-        faulty: y1, shape (rows, signals).
-        noise_sd: standard deviations of the noise, shape (signals,).
-    """
+    """Increments of L of each row, shape (rows,)."""
     squares = ((measured - nominal) ** 2 - (measured - faulty) ** 2) / (2 * noise_sd**2)
     return np.asarray(squares.sum(axis=1))
 
 
 def oracle_delay_min(time_min: Array, increments: Array, onset_min: float, rows_to_false_alarm: float) -> float:
-    """Minutes from the onset to the oracle's signal; inf if it does not come.
-
-    Args:
-        time_min: times of the rows, shape (rows,).
-        increments: result of `log_likelihood_ratio`.
-        onset_min: onset of the fault.
-        rows_to_false_alarm: promised ARL0.
-    """
+    """Minutes from the onset to the oracle's signal; inf if it does not come."""
     since = time_min >= onset_min
     reached = np.cumsum(increments[since]) >= log(rows_to_false_alarm)
     return float(time_min[since][np.argmax(reached)] - onset_min) if reached.any() else inf

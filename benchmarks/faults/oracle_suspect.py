@@ -33,13 +33,7 @@ _DIFFERENCE = 1e-4
 
 
 def oracle_suspect(case: Case, record: Record, truth: Truth) -> str:
-    """The cause that explains a run best.
-
-    Args:
-        case: case of the bank.
-        record: record of that case.
-        truth: noise-free run of that case.
-    """
+    """The cause that explains a run best."""
     since = int(np.argmax(record.time_min >= case.onset_min)) - 1
     misfits = {effect.name: _misfit(effect, case, record, truth, since) for effect in CAUSES}
     at_true_size = float(np.sum(((measurements_of(record) - truth.faulty)[since:] / NOISE_SD) ** 2))

@@ -33,15 +33,10 @@ TRAINING_ROWS = round(TRAINING_MIN / PERIOD_MIN)
 
 @dataclass(frozen=True)
 class ReportMethod:
-    """A chart of the residuals of one kind of model.
+    """A chart of the residuals of one kind of model."""
 
-    Attributes:
-        name: name of the kind.
-        fit: function of structure, inputs and output that returns the model.
-    """
-
-    name: str
-    fit: Callable[[Structure, Array, Array], LinearModel]
+    name: str  # name of the kind
+    fit: Callable[[Structure, Array, Array], LinearModel]  # function of structure
 
     def statistic(self, record: Record) -> Array:
         """Larger residual of each row in standard deviations, shape (rows,).
@@ -64,13 +59,7 @@ METHODS: tuple[ReportMethod, ...] = (ReportMethod("ARX", fit_arx), ReportMethod(
 
 
 def alarms_of(time_min: Array, statistic: Array, width: float) -> list[Interval]:
-    """Intervals of the alarms of a run: each from a point that is out to the next that is in.
-
-    Args:
-        time_min: times of the watched rows, shape (rows,).
-        statistic: statistic of these rows, shape (rows,).
-        width: width of the limits, in standard deviations.
-    """
+    """Intervals of the alarms of a run: each from a point that is out to the next that is in."""
     change = np.diff(statistic > width, prepend=False, append=False)
     edges = np.flatnonzero(change)
     times = np.append(time_min, inf)
@@ -78,12 +67,7 @@ def alarms_of(time_min: Array, statistic: Array, width: float) -> list[Interval]
 
 
 def count_alarms(statistics: Iterable[NDArray[np.floating[Any]]], width: float) -> int:
-    """Count the alarms of some runs: points that are out, whose predecessor is in.
-
-    Args:
-        statistics: statistic of the watched rows, one array a run.
-        width: width of the limits, in standard deviations.
-    """
+    """Count the alarms of some runs: points that are out, whose predecessor is in."""
     return sum(int(np.count_nonzero(np.diff(item > width, prepend=False, append=False))) // 2 for item in statistics)
 
 
@@ -92,10 +76,6 @@ def calibrated_width(statistics: Sequence[NDArray[np.floating[Any]]], rows_to_fa
 
     A run raises an alarm for every rise from a row at or below the width to one above it. So the alarms at a width are
     as many as rows above it, less the pairs of neighbours that are both above it.
-
-    Args:
-        statistics: statistic of the watched rows, one array a run.
-        rows_to_false_alarm: promised rows to a false alarm.
     """
     rows = np.concatenate(statistics)
     pairs = np.concatenate([np.minimum(item[1:], item[:-1]) for item in statistics])

@@ -27,19 +27,12 @@ EXTINGUISHED_K = 400.0
 
 
 class Truth(NamedTuple):
-    """A run without noise.
+    """A run without noise."""
 
-    Attributes:
-        nominal_states: states of the plant without the fault, shape (rows, 2).
-        nominal: C and T without the fault, shape (rows, 2).
-        faulty: C and T with the fault as a sensor without noise shows them, shape (rows, 2).
-        left_branch: whether the fault put the reactor out.
-    """
-
-    nominal_states: Array
-    nominal: Array
-    faulty: Array
-    left_branch: bool
+    nominal_states: Array  # states of the plant without the fault, shape (rows, 2)
+    nominal: Array  # C and T without the fault, shape (rows, 2)
+    faulty: Array  # C and T with the fault as a sensor without noise shows them, shape (rows, 2)
+    left_branch: bool  # whether the fault put the reactor out
 
 
 def record_of(case: Case) -> Record:
@@ -48,12 +41,7 @@ def record_of(case: Case) -> Record:
 
 
 def truth_of(case: Case, record: Record) -> Truth:
-    """The same run without noise, with the fault and without it.
-
-    Args:
-        case: case of the bank.
-        record: record of that case.
-    """
+    """The same run without noise, with the fault and without it."""
     flows = record.columns[SIGNAL]
     start = _start(flows)
     changes = {f"{case.fault.cause}.size": case.size} | profile_changes(case, case.fault.cause)
@@ -75,14 +63,7 @@ def profile_changes(case: Case, cause: str) -> dict[str, float]:
 
 
 def fault_free(seed: int, rows: int, phi: float = 0.0) -> Record:
-    """A run without a fault, with noise that may be autocorrelated.
-
-    Args:
-        seed: seed of the input and the noise.
-        rows: number of rows.
-        phi: coefficient of the AR(1) noise of both measurements, n[k] = phi n[k-1] + e[k]; its standard deviation is
-            the same for every phi.
-    """
+    """A run without a fault, with noise that may be autocorrelated."""
     scenario = RandomSteps(90.0, 111.0, 1.0)
     time_min = np.round(np.arange(rows) * PERIOD_MIN, 6)
     flows = np.array([scenario.level(float(minute), seed) for minute in time_min])

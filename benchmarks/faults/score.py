@@ -14,30 +14,19 @@ DAYS_30_MIN = 30 * 24 * 60.0
 
 @dataclass(frozen=True)
 class Interval:
-    """Interval in which an alarm was active.
+    """Interval in which an alarm was active."""
 
-    Attributes:
-        raised_min: time when it was raised.
-        cleared_min: time when it was cleared; inf: it is still active.
-    """
-
-    raised_min: float
-    cleared_min: float
+    raised_min: float  # time when it was raised
+    cleared_min: float  # time when it was cleared; inf: it is still active
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a detector in a run with a fault.
+    """Outcome of a detector in a run with a fault."""
 
-    Attributes:
-        delay_min: delay from the onset to the detection; inf: not detected.
-        false_alarms: number of alarms raised before the onset.
-        watched_min: watched time before the onset.
-    """
-
-    delay_min: float
-    false_alarms: int = 0
-    watched_min: float = 0.0
+    delay_min: float  # delay from the onset to the detection; inf: not detected
+    false_alarms: int = 0  # number of alarms raised before the onset
+    watched_min: float = 0.0  # watched time before the onset
 
 
 def outcome_of(alarms: Sequence[Interval], watching_since_min: float, onset_min: float, until_min: float) -> Outcome:
@@ -45,12 +34,6 @@ def outcome_of(alarms: Sequence[Interval], watching_since_min: float, onset_min:
 
     The detection is the first alarm that is raised after the onset while no other stands: one that was standing
     already has no news for the operator.
-
-    Args:
-        alarms: intervals of the alarms, in any order.
-        watching_since_min: time of the first evaluated row.
-        onset_min: onset of the fault.
-        until_min: later alarms don't count.
     """
     detected_min, standing_until_min = inf, -inf
     for item in sorted(alarms, key=lambda item: item.raised_min):
@@ -67,17 +50,11 @@ def outcome_of(alarms: Sequence[Interval], watching_since_min: float, onset_min:
 
 @dataclass(frozen=True)
 class Delays:
-    """The delays of many runs.
+    """The delays of many runs."""
 
-    Attributes:
-        detected: share of the runs, in [0, 1].
-        median_min: median of all runs, those not detected counted as infinite.
-        slow_min: 90 % quantile of all runs, those not detected counted as infinite.
-    """
-
-    detected: float
-    median_min: float
-    slow_min: float
+    detected: float  # share of the runs, in [0, 1]
+    median_min: float  # median of all runs, those not detected counted as infinite
+    slow_min: float  # 90 % quantile of all runs, those not detected counted as infinite
 
     @classmethod
     def of(cls, delays_min: Sequence[float]) -> "Delays":
@@ -89,15 +66,10 @@ class Delays:
 
 @dataclass(frozen=True)
 class Rate:
-    """Rate of chance events.
+    """Rate of chance events."""
 
-    Attributes:
-        count: number of events.
-        watched_min: watched time.
-    """
-
-    count: int
-    watched_min: float
+    count: int  # number of events
+    watched_min: float  # watched time
 
     @property
     def per_30_days(self) -> float:

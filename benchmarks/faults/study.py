@@ -28,40 +28,24 @@ Widths = dict[str, dict[float, float]]
 
 @dataclass(frozen=True)
 class CaseResult:
-    """Results of all detectors in a case.
+    """Results of all detectors in a case."""
 
-    Attributes:
-        case: case of the bank.
-        left_branch: whether the fault put the reactor out.
-        oracle_suspect: suspect of the oracle at the end of the run.
-        outcomes: outcomes by promised false alarms in 30 days, then by detector (see `detectors`).
-        soon: suspicion of the monitor `SOON_MIN` after its first alarm, by promised false alarms.
-        late: suspicion of the monitor at the end of the run, by promised false alarms.
-    """
-
-    case: Case
-    left_branch: bool
-    oracle_suspect: str
-    outcomes: dict[float, dict[str, Outcome]]
-    soon: dict[float, Suspicion]
-    late: dict[float, Suspicion]
+    case: Case  # case of the bank
+    left_branch: bool  # whether the fault put the reactor out
+    oracle_suspect: str  # suspect of the oracle at the end of the run
+    outcomes: dict[float, dict[str, Outcome]]  # outcomes by promised false alarms in 30 days
+    soon: dict[float, Suspicion]  # suspicion of the monitor `SOON_MIN` after its first alarm, by promised false alarms
+    late: dict[float, Suspicion]  # suspicion of the monitor at the end of the run, by promised false alarms
 
 
 @dataclass(frozen=True)
 class FaultFreeResult:
-    """Alarms in a run without a fault.
+    """Alarms in a run without a fault."""
 
-    Attributes:
-        phi: AR(1) coefficient of its noise.
-        alarms: rates by promised false alarms in 30 days, then by detector.
-        incidents: rates of the monitor's incidents, by promised false alarms.
-        names: names of the alarms that the monitor raised, by promised false alarms.
-    """
-
-    phi: float
-    alarms: dict[float, dict[str, Rate]]
-    incidents: dict[float, Rate]
-    names: dict[float, list[str]]
+    phi: float  # AR(1) coefficient of its noise
+    alarms: dict[float, dict[str, Rate]]  # rates by promised false alarms in 30 days, then by detector
+    incidents: dict[float, Rate]  # rates of the monitor's incidents, by promised false alarms
+    names: dict[float, list[str]]  # names of the alarms that the monitor raised, by promised false alarms
 
 
 def detectors() -> list[str]:
@@ -77,13 +61,7 @@ def fault_free_statistics(seed: int, rows: int) -> dict[str, NDArray[np.float32]
 
 
 def run_case(case: Case, budgets: tuple[float, ...], widths: Widths) -> CaseResult:
-    """Run all detectors over a case.
-
-    Args:
-        case: case of the bank.
-        budgets: false alarms in 30 days that are promised.
-        widths: widths of the report's limits.
-    """
+    """Run all detectors over a case."""
     record = record_of(case)
     truth = truth_of(case, record)
     increments = log_likelihood_ratio(measurements_of(record), truth.nominal, truth.faulty, NOISE_SD)
@@ -107,15 +85,7 @@ def run_case(case: Case, budgets: tuple[float, ...], widths: Widths) -> CaseResu
 
 
 def run_fault_free(seed: int, phi: float, rows: int, budgets: tuple[float, ...], widths: Widths) -> FaultFreeResult:
-    """Count the alarms of a run without a fault.
-
-    Args:
-        seed: seed of the run.
-        phi: AR(1) coefficient of its noise.
-        rows: number of rows.
-        budgets: false alarms in 30 days that are promised.
-        widths: widths of the report's limits.
-    """
+    """Count the alarms of a run without a fault."""
     record = fault_free(seed, rows, phi)
     statistics = {method.name: method.statistic(record)[TRAINING_ROWS:] for method in METHODS}
     report_min = (rows - TRAINING_ROWS) * PERIOD_MIN

@@ -19,43 +19,25 @@ LIKELY = 0.1
 
 @dataclass(frozen=True)
 class Watched:
-    """Output of the monitor for a record.
+    """Output of the monitor for a record."""
 
-    Attributes:
-        messages: every change of an alarm, in order.
-        incidents: every change of an incident, in order.
-        watching_since_min: time of the first evaluated row; inf if there was none.
-        last_min: time of the last row.
-    """
-
-    messages: list[Alarm]
-    incidents: list[Incident]
-    watching_since_min: float
-    last_min: float
+    messages: list[Alarm]  # every change of an alarm, in order
+    incidents: list[Incident]  # every change of an incident, in order
+    watching_since_min: float  # time of the first evaluated row; inf if there was none
+    last_min: float  # time of the last row
 
 
 @dataclass(frozen=True)
 class Suspicion:
-    """Ranks of the true cause among the suspects.
+    """Ranks of the true cause among the suspects."""
 
-    Attributes:
-        first: the true cause was the likeliest suspect.
-        likely: the true cause was among the suspects of at least `LIKELY`.
-        twin_first: a twin of it was the likeliest.
-    """
-
-    first: bool = False
-    likely: bool = False
-    twin_first: bool = False
+    first: bool = False  # the true cause was the likeliest suspect
+    likely: bool = False  # the true cause was among the suspects of at least `LIKELY`
+    twin_first: bool = False  # a twin of it was the likeliest
 
 
 def watch(record: Record, false_alarms_per_30_days: float) -> Watched:
-    """Run the monitor over a record.
-
-    Args:
-        record: rows as the plant publishes them.
-        false_alarms_per_30_days: promised false alarms.
-    """
+    """Run the monitor over a record."""
     config = MonitorConfig(training_min=TRAINING_MIN, false_alarms_per_30_days=false_alarms_per_30_days)
     result = backtest.run([encode(item) for item in samples_of(record, config.plant)], config)
     since = result.watching_since_ns
@@ -96,12 +78,6 @@ def suspicion(watched: Watched, cause: str, detected_min: float, until_min: floa
     """Suspicion of the monitor at a time.
 
     The newest suspects of the incident count, or those of an alarm of it that names its cause itself.
-
-    Args:
-        watched: messages of the monitor.
-        cause: the true cause.
-        detected_min: time when the detecting alarm was raised; inf if there was none.
-        until_min: the time in minutes.
     """
     raised = (item for item in watched.messages if item.event == "raised")
     detecting = [item for item in raised if to_minutes(item.raised_ns) == detected_min]

@@ -23,19 +23,12 @@ NEARLY, BACKGROUND = "not quite the model", 0.2
 
 @dataclass(frozen=True)
 class StudyClass:
-    """A class of records.
+    """A class of records."""
 
-    Attributes:
-        name: name of the class.
-        kind: kind of the score, `single`, `pair`, `nominal` or `outside`.
-        circumstances: function of the number of a record that returns its circumstances.
-        group: classes of one group are scored together as well; empty: none.
-    """
-
-    name: str
-    kind: str
-    circumstances: Callable[[int], Circumstances]
-    group: str = ""
+    name: str  # name of the class
+    kind: str  # kind of the score, `single`, `pair`, `nominal` or `outside`
+    circumstances: Callable[[int], Circumstances]  # function of the number of a record that returns its circumstances
+    group: str = ""  # classes of one group are scored together as well; empty: none
 
 
 def _always(circumstances: Circumstances) -> Callable[[int], Circumstances]:
@@ -98,11 +91,7 @@ CLASSES: tuple[StudyClass, ...] = (
 
 
 def find_class(name: str) -> StudyClass:
-    """Find a class by its name.
-
-    Raises:
-        KeyError: there is none.
-    """
+    """Find a class by its name."""
     for item in CLASSES:
         if item.name == name:
             return item

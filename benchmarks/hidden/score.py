@@ -34,51 +34,28 @@ class Share(float):
 
 @dataclass(frozen=True)
 class Score:
-    """Scores of some records; shares from 0 to 1, NaN without a denominator.
+    """Scores of some records; shares from 0 to 1, NaN without a denominator."""
 
-    Attributes:
-        records: number of records.
-        first: share in which exactly the hidden causes are named.
-        listed: share in which they are named or listed.
-        count: mean number of listed explanations.
-        wrong: share with a false claim.
-        unknown: share called unknown.
-        unknown_in_place: share called unknown with the right location.
-        right_place: share with the right location, whatever the name.
-        same_profile: share of the right causes with the right profile.
-        size: median and 90 % quantile of the relative error of the size.
-        curve: median and 90 % quantile of the relative error of the curve.
-        size_inside: share of the 95 % intervals that contain the size.
-        onset: median and 90 % quantile of the error of a step's onset, in min.
-        onset_inside: share of the 95 % intervals that contain the onset.
-        held_out: median and 90 % quantile of the error of T on held-out rows over the noise drawn in them.
-        held_out_in_sd: error of T on held-out rows over the standard deviation of the noise, as `held_out`.
-        drawn_in_sd: error of the truth on held-out rows over the standard deviation of the noise, as `held_out`.
-        before: error of the nominal model over the standard deviation of the noise, as `held_out`.
-        seconds: median and maximum of the core seconds.
-        errors: number of diagnoses that failed.
-    """
-
-    records: int
-    first: float
-    listed: float
-    count: float
-    wrong: float
-    unknown: float
-    unknown_in_place: float
-    right_place: float
-    same_profile: float
-    size: tuple[float, float]
-    curve: tuple[float, float]
-    size_inside: float
-    onset: tuple[float, float]
-    onset_inside: float
+    records: int  # number of records
+    first: float  # share in which exactly the hidden causes are named
+    listed: float  # share in which they are named or listed
+    count: float  # mean number of listed explanations
+    wrong: float  # share with a false claim
+    unknown: float  # share called unknown
+    unknown_in_place: float  # share called unknown with the right location
+    right_place: float  # share with the right location, whatever the name
+    same_profile: float  # share of the right causes with the right profile
+    size: tuple[float, float]  # median and 90 % quantile of the relative error of the size
+    curve: tuple[float, float]  # median and 90 % quantile of the relative error of the curve
+    size_inside: float  # share of the 95 % intervals that contain the size
+    onset: tuple[float, float]  # median and 90 % quantile of the error of a step's onset, in min
+    onset_inside: float  # share of the 95 % intervals that contain the onset
     held_out: tuple[float, float]
-    held_out_in_sd: tuple[float, float]
-    drawn_in_sd: tuple[float, float]
-    before: tuple[float, float]
-    seconds: tuple[float, float]
-    errors: int
+    held_out_in_sd: tuple[float, float]  # error of T on held-out rows over the standard deviation of the noise
+    drawn_in_sd: tuple[float, float]  # error of the truth on held-out rows over the standard deviation of the noise
+    before: tuple[float, float]  # error of the nominal model over the standard deviation of the noise, as `held_out`
+    seconds: tuple[float, float]  # median and maximum of the core seconds
+    errors: int  # number of diagnoses that failed
 
     @classmethod
     def of(cls, judged: Sequence[Judged]) -> "Score":

@@ -20,21 +20,13 @@ TRIES = 200
 
 @dataclass(frozen=True)
 class SuspectsJudged:
-    """Suspects of one alarm.
+    """Suspects of one alarm."""
 
-    Attributes:
-        truth: name of the hidden cause.
-        nearly: whether the plant is not quite the model.
-        first_probability: probability of the first suspect.
-        first: whether it is the hidden cause.
-        in_set: whether the hidden cause is in the smallest set with 90 %.
-    """
-
-    truth: str
-    nearly: bool
-    first_probability: float
-    first: bool
-    in_set: bool
+    truth: str  # name of the hidden cause
+    nearly: bool  # whether the plant is not quite the model
+    first_probability: float  # probability of the first suspect
+    first: bool  # whether it is the hidden cause
+    in_set: bool  # whether the hidden cause is in the smallest set with 90 %
 
 
 def judge_suspects(number: int, nearly: bool, first_seed: int) -> SuspectsJudged | None:

@@ -28,27 +28,16 @@ TRIES, NEAR = 9, 0.25
 
 @dataclass(frozen=True)
 class Unlisted:
-    """An effect that is in no catalogue.
+    """An effect that is in no catalogue."""
 
-    Attributes:
-        name: name in the tables.
-        process: plant in which it acts.
-        places: locations that count as right.
-        forms: forms of a law that count as right.
-        size: size of a trial; the size of a record is scaled from it.
-        rates: derivatives of the states.
-        reading: readings of the sensors.
-        extra: start values of further states.
-    """
-
-    name: str
-    process: str
-    places: tuple[str, ...]
-    forms: tuple[str, ...]
-    size: float
-    rates: Rates
-    reading: Reading
-    extra: tuple[float, ...] = ()
+    name: str  # name in the tables
+    process: str  # plant in which it acts
+    places: tuple[str, ...]  # locations that count as right
+    forms: tuple[str, ...]  # forms of a law that count as right
+    size: float  # size of a trial; the size of a record is scaled from it
+    rates: Rates  # derivatives of the states
+    reading: Reading  # readings of the sensors
+    extra: tuple[float, ...] = ()  # start values of further states
 
 
 @dataclass(frozen=True)
@@ -74,19 +63,12 @@ PLANTS = {
 
 @dataclass(frozen=True, eq=False)
 class UnlistedRecord:
-    """A record and the truth about it.
+    """A record and the truth about it."""
 
-    Attributes:
-        record: measured values.
-        clean: readings without noise, shape (rows, outputs).
-        size: size of the effect.
-        widths: largest root mean square difference from the nominal plant, in noise standard deviations.
-    """
-
-    record: Record
-    clean: Array
-    size: float
-    widths: float
+    record: Record  # measured values
+    clean: Array  # readings without noise, shape (rows, outputs)
+    size: float  # size of the effect
+    widths: float  # largest root mean square difference from the nominal plant, in noise standard deviations
 
 
 def draw_record(effect: Unlisted, seed: int, wanted_widths: float, span_min: float = 750.0) -> UnlistedRecord:

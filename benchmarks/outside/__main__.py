@@ -15,19 +15,12 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A benchmark.
+    """A benchmark."""
 
-    Attributes:
-        title: heading of its table.
-        data: path of its data in the folder.
-        measure: function of that path and a seed that returns the rows of the table.
-        records: sentence above the table that states how many records its numbers are from.
-    """
-
-    title: str
-    data: str
-    measure: Callable[[Path, int], list[Row]]
-    records: str
+    title: str  # heading of its table
+    data: str  # path of its data in the folder
+    measure: Callable[[Path, int], list[Row]]  # function of that path and a seed that returns the rows of the table
+    records: str  # sentence above the table that states how many records its numbers are from
 
 
 ONE_OF_EACH = "One record of each fault."

@@ -17,31 +17,14 @@ from reactorwatch.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class WatchedRows:
-    """Rows of a file that was watched.
+    """Rows of a file that was watched."""
 
-    Attributes:
-        in_alarm: flags of the rows in alarm, shape (rows,).
-        raised: flags of the rows at which an alarm is raised.
-    """
-
-    in_alarm: NDArray[np.bool_]
-    raised: NDArray[np.bool_]
+    in_alarm: NDArray[np.bool_]  # flags of the rows in alarm, shape (rows,)
+    raised: NDArray[np.bool_]  # flags of the rows at which an alarm is raised
 
 
 def backtest(files: Sequence[Path], folder: Path, *options: str) -> tuple[list[WatchedRows], list[dict[str, Any]]]:
-    """Run `reactorwatch backtest` with `--rows` and `--json`.
-
-    Args:
-        files: files to be watched.
-        folder: folder for the rows.
-        *options: options of the command.
-
-    Returns:
-        The rows of each file, and its JSON.
-
-    Raises:
-        InputError: the command refused the files; the message is its own.
-    """
+    """Run `reactorwatch backtest` with `--rows` and `--json`."""
     out = folder / "rows.csv"
     command = ("backtest", *map(str, files), "--rows", str(out), "--json", "--force", *options)
     objects = [json.loads(line) for line in run(*command).splitlines() if line.startswith("{")]
@@ -54,11 +37,7 @@ def backtest(files: Sequence[Path], folder: Path, *options: str) -> tuple[list[W
 
 
 def run(*arguments: str) -> str:
-    """Run a command of reactorwatch and return what it prints.
-
-    Raises:
-        InputError: it failed; the message is its own.
-    """
+    """Run a command of reactorwatch and return what it prints."""
     command = [str(Path(sys.executable).with_name("reactorwatch")), *arguments]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode:

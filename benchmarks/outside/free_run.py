@@ -28,11 +28,7 @@ _TANKS = ("--time-unit", "s", "--input", "pump_V", "--output", "level_V")
 
 
 def measure_tanks(folder: Path, _seed: int) -> list[Row]:
-    """Rows of the table of the cascaded tanks, one for each kind of model and one for the equations.
-
-    Args:
-        folder: folder with `estimation.csv`, and `validation.csv` if it is there.
-    """
+    """Rows of the table of the cascaded tanks, one for each kind of model and one for the equations."""
     source = folder / "estimation.csv"
     with tempfile.TemporaryDirectory() as temporary:
         first, second = split(source, Path(temporary), 512)
@@ -83,11 +79,7 @@ def _describe(equations: str) -> str:
 
 
 def measure_reactor(file: Path, _seed: int) -> list[Row]:
-    """Rows of the table of DaISy's reactor, one for each kind of model.
-
-    Args:
-        file: the record.
-    """
+    """Rows of the table of DaISy's reactor, one for each kind of model."""
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         first, second = split(file, Path(temporary), 3750)

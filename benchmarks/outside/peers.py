@@ -45,23 +45,14 @@ class Peer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Pca:
-    """Principal components of scaled rows.
+    """Principal components of scaled rows."""
 
-    Attributes:
-        centre: mean of each signal, shape (signals,).
-        spread: standard deviation of each signal; 1 for a constant one.
-        directions: directions of all components, shape (signals, components), by falling variance.
-        variances: variance of each component.
-        kept: number of components of T2.
-        rows: number of rows of the training.
-    """
-
-    centre: Array
-    spread: Array
-    directions: Array
-    variances: Array
-    kept: int
-    rows: int
+    centre: Array  # mean of each signal, shape (signals,)
+    spread: Array  # standard deviation of each signal; 1 for a constant one
+    directions: Array  # directions of all components, shape (signals, components), by falling variance
+    variances: Array  # variance of each component
+    kept: int  # number of components of T2
+    rows: int  # number of rows of the training
 
     @classmethod
     def fit(cls, rows: Array) -> Self:
@@ -96,13 +87,9 @@ class Pca:
 
 @dataclass(frozen=True, eq=False)
 class DynamicPca:
-    """PCA of rows with the rows before them.
+    """PCA of rows with the rows before them."""
 
-    Attributes:
-        pca: components of the stacked rows.
-    """
-
-    pca: Pca
+    pca: Pca  # components of the stacked rows
 
     @classmethod
     def fit(cls, rows: Array) -> Self:
@@ -121,21 +108,13 @@ class DynamicPca:
 
 @dataclass(frozen=True, eq=False)
 class CanonicalVariates:
-    """Canonical variates of the past rows with the future ones.
+    """Canonical variates of the past rows with the future ones."""
 
-    Attributes:
-        centre: mean of each signal.
-        spread: standard deviation of each signal; 1 for a constant one.
-        whitening: matrix that makes the past white, shape (past, past).
-        state: directions of the state in the whitened past, shape (past, states).
-        rows: number of rows of the training.
-    """
-
-    centre: Array
-    spread: Array
-    whitening: Array
-    state: Array
-    rows: int
+    centre: Array  # mean of each signal
+    spread: Array  # standard deviation of each signal; 1 for a constant one
+    whitening: Array  # matrix that makes the past white, shape (past, past)
+    state: Array  # directions of the state in the whitened past, shape (past, states)
+    rows: int  # number of rows of the training
 
     @classmethod
     def fit(cls, rows: Array) -> Self:
@@ -186,15 +165,7 @@ def cross_validated_limits(
     blocks: int = BLOCKS,
     transform: Callable[[Array], Array] = _identity,
 ) -> dict[str, float]:
-    """Limits by blocked cross-validation.
-
-    Args:
-        peer: method.
-        rows: rows of the training, shape (rows, signals).
-        level: share of sound rows below a limit.
-        blocks: number of blocks.
-        transform: function of the statistic of a block, such as its smoothing.
-    """
+    """Limits by blocked cross-validation."""
     held_out = _judge_blocks(peer.fit, rows, blocks, transform)
     return {name: float(np.nanquantile(values, level)) for name, values in held_out.items()}
 

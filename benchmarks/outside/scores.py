@@ -14,19 +14,12 @@ A_TRUE, A_FALSE, A_MISSED = 1.0, -0.11, -1.0
 
 @dataclass(frozen=True)
 class Outliers:
-    """Comparison of rows in alarm with rows that are labelled anomalous.
+    """Comparison of rows in alarm with rows that are labelled anomalous."""
 
-    Attributes:
-        true_alarms: number of anomalous rows in alarm.
-        false_alarms: number of sound rows in alarm.
-        missed: number of anomalous rows without alarm.
-        sound: number of sound rows without alarm.
-    """
-
-    true_alarms: int
-    false_alarms: int
-    missed: int
-    sound: int
+    true_alarms: int  # number of anomalous rows in alarm
+    false_alarms: int  # number of sound rows in alarm
+    missed: int  # number of anomalous rows without alarm
+    sound: int  # number of sound rows without alarm
 
     @property
     def false_alarm_percent(self) -> float:
@@ -45,12 +38,7 @@ class Outliers:
 
 
 def compare_rows(labelled: Sequence[Flags], in_alarm: Sequence[Flags]) -> Outliers:
-    """Compare rows in alarm with labels, over all files together.
-
-    Args:
-        labelled: anomalous rows of each file, shape (rows,).
-        in_alarm: rows in alarm of each file, shape (rows,).
-    """
+    """Compare rows in alarm with labels, over all files together."""
     truth, alarm = np.concatenate(labelled), np.concatenate(in_alarm)
     return Outliers(
         int(np.sum(truth & alarm)),
@@ -62,17 +50,11 @@ def compare_rows(labelled: Sequence[Flags], in_alarm: Sequence[Flags]) -> Outlie
 
 @dataclass(frozen=True)
 class ChangePoints:
-    """Score of change points.
+    """Score of change points."""
 
-    Attributes:
-        score: standard profile of the Numenta benchmark: 100 is perfect, 0 is no detection at all.
-        missed: number of changes without a detection in their window.
-        false_positives: number of detections outside all windows.
-    """
-
-    score: float
-    missed: int
-    false_positives: int
+    score: float  # standard profile of the Numenta benchmark: 100 is perfect, 0 is no detection at all
+    missed: int  # number of changes without a detection in their window
+    false_positives: int  # number of detections outside all windows
 
 
 def score_change_points(
@@ -82,11 +64,6 @@ def score_change_points(
 
     The window of a change begins at the change; where two overlap, the second begins at the end of the first. The first
     detection in a window counts the more the earlier it is.
-
-    Args:
-        changes: times of the changes of each file, in order.
-        detections: times of the detections of each file, in order.
-        window: length of a window, in the unit of the times.
     """
     total, missed, false, count = 0.0, 0, 0, 0
     for true, found in zip(changes, detections, strict=True):
@@ -120,13 +97,7 @@ def _value(share: float) -> float:
 def bootstrap_interval(
     values: NDArray[np.float64], rng: np.random.Generator, resamples: int = 2000
 ) -> tuple[float, float]:
-    """95 % interval of a mean over files or blocks, by resampling them.
-
-    Args:
-        values: one value a file or block, shape (n,).
-        rng: generator of the resamples.
-        resamples: number of resamples.
-    """
+    """95 % interval of a mean over files or blocks, by resampling them."""
     means = values[rng.integers(0, values.size, (resamples, values.size))].mean(axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
     return float(low), float(high)

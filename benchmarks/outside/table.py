@@ -6,17 +6,11 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a table.
+    """A row of a table."""
 
-    Attributes:
-        method: name of the method.
-        settings: settings that it was run with.
-        cells: values by the name of their column.
-    """
-
-    method: str
-    settings: str
-    cells: dict[str, str] = field(default_factory=dict)
+    method: str  # name of the method
+    settings: str  # settings that it was run with
+    cells: dict[str, str] = field(default_factory=dict)  # values by the name of their column
 
 
 def markdown(rows: Sequence[Row]) -> str:

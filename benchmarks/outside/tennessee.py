@@ -51,12 +51,7 @@ def rows_of(file: Path) -> Array:
 
 
 def measure(folder: Path, seed: int) -> list[Row]:
-    """Rows of the table, one for each method.
-
-    Args:
-        folder: folder with `d00.dat` and the files of the faults.
-        seed: seed of the resamples of the intervals.
-    """
+    """Rows of the table, one for each method."""
     train, sound = folder / "d00.dat", folder / "d00_te.dat"
     faults = {re.sub(r"\D", "", path.stem): path for path in sorted(folder.glob("d[0-9][0-9]_te.dat")) if path != sound}
     files = [sound, *faults.values()]
@@ -84,12 +79,7 @@ def measure(folder: Path, seed: int) -> list[Row]:
 
 
 def measure_places(folder: Path, seed: int) -> list[Row]:
-    """Signals that the first alarm with a place names, for the faults whose place is known.
-
-    Args:
-        folder: see `measure`.
-        seed: not used; nothing is drawn.
-    """
+    """Signals that the first alarm with a place names, for the faults whose place is known."""
     files = {name: folder / f"d{name}_te.dat" for name in PLACES}
     files = {name: file for name, file in files.items() if file.exists()}
     objects = _watch(folder / "d00.dat", list(files.values()))[1]

@@ -34,11 +34,7 @@ _SIGNALS = {"Q1": "Q1_cm3_s", "Q2": "Q2_cm3_s", "h1": "h1_cm", "h2": "h2_cm", "h
 
 
 def measure(folder: Path, _seed: int) -> list[Row]:
-    """Rows of the table, one for each fault in the folder.
-
-    Args:
-        folder: folder with `faultNN.csv` and `normal.csv`.
-    """
+    """Rows of the table, one for each fault in the folder."""
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         process = Path(temporary) / "rig.toml"

@@ -27,21 +27,13 @@ _LABELS = ("anomaly", "changepoint")
 
 @dataclass(frozen=True, eq=False)
 class File:
-    """A file of the benchmark.
+    """A file of the benchmark."""
 
-    Attributes:
-        time_s: time of each row since the first, shape (rows,).
-        values: shape (rows, sensors).
-        sensors: names of the sensors.
-        anomaly: flags of the anomalous rows.
-        changes: flags of the rows at which something changes.
-    """
-
-    time_s: Array
-    values: Array
-    sensors: tuple[str, ...]
-    anomaly: Flags
-    changes: Flags
+    time_s: Array  # time of each row since the first, shape (rows,)
+    values: Array  # shape (rows, sensors)
+    sensors: tuple[str, ...]  # names of the sensors
+    anomaly: Flags  # flags of the anomalous rows
+    changes: Flags  # flags of the rows at which something changes
 
 
 def read(path: Path) -> File:
@@ -61,12 +53,7 @@ def read(path: Path) -> File:
 
 
 def measure(folder: Path, seed: int) -> list[Row]:
-    """Rows of the table, one for each method.
-
-    Args:
-        folder: folder with the files.
-        seed: seed of the resamples of the intervals.
-    """
+    """Rows of the table, one for each method."""
     paths = sorted(folder.glob("*.csv"))
     files = [read(path) for path in paths]
     watched = _monitor(paths, files[0].sensors)

@@ -45,21 +45,13 @@ class Job(NamedTuple):
 
 
 class Result(NamedTuple):
-    """Result of a record.
+    """Result of a record."""
 
-    Attributes:
-        alarms: number of alarms.
-        expected: number of false alarms promised.
-        rows: number of rows after the training.
-        judged: number of these that were judged.
-        kept: false if the monitor says that the promise is not kept.
-    """
-
-    alarms: int
-    expected: float
-    rows: int
-    judged: int
-    kept: bool
+    alarms: int  # number of alarms
+    expected: float  # number of false alarms promised
+    rows: int  # number of rows after the training
+    judged: int  # number of these that were judged
+    kept: bool  # false if the monitor says that the promise is not kept
 
 
 def without_equations(reference: ReferenceName = "auto") -> MonitorConfig:
@@ -78,14 +70,7 @@ def without_equations(reference: ReferenceName = "auto") -> MonitorConfig:
 
 
 def flows_of(kind: str, rows: int, rng: np.random.Generator) -> Array:
-    """Coolant flow of a record.
-
-    Args:
-        kind: `wide`: new in 90 to 111 each minute; `mid`: in 97 to 109; `moves`: in 93 to 109 every 75 min; `sines`:
-            three of them, within 93 to 109.
-        rows: number of rows.
-        rng: source of random numbers.
-    """
+    """Coolant flow of a record."""
     time_min = np.arange(rows) * PERIOD_MIN
     if kind == "sines":
         phases = rng.uniform(0.0, 2.0 * np.pi, 3)

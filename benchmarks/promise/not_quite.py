@@ -22,35 +22,21 @@ NOT_WATCHED = ("C every tenth row", "2 % of the rows lost")
 
 
 class Plant(NamedTuple):
-    """A plant and its monitor.
+    """A plant and its monitor."""
 
-    Attributes:
-        kind: index of its kind.
-        moves: index of its input.
-        set: index of the set of plants, which differ in their seeds.
-        rate: false alarms promised in 30 days; None: the default of the monitor.
-        is_faulty: true if its feed is 1.5 K warmer from `ONSET_MIN` on.
-    """
-
-    kind: int
-    moves: int
-    set: int = 0
-    rate: float | None = None
-    is_faulty: bool = False
+    kind: int  # index of its kind
+    moves: int  # index of its input
+    set: int = 0  # index of the set of plants, which differ in their seeds
+    rate: float | None = None  # false alarms promised in 30 days; None: the default of the monitor
+    is_faulty: bool = False  # true if its feed is 1.5 K warmer from `ONSET_MIN` on
 
 
 class Outcome(NamedTuple):
-    """Result of a back-test.
+    """Result of a back-test."""
 
-    Attributes:
-        raised_min: times of the alarms.
-        expected: false alarms promised.
-        kept: false if the monitor says that the promise is not kept.
-    """
-
-    raised_min: list[float]
-    expected: float
-    kept: bool
+    raised_min: list[float]  # times of the alarms
+    expected: float  # false alarms promised
+    kept: bool  # false if the monitor says that the promise is not kept
 
 
 def watch(plant: Plant) -> Outcome:
@@ -65,12 +51,7 @@ def watch(plant: Plant) -> Outcome:
 
 
 def print_plants(executor: Executor, count: int) -> None:
-    """Watch sound plants and plants with a fault, and print the tables.
-
-    Args:
-        executor: executor of the jobs.
-        count: number of kinds of plants.
-    """
+    """Watch sound plants and plants with a fault, and print the tables."""
     kinds, moves = range(count), range(len(INPUTS))
     sound = [Plant(kind, move) for kind in kinds for move in moves]
     often = [Plant(kind, move, number, HIGH_RATE) for number in (0, 1) for kind in kinds for move in moves]
@@ -84,13 +65,7 @@ def print_plants(executor: Executor, count: int) -> None:
 
 
 def print_counts(title: str, plants: Sequence[Plant], outcomes: Iterator[Outcome]) -> None:
-    """Print the table of false alarms.
-
-    Args:
-        title: heading of the table.
-        plants: sound plants, by kind and input.
-        outcomes: outcomes of these plants, then those of later tables.
-    """
+    """Print the table of false alarms."""
     print(f"| sound plant, {title} | false alarms, by input | promised | not kept |\n|---|---|---|---|", flush=True)
     found = [(plant, next(outcomes)) for plant in plants]
     for kind in dict.fromkeys(plant.kind for plant in plants):

@@ -21,29 +21,17 @@ _START = (0.1, 438.54)
 
 @dataclass(frozen=True)
 class Kind:
-    """A way in which a sound plant differs from the model.
+    """A way in which a sound plant differs from the model."""
 
-    Attributes:
-        name: description.
-        constants: changed constants of the equations, by name.
-        lag_min: time constant of the coolant valve.
-        feed_wander: coefficient of a row and standard deviation of the innovations of the feed temperature's AR(1), K.
-        process_noise: standard deviation of the noise of T's balance, K per square root of a minute.
-        noise_memory: coefficient of a row and standard deviation of the innovations of the AR(1) noise of T, K.
-        lost: share of the rows that are lost.
-        analyser_every: rows between two values of C.
-        steps: steps of the sensors, mol/l and K.
-    """
-
-    name: str
-    constants: tuple[tuple[str, float], ...] = ()
-    lag_min: float = 0.0
+    name: str  # description
+    constants: tuple[tuple[str, float], ...] = ()  # changed constants of the equations, by name
+    lag_min: float = 0.0  # time constant of the coolant valve
     feed_wander: tuple[float, float] | None = None
-    process_noise: float = 0.0
+    process_noise: float = 0.0  # standard deviation of the noise of T's balance, K per square root of a minute
     noise_memory: tuple[float, float] | None = None
-    lost: float = 0.0
-    analyser_every: int = 1
-    steps: tuple[float, float] | None = None
+    lost: float = 0.0  # share of the rows that are lost
+    analyser_every: int = 1  # rows between two values of C
+    steps: tuple[float, float] | None = None  # steps of the sensors, mol/l and K
 
 
 KINDS = (
@@ -79,15 +67,7 @@ INPUTS: dict[str, Input] = {
 
 
 def simulate(kind: Kind, flow: Input, seed: int, warmer_from_min: float | None = None, warmer: float = 1.5) -> Record:
-    """Simulate a plant.
-
-    Args:
-        kind: difference from the model.
-        flow: input.
-        seed: seed of input and noise.
-        warmer_from_min: time from which the feed is warmer: a fault; None: there is none.
-        warmer: size of that fault, K.
-    """
+    """Simulate a plant."""
     rng = np.random.default_rng(seed)
     rows = round(SPAN_MIN / PERIOD_MIN)
     time_min: Array = np.arange(rows, dtype=np.float64) * PERIOD_MIN

@@ -13,11 +13,7 @@ Result = TypeVar("Result")
 
 
 def run_jobs(executor: Executor, work: Callable[[Job], Result], jobs: Sequence[Job]) -> Generator[Result]:
-    """Yield the results of jobs, in their order.
-
-    Raises:
-        RuntimeError: a job failed.
-    """
+    """Yield the results of jobs, in their order."""
     for job, outcome in zip(jobs, in_job_order(executor.map_unordered(work, jobs)), strict=True):
         if isinstance(outcome, Failed):
             raise RuntimeError(f"{job}: {outcome.reason}")  # noqa: TRY004 # no wrong type: it failed

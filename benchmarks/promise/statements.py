@@ -46,19 +46,12 @@ class Group(NamedTuple):
 
 
 class Step(NamedTuple):
-    """An injected step.
+    """An injected step."""
 
-    Attributes:
-        cause: cause of the catalogue.
-        size: size in the unit of the cause.
-        factor: size relative to the stated one.
-        seed: seed of the record.
-    """
-
-    cause: str
-    size: float
-    factor: float
-    seed: int
+    cause: str  # cause of the catalogue
+    size: float  # size in the unit of the cause
+    factor: float  # size relative to the stated one
+    seed: int  # seed of the record
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -73,13 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def print_tables(executor: Executor, plants: int = PLANTS, runs: int = RUNS) -> None:
-    """Print both tables.
-
-    Args:
-        executor: executor of the jobs.
-        plants: simulated plants for each length of the training.
-        runs: faults injected for each size.
-    """
+    """Print both tables."""
     print("| rows of the training | noise of the residual | plants worse than their bound at 90 % (95 %) |")
     print("|---|---|---|", flush=True)
     groups = [Group(rows, coefficient, plants) for rows in TRAININGS for coefficient in COEFFICIENTS]
@@ -117,12 +104,6 @@ def share_worse(rows: int, coefficient: float, plants: int, quantile: float = QU
     """Share of simulated plants whose true rate of false alarms is above the stated bound.
 
     Each has one residual, an autoregression, and a Shewhart and an EWMA chart.
-
-    Args:
-        rows: rows of the training.
-        coefficient: coefficient of the autoregression.
-        plants: number of plants.
-        quantile: quantile of the rate that is the bound.
     """
     generator, errors = np.random.default_rng(rows), TrainingErrors.draw(1)
     worse = 0

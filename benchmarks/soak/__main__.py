@@ -28,13 +28,7 @@ CATCH_UP_S = 60.0
 
 
 def soak(plan: Plan, folder: Path, *, tell: bool = False) -> Findings:
-    """Run a soak and assess it.
-
-    Args:
-        plan: plan of the soak.
-        folder: empty folder for settings, states and logs of the monitors.
-        tell: whether each blow is printed.
-    """
+    """Run a soak and assess it."""
     zero_ns = time.time_ns()
     with Site(plan, folder, zero_ns) as site, contextlib.closing(Witness(site.bus)) as witness:
         site.start_monitors()

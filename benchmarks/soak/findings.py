@@ -47,62 +47,32 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of a soak.
+    """Findings of a soak."""
 
-    Attributes:
-        published: samples of all plants.
-        rows: number of evaluated rows.
-        incomplete: number of incomplete rows among them.
-        lost: samples that never reached the monitor of their plant.
-        late: samples that came after their row was evaluated.
-        unaccounted: for each plant with any, its samples that are neither in a row nor counted, or in a row without
-            having been published.
-        duplicated: repeated samples.
-        refused: rejected messages of the plants, by reason.
-        garbage: number of garbage messages.
-        stalls: number of stalls of a monitor longer than a second.
-        lag_ms: longest wait of a message in a monitor.
-        faults: number of faults in the plants.
-        alarmed_once: number of faults alarmed once.
-        not_once: plants with a fault that was not alarmed once, with the reason.
-        false_alarms: alarms of each plant without a fault.
-        others: for each plant, changes of alarms that differ from those of an undisturbed monitor.
-        silences: number of silences raised before the last row.
-        silences_raised_twice: number of silences raised once more.
-        standing_silences: number of silences that were not over in the end.
-        memory_mb: largest memory of each process in each third of the run.
-        grown_mb: for each process that ran since the first third, growth of its median memory from the second third to
-            the last.
-    """
-
-    published: int
-    rows: int
-    incomplete: int
-    lost: int
-    late: int
-    unaccounted: dict[str, str]
-    duplicated: int
-    refused: dict[str, int]
-    garbage: int
-    stalls: int
-    lag_ms: float
-    faults: int
-    alarmed_once: int
-    not_once: dict[str, str]
-    false_alarms: dict[str, list[str]]
-    others: dict[str, list[str]]
-    silences: int
-    silences_raised_twice: int
-    standing_silences: int
-    memory_mb: dict[str, tuple[float, float, float]]
-    grown_mb: dict[str, float]
+    published: int  # samples of all plants
+    rows: int  # number of evaluated rows
+    incomplete: int  # number of incomplete rows among them
+    lost: int  # samples that never reached the monitor of their plant
+    late: int  # samples that came after their row was evaluated
+    unaccounted: dict[str, str]  # for each plant with any
+    duplicated: int  # repeated samples
+    refused: dict[str, int]  # rejected messages of the plants, by reason
+    garbage: int  # number of garbage messages
+    stalls: int  # number of stalls of a monitor longer than a second
+    lag_ms: float  # longest wait of a message in a monitor
+    faults: int  # number of faults in the plants
+    alarmed_once: int  # number of faults alarmed once
+    not_once: dict[str, str]  # plants with a fault that was not alarmed once, with the reason
+    false_alarms: dict[str, list[str]]  # alarms of each plant without a fault
+    others: dict[str, list[str]]  # for each plant, changes of alarms that differ from those of an undisturbed monitor
+    silences: int  # number of silences raised before the last row
+    silences_raised_twice: int  # number of silences raised once more
+    standing_silences: int  # number of silences that were not over in the end
+    memory_mb: dict[str, tuple[float, float, float]]  # largest memory of each process in each third of the run
+    grown_mb: dict[str, float]  # for each process that ran since the first third
 
     def failures(self, growth_mb: float = GROWTH_MB) -> Iterator[str]:
-        """Yield a line for each broken promise.
-
-        Args:
-            growth_mb: allowed growth of a process.
-        """
+        """Yield a line for each broken promise."""
         for plant, samples in self.unaccounted.items():
             yield f"{plant}: samples unaccounted for: {samples}"
         if not 0 < sum(self.refused.values()) <= self.garbage:
@@ -123,12 +93,7 @@ class Findings:
 
 
 def count_unaccounted(health: Health, rows: int) -> int:
-    """Count the samples of a plant that are neither in a row nor counted, or samples in rows that it did not publish.
-
-    Args:
-        health: newest health of the plant's monitor.
-        rows: rows that the plant has published.
-    """
+    """Count the samples of a plant that are neither in a row nor counted, or in a row without being published."""
     places = SIGNALS * health.rows
     fewest, most = places - (SIGNALS - 1) * health.incomplete_rows, places - health.incomplete_rows
     missing, too_many = SIGNALS * rows - most, fewest - SIGNALS * rows
@@ -176,17 +141,7 @@ def assess(
     garbage: int,
     memory: Mapping[str, Sequence[Taken]],
 ) -> Findings:
-    """Assess a soak.
-
-    Args:
-        plan: plan of the soak.
-        zero_ns: the time of the plants' first row.
-        alarms: alarm messages of each plant.
-        health: newest health of each plant's monitor.
-        lag_ms: longest wait of a message in a monitor.
-        garbage: number of garbage messages.
-        memory: memory of each process in the course of the run.
-    """
+    """Assess a soak."""
     reports = [health.get(plant, Health()) for plant in plan.plants]
     refused: Counter[str] = Counter()
     missing: dict[str, str] = {}

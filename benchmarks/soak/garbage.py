@@ -33,27 +33,16 @@ SIGNALS = ("qc", "C", "T")
 
 
 class Task(msgspec.Struct, frozen=True):
-    """Task of the process.
+    """Task of the process."""
 
-    Attributes:
-        seed: seed of the messages.
-        plants: names of the plants that it imitates.
-        zero_ns: the time of their first row.
-        bus: settings of the link to the router.
-    """
-
-    seed: int
-    plants: tuple[str, ...]
-    zero_ns: int
-    bus: BusConfig
+    seed: int  # seed of the messages
+    plants: tuple[str, ...]  # names of the plants that it imitates
+    zero_ns: int  # the time of their first row
+    bus: BusConfig  # settings of the link to the router
 
 
 class GarbageSource:
-    """Publishes garbage.
-
-    Args:
-        task: seed, plants and router.
-    """
+    """Publishes garbage."""
 
     def __init__(self, task: Task) -> None:
         self._task = task

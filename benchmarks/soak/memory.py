@@ -19,17 +19,11 @@ OWN = ("RssAnon:", "RssShmem:")
 
 
 class Taken(NamedTuple):
-    """Memory that a process takes at one time.
+    """Memory that a process takes at one time."""
 
-    Attributes:
-        row: Row of the plants that was published last.
-        pid: Number of the process; a restarted process has another one.
-        memory_mb: Memory of the process's own in MB.
-    """
-
-    row: int
-    pid: int
-    memory_mb: float
+    row: int  # Row of the plants that was published last
+    pid: int  # Number of the process; a restarted process has another one
+    memory_mb: float  # Memory of the process's own in MB
 
 
 def own_memory_mb(pid: int) -> float:
@@ -51,12 +45,7 @@ def most_in_thirds(taken: Sequence[Taken], rows: int) -> tuple[float, float, flo
 
 
 def find_growth_mb(taken: Sequence[Taken], rows: int) -> float | None:
-    """Return how much a process has grown since the warm-up, in MB; None if it did not run all the time since.
-
-    Args:
-        taken: Memory of the process in the course of the run.
-        rows: Rows of the run.
-    """
+    """Return how much a process has grown since the warm-up, in MB; None if it did not run all the time since."""
     _, middle, last = _thirds(taken, rows)
     if not middle or not last or len({item.pid for item in (*middle, *last)}) > 1:
         return None

@@ -79,21 +79,13 @@ takes a core for a second a plant, and is tested elsewhere."""
 
 
 class Blow(NamedTuple):
-    """A disturbance of a process or a link.
+    """A disturbance of a process or a link."""
 
-    Attributes:
-        row: row of the plants at which it comes.
-        kind: kind of the disturbance.
-        manner: manner of a cut: closed, as when a machine is switched off, or stalled, as when a cable is pulled.
-        monitor: index of the monitor.
-        rows: duration in rows.
-    """
-
-    row: int
-    kind: Kind
-    manner: Manner
-    monitor: int
-    rows: int
+    row: int  # row of the plants at which it comes
+    kind: Kind  # kind of the disturbance
+    manner: Manner  # manner of a cut: closed, as when a machine is switched off, or stalled, as when a cable is pulled
+    monitor: int  # index of the monitor
+    rows: int  # duration in rows
 
 
 class Fault(NamedTuple):
@@ -104,33 +96,18 @@ class Fault(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Plan of a soak.
+    """Plan of a soak."""
 
-    Attributes:
-        seed: seed of the plan.
-        rows: rows of each plant.
-        rows_per_s: rows of each plant in a second.
-        plants: names of the plants.
-        faults: fault of each plant that has one.
-        blows: disturbances in order of time.
-        monitor: settings of the monitors.
-    """
-
-    seed: int
-    rows: int
-    rows_per_s: float
-    plants: tuple[str, ...]
-    faults: dict[str, Fault]
-    blows: tuple[Blow, ...]
-    monitor: MonitorConfig = WATCH
+    seed: int  # seed of the plan
+    rows: int  # rows of each plant
+    rows_per_s: float  # rows of each plant in a second
+    plants: tuple[str, ...]  # names of the plants
+    faults: dict[str, Fault]  # fault of each plant that has one
+    blows: tuple[Blow, ...]  # disturbances in order of time
+    monitor: MonitorConfig = WATCH  # settings of the monitors
 
     def plant(self, name: str, zero_ns: int) -> PlantConfig:
-        """Configuration of a plant.
-
-        Args:
-            name: name of the plant.
-            zero_ns: the time of its first row.
-        """
+        """Configuration of a plant."""
         fault = self.faults.get(name)
         return PlantConfig(
             name=name,
@@ -144,17 +121,7 @@ class Plan(NamedTuple):
 
 
 def draw_plan(seed: int, plants: int, rows: int, rows_per_s: float) -> Plan:
-    """Draw a plan.
-
-    Args:
-        seed: seed of the plan.
-        plants: number of plants.
-        rows: rows of each plant.
-        rows_per_s: rows of each plant in a second.
-
-    Raises:
-        InputError: too few rows for a training and a fault after it.
-    """
+    """Draw a plan."""
     first = TRAINING_ROWS + SETTLED_ROWS
     if rows <= first + LAST_ROWS:
         raise InputError(

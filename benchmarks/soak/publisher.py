@@ -25,27 +25,16 @@ SHARING = 25
 
 
 class Task(msgspec.Struct, frozen=True):
-    """Task of a process of plants.
+    """Task of a process of plants."""
 
-    Attributes:
-        seed: seed of the plan.
-        plants: number of plants of the plan.
-        rows: rows of each plant.
-        rows_per_s: rows of each plant in a second.
-        part: index of the first plant of this process; every `parts`-th after it belongs to it as well.
-        parts: number of such processes.
-        zero_ns: the time of the first row.
-        bus: settings of the link to the router.
-    """
-
-    seed: int
-    plants: int
-    rows: int
-    rows_per_s: float
-    part: int
-    parts: int
-    zero_ns: int
-    bus: BusConfig
+    seed: int  # seed of the plan
+    plants: int  # number of plants of the plan
+    rows: int  # rows of each plant
+    rows_per_s: float  # rows of each plant in a second
+    part: int  # index of the first plant of this process; every `parts`-th after it belongs to it as well
+    parts: int  # number of such processes
+    zero_ns: int  # the time of the first row
+    bus: BusConfig  # settings of the link to the router
 
 
 class Allowance:

@@ -32,12 +32,7 @@ KEPT_S = 60.0
 
 
 class Lines:
-    """Lines that a process prints.
-
-    Args:
-        process: the process.
-        on_line: called with each line, in a thread.
-    """
+    """Lines that a process prints."""
 
     def __init__(self, process: "subprocess.Popen[str]", on_line: Callable[[str], None] = lambda _: None) -> None:
         self._changed = threading.Condition()
@@ -71,13 +66,7 @@ class Lines:
 
 
 class Site:
-    """The processes, as long as the context lasts.
-
-    Args:
-        plan: plan of the soak.
-        folder: folder for settings, states and logs of the monitors.
-        zero_ns: the time of the plants' first row.
-    """
+    """The processes, as long as the context lasts."""
 
     def __init__(self, plan: Plan, folder: Path, zero_ns: int) -> None:
         self._plan, self._folder, self._zero_ns = plan, folder, zero_ns
@@ -183,12 +172,7 @@ class Site:
     # --- disturbances ---------------------------------------------------------------------------------------
 
     def disturb(self, blow: Blow, wait_for_monitors: Callable[[int], None]) -> None:
-        """Strike a blow, and wait until all processes are there again.
-
-        Args:
-            blow: the blow.
-            wait_for_monitors: waits for a number of live monitors.
-        """
+        """Strike a blow, and wait until all processes are there again."""
         end = blow.row + blow.rows
         self.allow(end + 1)
         if blow.kind == "kill monitor":

@@ -13,16 +13,7 @@ from reactorwatch.runtime.config import BusConfig
 
 
 class Witness:
-    """Collects alarms, health and tokens of the monitors.
-
-    Args:
-        config: settings of the link to the router.
-
-    Attributes:
-        alarms: alarm messages of each plant, in order of arrival.
-        health: newest health of each plant's monitor.
-        longest_lag_ms: largest lag in the health messages.
-    """
+    """Collects alarms, health and tokens of the monitors."""
 
     def __init__(self, config: BusConfig) -> None:
         self._changed = threading.Condition()

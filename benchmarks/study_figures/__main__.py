@@ -12,11 +12,7 @@ from reactorwatch.runtime.crash import guard
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Draw the figures; returns an exit code.
-
-    Args:
-        words: words of the command line; None: those of this process.
-    """
+    """Draw the figures; returns an exit code."""
     # Before NumPy is imported: the last bits of a limit depend on the number of threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     return guard("reproduce", partial(_reproduce, _arguments(words)))

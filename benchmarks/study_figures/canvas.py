@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.write import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,11 +51,7 @@ _STYLE: Any = {
 
 
 def require_matplotlib() -> None:
-    """Require matplotlib.
-
-    Raises:
-        InputError: matplotlib is not installed.
-    """
+    """Require matplotlib."""
     try:
         import matplotlib  # noqa: F401
     except ImportError as missing:
@@ -64,11 +60,7 @@ def require_matplotlib() -> None:
 
 @contextmanager
 def paper(path: Path, height_px: int) -> Iterator[Drawing]:
-    """An empty drawing, which is written to `path` (PNG) when the block ends without an error.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """An empty drawing, which is written to `path` (PNG) when the block ends without an error."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -88,14 +80,7 @@ def paper(path: Path, height_px: int) -> Iterator[Drawing]:
 
 
 def panels(drawing: Drawing, rows: int, columns: int, **options: Any) -> list[Axes]:
-    """Axes in a grid, row by row.
-
-    Args:
-        drawing: drawing of the axes.
-        rows: number of rows.
-        columns: number of columns.
-        **options: options of matplotlib's `subplots`.
-    """
+    """Axes in a grid, row by row."""
     return list(drawing.subplots(rows, columns, squeeze=False, **options).ravel())
 
 

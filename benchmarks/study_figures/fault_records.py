@@ -40,25 +40,15 @@ _EXPECTED = round(100 * probability_out(WIDTH), 2)  # % of independent normal re
 
 @dataclass(frozen=True)
 class Watch:
-    """Outcome of the watch of a record by the report's scheme and by the monitor.
+    """Outcome of the watch of a record by the report's scheme and by the monitor."""
 
-    Attributes:
-        charts: report's chart of each output.
-        out: share of the rows outside the limits before the onset and after it, for each output, in percent.
-        first_min: time of the first row after the onset that is out, for C or T; None: none is.
-        false_points: rows after the training and before the onset that are out, C and T together.
-        monitor_min: time of the monitor's first alarm; None: none.
-        monitor_false: monitor's alarms before the onset.
-        cause: likeliest cause that the monitor named, with its probability.
-    """
-
-    charts: dict[str, ReportChart]
-    out: dict[str, tuple[float, float]]
-    first_min: float | None
-    false_points: int
-    monitor_min: float | None
-    monitor_false: int
-    cause: str
+    charts: dict[str, ReportChart]  # report's chart of each output
+    out: dict[str, tuple[float, float]]  # share of the rows outside the limits before the onset and after it
+    first_min: float | None  # time of the first row after the onset that is out, for C or T; None: none is
+    false_points: int  # rows after the training and before the onset that are out, C and T together
+    monitor_min: float | None  # time of the monitor's first alarm; None: none
+    monitor_false: int  # monitor's alarms before the onset
+    cause: str  # likeliest cause that the monitor named, with its probability
 
 
 @cache

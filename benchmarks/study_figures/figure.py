@@ -24,34 +24,21 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Finding of a figure.
+    """Finding of a figure."""
 
-    Attributes:
-        text: Markdown, with the numbers of this run.
-        verdict: agreement with the report.
-    """
-
-    text: str
-    verdict: Verdict = Verdict.NO_CLAIM
+    text: str  # Markdown, with the numbers of this run
+    verdict: Verdict = Verdict.NO_CLAIM  # agreement with the report
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure of the report, or one of its sections that has a claim and no figure.
+    """One figure of the report, or one of its sections that has a claim and no figure."""
 
-    Attributes:
-        key: number of the report's caption, such as `8`; `section-` and a word for a section.
-        title: subject of the figure.
-        claim: statement of the report, in our words.
-        draw: function that puts it on an empty drawing and returns the finding.
-        height_px: height of the picture, which is 900 px wide.
-    """
-
-    key: str
-    title: str
-    claim: str
-    draw: Callable[[Study, Drawing], Finding]
-    height_px: int = 500
+    key: str  # number of the report's caption, such as `8`; `section-` and a word for a section
+    title: str  # subject of the figure
+    claim: str  # statement of the report, in our words
+    draw: Callable[[Study, Drawing], Finding]  # function that puts it on an empty drawing and returns the finding
+    height_px: int = 500  # height of the picture, which is 900 px wide
 
     @property
     def heading(self) -> str:

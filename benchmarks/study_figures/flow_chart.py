@@ -36,36 +36,22 @@ MISMATCH_MINUS_LOG10_P = 6.0
 
 
 class Branch(msgspec.Struct, frozen=True):
-    """One question of the chart.
+    """One question of the chart."""
 
-    Attributes:
-        question: the question.
-        answer: "yes" or "no".
-        why: the numbers behind the answer.
-    """
-
-    question: str
-    answer: str
-    why: str
+    question: str  # the question
+    answer: str  # "yes" or "no"
+    why: str  # the numbers behind the answer
 
 
 @dataclass(frozen=True)
 class Conclusion:
-    """Result of the chart.
+    """Result of the chart."""
 
-    Attributes:
-        verdict: "sample again", "fault free", "identify again" or "fault".
-        branches: the questions in order.
-        model: the fitted model; None if the chart ended before it.
-        lower_limit: lower limit of the residual, in the output's unit; NaN without a model.
-        upper_limit: upper limit of the residual; NaN without a model.
-    """
-
-    verdict: str
-    branches: tuple[Branch, ...]
-    model: LinearModel | None = None
-    lower_limit: float = math.nan
-    upper_limit: float = math.nan
+    verdict: str  # "sample again", "fault free", "identify again" or "fault"
+    branches: tuple[Branch, ...]  # the questions in order
+    model: LinearModel | None = None  # the fitted model; None if the chart ended before it
+    lower_limit: float = math.nan  # lower limit of the residual, in the output's unit; NaN without a model
+    upper_limit: float = math.nan  # upper limit of the residual; NaN without a model
 
 
 def follow(
@@ -75,18 +61,7 @@ def follow(
     time: ArrayLike | None = None,
     trusted_rows: int | None = None,
 ) -> Conclusion:
-    """Apply the chart to a record.
-
-    Args:
-        structure: structure of the ARX model; one output.
-        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
-        time: shape (rows,); None: gaps are not detected.
-        trusted_rows: number of rows at the start that are known to be fault free; None: the first half.
-
-    Raises:
-        InputError: a record that does not determine the model, or no rows on one side.
-    """
+    """Apply the chart to a record."""
     u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
     t = np.arange(len(y), dtype=np.float64) if time is None else np.asarray(time, dtype=np.float64)
     trusted = len(y) // 2 if trusted_rows is None else trusted_rows

@@ -54,19 +54,12 @@ _LAB = 'name = "lab"\n[time]\ncolumn = "Time (sec)"\nunit = "s"\n' + "".join(
 
 @dataclass(frozen=True)
 class Source:
-    """A record of others.
+    """A record of others."""
 
-    Attributes:
-        name: name in the table.
-        path: path in the folder.
-        process: description of the process as TOML; empty: the reactor.
-        training_rows: rows that both learn from.
-    """
-
-    name: str
-    path: str
-    process: str
-    training_rows: int
+    name: str  # name in the table
+    path: str  # path in the folder
+    process: str  # description of the process as TOML; empty: the reactor
+    training_rows: int  # rows that both learn from
 
 
 SOURCES = (
@@ -122,17 +115,11 @@ def _draw(_study: Study, drawing: Drawing, folder: Path) -> Finding:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """The report's scheme and the monitor on one record.
+    """The report's scheme and the monitor on one record."""
 
-    Attributes:
-        out_min: times of the rows that are out by the report's scheme, any output.
-        alarms_min: times of the monitor's alarms.
-        row: cells of the table.
-    """
-
-    out_min: Array
-    alarms_min: Array
-    row: str
+    out_min: Array  # times of the rows that are out by the report's scheme, any output
+    alarms_min: Array  # times of the monitor's alarms
+    row: str  # cells of the table
 
 
 def _read(folder: Path, source: Source) -> tuple[rw.Record, rw.Process]:

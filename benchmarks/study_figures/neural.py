@@ -29,25 +29,15 @@ _DIVERGED = 1e6  # a scaled output beyond this, a million times its spread, has 
 
 @dataclass(frozen=True)
 class NeuralModel:
-    """A fitted network beside the linear model whose residual it learned.
+    """A fitted network beside the linear model whose residual it learned."""
 
-    Attributes:
-        linear: the model that the network corrects.
-        scaling: scaling of the signals.
-        residual_sd: scale of the network's output, in the output's unit.
-        hidden: shape (regressors, neurons), weights into the hidden layer.
-        hidden_bias: shape (neurons,).
-        output: shape (neurons,), weights out of the hidden layer.
-        output_bias: constant of the output.
-    """
-
-    linear: LinearModel
-    scaling: Scaling
-    residual_sd: float
-    hidden: NDArray[np.float64]
-    hidden_bias: NDArray[np.float64]
-    output: NDArray[np.float64]
-    output_bias: float
+    linear: LinearModel  # the model that the network corrects
+    scaling: Scaling  # scaling of the signals
+    residual_sd: float  # scale of the network's output, in the output's unit
+    hidden: NDArray[np.float64]  # shape (regressors, neurons), weights into the hidden layer
+    hidden_bias: NDArray[np.float64]  # shape (neurons,)
+    output: NDArray[np.float64]  # shape (neurons,), weights out of the hidden layer
+    output_bias: float  # constant of the output
 
     @property
     def parameter_count(self) -> int:
@@ -96,33 +86,17 @@ class NeuralModel:
 
 @dataclass(frozen=True)
 class Neural:
-    """The family of these models.
+    """The family of these models."""
 
-    Attributes:
-        neurons: number of neurons in the hidden layer.
-        seeds: seeds of the initial weights; one network is fitted for each.
-        iterations: largest number of iterations of each search.
-    """
-
-    neurons: int = 12
-    seeds: tuple[int, ...] = (1, 2, 3)
-    iterations: int = 200
+    neurons: int = 12  # number of neurons in the hidden layer
+    seeds: tuple[int, ...] = (1, 2, 3)  # seeds of the initial weights; one network is fitted for each
+    iterations: int = 200  # largest number of iterations of each search
     name: str = "neural"
 
     def fit(
         self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
     ) -> NeuralModel:
-        """Fit the networks and choose the one with the best simulation.
-
-        Args:
-            structure: lags and delay.
-            inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-            outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
-            time: shape (rows,); None: gaps are not detected.
-
-        Raises:
-            InputError: scikit-learn is not installed, or a record that `fit_arx` refuses.
-        """
+        """Fit the networks and choose the one with the best simulation."""
         try:
             from sklearn.exceptions import ConvergenceWarning  # type: ignore[import-untyped]
             from sklearn.neural_network import MLPRegressor  # type: ignore[import-untyped]

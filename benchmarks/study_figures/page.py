@@ -25,13 +25,7 @@ _MEASURED = "The models of figures 5, 6 and 11 to 16 are identified from the rec
 
 
 def page(found: Sequence[tuple[Figure, Finding]], seed: int, measured: str = "") -> str:
-    """The page as Markdown.
-
-    Args:
-        found: the figures that were drawn, in order, with what was found.
-        seed: seed of the run.
-        measured: name of the record that the models are identified from; empty if it was simulated.
-    """
+    """The page as Markdown."""
     source = _MEASURED.format(name=measured) if measured else _OWN
     parts = [_HEAD.format(seed=seed, source=source)]
     if len(found) < len(FIGURES):

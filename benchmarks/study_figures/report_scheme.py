@@ -39,17 +39,7 @@ _SETTLED = 1e-9
 def fit_least_squares(
     structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
 ) -> LinearModel:
-    """Fit the report's ARX model.
-
-    Args:
-        structure: terms of the model.
-        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
-        time: shape (rows,); None: gaps are not detected.
-
-    Raises:
-        InputError: no complete row among those that the report takes, or an output that is constant.
-    """
+    """Fit the report's ARX model."""
     return _solve(ScaledRecord.of(structure, inputs, outputs, time))
 
 
@@ -59,9 +49,6 @@ def fit_output_error(
     """Fit the report's output-error model: its ARX model, re-estimated from its own simulation until it settles.
 
     Arguments are those of `fit_least_squares`.
-
-    Raises:
-        InputError: see `fit_least_squares`; or a simulation that diverges.
     """
     model = fit_least_squares(structure, inputs, outputs, time)
     for _ in range(MOST_STEPS):
@@ -80,9 +67,6 @@ def re_estimate(
 
     Arguments are the model that is simulated, and those of `fit_least_squares`; the measured outputs give the
     simulation its first rows and the model its noise.
-
-    Raises:
-        InputError: the simulation diverges.
     """
     u = as_columns(inputs, "inputs", model.structure.inputs)
     y = as_columns(outputs, "outputs", 1)
@@ -101,21 +85,13 @@ def re_estimate(
 
 @dataclass(frozen=True, eq=False)
 class ReportChart:
-    """The report's chart of an output.
+    """The report's chart of an output."""
 
-    Attributes:
-        model: the model of the training.
-        mean: mean of the residuals of the training, in the output's unit.
-        sd: their standard deviation.
-        residuals: residuals of all rows, shape (rows,); NaN where a row cannot be predicted.
-        out: flags of the rows outside the limits, shape (rows,).
-    """
-
-    model: LinearModel
-    mean: float
-    sd: float
-    residuals: Array
-    out: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    model: LinearModel  # the model of the training
+    mean: float  # mean of the residuals of the training, in the output's unit
+    sd: float  # their standard deviation
+    residuals: Array  # residuals of all rows, shape (rows,); NaN where a row cannot be predicted
+    out: np.ndarray[tuple[int], np.dtype[np.bool_]]  # flags of the rows outside the limits, shape (rows,)
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -130,19 +106,7 @@ MODELS: dict[str, Callable[..., LinearModel]] = {"arx": fit_least_squares, "oe":
 def chart_output(
     inputs: ArrayLike, output: ArrayLike, time: ArrayLike, training_rows: int, model: str = "oe", order: int = ORDER
 ) -> ReportChart:
-    """Chart an output by the report's scheme.
-
-    Args:
-        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        output: shape (rows,), NaN where nothing was measured.
-        time: shape (rows,).
-        training_rows: number of rows at the start that model and limits are learned from.
-        model: `arx` or `oe`; the report diagnoses with `oe`.
-        order: order of the model.
-
-    Raises:
-        InputError: see `fit_output_error`; or fewer than two training rows can be predicted.
-    """
+    """Chart an output by the report's scheme."""
     u, y, t = as_columns(inputs, "inputs"), as_columns(output, "output", 1), np.asarray(time, dtype=np.float64)
     structure = Structure.of_order(order, inputs=u.shape[1])
     fitted = MODELS[model](structure, u[:training_rows], y[:training_rows], t[:training_rows])

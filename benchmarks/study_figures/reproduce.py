@@ -12,10 +12,8 @@ from benchmarks.study_figures.page import FOLDER, page
 from benchmarks.study_figures.study import Study
 from reactorwatch.cli.batch import results_in_order
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.folder import fill_folder, make_folder
-from reactorwatch.records.output import check_output_folder
 from reactorwatch.records.record import Record
+from reactorwatch.records.write import atomic_write, check_output_folder, fill_folder, make_folder
 from reactorwatch.runtime.parallel.jobs import Failed
 from reactorwatch.terminal import printable_lines
 
@@ -24,21 +22,13 @@ PAGE = "study.md"
 
 @dataclass(frozen=True)
 class Job:
-    """A figure to be drawn.
+    """A figure to be drawn."""
 
-    Attributes:
-        key: key of the figure.
-        picture: file of the picture.
-        seed: seed of every simulated record.
-        measured: a record that models are identified from, or None.
-        data: folder of records of others, or None.
-    """
-
-    key: str
-    picture: Path
-    seed: int
-    measured: Record | None
-    data: Path | None = None
+    key: str  # key of the figure
+    picture: Path  # file of the picture
+    seed: int  # seed of every simulated record
+    measured: Record | None  # a record that models are identified from, or None
+    data: Path | None = None  # folder of records of others, or None
 
 
 def reproduce(
@@ -50,24 +40,7 @@ def reproduce(
     data: Path | None = None,
     processes: int | None = 1,
 ) -> str:
-    """Write `out`/study.md and its pictures.
-
-    Args:
-        out: folder; made if it is not there.
-        seed: seed of every simulated record.
-        only: keys of figures, such as `7,12`; all, if not given.
-        measured: a record that figures 5, 6 and 11 to 16 identify their models from.
-        data: folder of records of others, for the entry of measured records; None: the page has no such entry.
-        processes: number of processes; None: one a core.
-
-    Returns:
-        What was written, for people.
-
-    Raises:
-        InputError: figures that there are not, a folder that cannot be written to, workers that there are not, or
-            matplotlib is not installed.
-        RuntimeError: a figure could not be drawn.
-    """
+    """Write `out`/study.md and its pictures."""
     figures = _select_figures(only, data)
     require_matplotlib()
     check_output_folder(check_output_folder(out) / FOLDER)
@@ -89,11 +62,7 @@ def reproduce(
 def check_out(
     out: Path, only: str | None, sources: Iterable[Path | None], *, data: Path | None = None, force: bool
 ) -> None:
-    """Check that the page and its pictures may be written; arguments as for `reproduce` and `check_output_file`.
-
-    Raises:
-        InputError: as `check_output_folder`, or figures that there are not.
-    """
+    """Check that the page and its pictures may be written; arguments as for `reproduce` and `check_output_file`."""
     pictures = [f"{FOLDER}/{figure.file_name}" for figure in _select_figures(only, data)]
     check_output_folder(out, (PAGE, *pictures), sources, force=force)
 

@@ -130,12 +130,7 @@ def draw(study: Study, drawing: Drawing) -> Finding:
 
 
 def report_choice(record: Record) -> tuple[float, float, str, bool]:
-    """The report's rows of a record.
-
-    Returns:
-        Condition numbers with all rows and with the report's, what fitting the latter comes to, and whether two lags of
-        the input are equal in all of them.
-    """
+    """The report's rows of a record."""
     u, y = record.columns["qc"], record.columns[_OUTPUT]
     try:
         fit_arx(_STRUCTURE, u, y, choice=REPORT_ROWS)

@@ -41,12 +41,7 @@ FAST_PERIOD_MIN = 0.01
 
 
 class Study:
-    """Model, records and fits of one run of `reproduce`.
-
-    Args:
-        seed: seed of every record.
-        measured: a record that the models are identified from, in place of a simulated one.
-    """
+    """Model, records and fits of one run of `reproduce`."""
 
     def __init__(self, seed: int, measured: Record | None = None) -> None:
         self.seed = seed

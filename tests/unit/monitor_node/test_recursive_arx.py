@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.exchanger import config_of, random_exchanger, simulate
 from monitor_node.config import ReferenceName
 from monitor_node.core import Monitor
 from monitor_node.learn.arx import COPY_ROWS, LaggedRows
@@ -12,6 +11,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Estimate, ModelSnapshot
 from reactorwatch.identification.structure import Structure
 from reactorwatch.stored_state import copy_of
+from tests.exchanger import config_of, random_exchanger, simulate
 
 from .samples import feed_row
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from benchmarks.exchanger import Result, config_of, random_exchanger, simulate, watch
 from monitor_node.config import MonitorConfig, ReferenceName
 from monitor_node.core import Monitor
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, ChartPoint
+from tests.exchanger import Result, config_of, random_exchanger, simulate, watch
 
 from ..samples import feed_row, leaking_run, samples
 

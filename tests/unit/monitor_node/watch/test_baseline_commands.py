@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from benchmarks.exchanger import PLANT, config_of, random_exchanger, simulate
 from monitor_node.config import ReferenceName
 from monitor_node.core import Monitor
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, Baseline, BaselineCommand, CommandReply
+from tests.exchanger import PLANT, config_of, random_exchanger, simulate
 
 from ..samples import feed_row
 

@@ -4,12 +4,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.exchanger import PLANT, config_of
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, BaselineCommand, ChartPoint, Quality, Sample
+from tests.exchanger import PLANT, config_of
 
 from ..samples import feed_row
 

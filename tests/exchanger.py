@@ -1,27 +1,23 @@
-"""Lasting steps of a measurement, which one-step predictions follow: found within 20 rows, and what chance raises.
+"""Simulated heat exchangers, watched with lasting steps of their measurement.
 
-Records of simulated heat exchangers with one input and one output, a row a second: a liquid that is heated by
+Records of heat exchangers with one input and one output, a row a second: a liquid that is heated by
 condensing steam, its flow a staircase of random levels. Five cells and the wall's heat capacity, a heat transfer that
 grows with the flow, a dead time, a steam temperature that wanders, noise and resolution of the sensor. The plants
 differ in all of these.
-
-    python -m benchmarks.exchanger [--plants N] [--sizes 0.5,1,2] [--reference auto,arx,black-box]
 """
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.promise.black_box import unfamiliar_rows
 from monitor_node.config import WITHOUT_EQUATIONS, MonitorConfig, ReferenceName
 from monitor_node.core import Monitor
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
 
-ROWS, TRAINING = 4000, 1000
+TRAINING = 1000
 CELLS, SUBSTEPS = 5, 4
 FOUND_ROWS = 20
 SECOND_NS = 10**9
@@ -30,29 +26,17 @@ PLANT = "exchanger"
 
 @dataclass(frozen=True)
 class Exchanger:
-    """Constants of an exchanger.
+    """Constants of an exchanger."""
 
-    Attributes:
-        transit_s: time in which the liquid passes, at the flow 1.
-        wall_s: time constant of the wall.
-        transfer: number of transfer units at the flow 1.
-        exponent: exponent of the flow in the heat transfer.
-        dead_s: dead time of the valve.
-        hold_s: shortest and longest time between two moves of the flow.
-        wander: standard deviation of the steam temperature, K; its time constant is 100 s.
-        noise: standard deviation of the sensor's noise, K.
-        resolution: step of its readings, K.
-    """
-
-    transit_s: float = 12.0
-    wall_s: float = 6.0
-    transfer: float = 3.2
-    exponent: float = 0.6
-    dead_s: int = 2
-    hold_s: tuple[int, int] = (5, 60)
-    wander: float = 0.4
-    noise: float = 0.08
-    resolution: float = 0.001
+    transit_s: float = 12.0  # time in which the liquid passes, at the flow 1
+    wall_s: float = 6.0  # time constant of the wall
+    transfer: float = 3.2  # number of transfer units at the flow 1
+    exponent: float = 0.6  # exponent of the flow in the heat transfer
+    dead_s: int = 2  # dead time of the valve
+    hold_s: tuple[int, int] = (5, 60)  # shortest and longest time between two moves of the flow
+    wander: float = 0.4  # standard deviation of the steam temperature, K; its time constant is 100 s
+    noise: float = 0.08  # standard deviation of the sensor's noise, K
+    resolution: float = 0.001  # step of its readings, K
 
 
 def random_exchanger(rng: np.random.Generator) -> Exchanger:
@@ -70,14 +54,7 @@ def random_exchanger(rng: np.random.Generator) -> Exchanger:
 
 
 def simulate(plant: Exchanger, rows: int, rng: np.random.Generator, calm: int = 0) -> tuple[Array, Array]:
-    """Simulate an exchanger; returns its flow and the measured temperature at the outlet, degC.
-
-    Args:
-        plant: constants.
-        rows: number of rows.
-        rng: source of random numbers.
-        calm: number of rows, from the first one, in which the flow moves less.
-    """
+    """Simulate an exchanger; returns its flow and the measured temperature at the outlet, degC."""
     holds = rng.integers(*plant.hold_s, rows)
     flow = np.repeat(rng.uniform(0.65, 1.5, rows), holds)[: rows + plant.dead_s]
     flow[:calm] = 1.0 + 0.4 * (flow[:calm] - 1.0)
@@ -115,21 +92,12 @@ def config_of(reference: ReferenceName, per_30_days: float | None = None) -> Mon
 
 @dataclass
 class Result:
-    """Results of a plant.
+    """Results of a plant."""
 
-    Attributes:
-        reference: kind of the reference.
-        false_alarms: alarms of the sound record, by name.
-        delays: for each size of a step, the delays of its alarms in rows; None: none within `FOUND_ROWS`.
-        missed: for each size, the onsets whose steps were missed.
-        unjudged: rows that were not judged.
-    """
-
-    reference: str
-    false_alarms: list[str]
-    delays: dict[float, list[int | None]]
-    missed: dict[float, list[int]]
-    unjudged: int
+    reference: str  # kind of the reference
+    false_alarms: list[str]  # alarms of the sound record, by name
+    delays: dict[float, list[int | None]]  # for each size of a step, the delays of its alarms in rows
+    missed: dict[float, list[int]]  # for each size, the onsets whose steps were missed
 
 
 def watch(flow: Array, measured: Array, config: MonitorConfig, sizes: Sequence[float], onsets: Sequence[int]) -> Result:
@@ -140,7 +108,7 @@ def watch(flow: Array, measured: Array, config: MonitorConfig, sizes: Sequence[f
         if k in onsets:
             copies[k] = monitor.to_bytes()
         alarms += [f"{name}@{k}" for name in _take_row(monitor, k, values)]
-    result = Result(monitor.pipeline.reference, alarms, {}, {}, unfamiliar_rows(monitor))
+    result = Result(monitor.pipeline.reference, alarms, {}, {})
     for size in sizes:
         delays = result.delays[size] = []
         result.missed[size] = []
@@ -171,41 +139,3 @@ def _take_row(monitor: Monitor, row: int, values: tuple[float, float]) -> list[s
         item.message for item in publications if isinstance(item.message, Alarm) and item.message.event == "raised"
     ]
     return [alarm.alarm for alarm in raised if not alarm.alarm.startswith("spike/")]
-
-
-def main() -> None:
-    """Run the benchmark and print its table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--plants", type=int, default=10)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--sizes", default="0.5,1,2,-2")
-    parser.add_argument("--onsets", type=int, default=20)
-    parser.add_argument("--reference", default="auto,arx,black-box")
-    parser.add_argument("--verbose", action="store_true")
-    chosen = parser.parse_args()
-    sizes = [float(size) for size in chosen.sizes.split(",")]
-    for reference in chosen.reference.split(","):
-        found: dict[float, list[int | None]] = {size: [] for size in sizes}
-        false_alarms = 0
-        for seed in range(chosen.first, chosen.first + chosen.plants):
-            rng = np.random.default_rng(seed)
-            flow, measured = simulate(random_exchanger(rng), ROWS, rng)
-            onsets = sorted(rng.integers(TRAINING + 100, ROWS - FOUND_ROWS, chosen.onsets).tolist())
-            result = watch(flow, measured, config_of(reference), sizes, onsets)
-            false_alarms += len(result.false_alarms)
-            for size in sizes:
-                found[size] += result.delays[size]
-            if chosen.verbose:
-                print(seed, result.reference, result.false_alarms, result.unjudged, result.missed, flush=True)
-        print(f"{reference}: {false_alarms} alarms of {chosen.plants} sound records of {ROWS} rows")
-        for size in sizes:
-            seen = [delay for delay in found[size] if delay is not None]
-            median = np.median(seen) if seen else np.nan
-            print(
-                f"  {size:+.2g} K: {len(seen)} of {len(found[size])} within {FOUND_ROWS} rows, median {median:.0f}",
-                flush=True,
-            )
-
-
-if __name__ == "__main__":
-    main()
