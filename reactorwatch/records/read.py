@@ -81,7 +81,7 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
         InputError: the file cannot be read, is malformed or can be read in several ways; one line with file, row (as
             a text editor counts), column, rule, value and cure.
     """
-    text, notes = read_text(path)
+    text, notes = read_text(path, stated.sheet)
     layout = sniff(path, text, stated)
     notes = [*notes, *layout.notes]
     asked = [signal.column or signal.name for signal in signals or ()]

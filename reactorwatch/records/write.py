@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.decode import PARQUET_SUFFIXES, import_openpyxl, list_files, quote_formula
+from reactorwatch.records.decode import PARQUET_SUFFIXES, list_files, quote_formula
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record  # it imports NumPy, and help is to be fast
@@ -404,7 +404,13 @@ def _write_workbook(path: Path, record: "Record", clock: bool) -> None:
         raise InputError(
             f"{path}: a sheet has at most {MAX_SHEET_ROWS} rows, got {record.rows}; write .parquet or .csv"
         )
-    columns, openpyxl = _columns(record, clock), import_openpyxl(path)
+    try:
+        import openpyxl
+    except ImportError as error:
+        raise InputError(
+            f"{path}: a workbook is written with openpyxl: install reactorwatch[excel], or write .csv"
+        ) from error
+    columns = _columns(record, clock)
     book = openpyxl.Workbook(write_only=True)
     sheet = book.create_sheet("record")
     sheet.append([_text_cell(openpyxl, sheet, path, name) for name in columns])
