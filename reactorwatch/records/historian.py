@@ -3,6 +3,7 @@
 import re
 from collections.abc import Collection, Mapping, Sequence
 from itertools import combinations, pairwise
+from operator import eq
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,6 +78,11 @@ def find_qualities(
         is_named = _STRONG.search(name) is not None  # numbers that are no codes are a measured quality
         is_named &= all(_code(cell) is not None or is_text for cell in layout.cells(column) if cell.strip())
         is_quality = is_quality_name(name) or _FLAG.search(name) is not None
+        if not is_quality and is_text and _is_certain(layout, column, stated):  # under any name
+            of = [item for item in values if item != column]
+            parts = re.split(r"[\W_]+", name)
+            own, is_quality = [item for item in of if names[item] in parts], True
+            of = own or of
         if of and is_quality and (is_named or _is_certain(layout, column, stated)):
             found[column] = of
     return found
@@ -240,11 +246,10 @@ def _judge_word(cell: str) -> bool | None:
     return True if signs and set(words[: signs[0][1]]) <= _NEUTRAL else None
 
 
-_TAG = re.compile(r"tag|point|signal|variable|sensor|channel|mess(?:stelle|punkt)|kanal|name", re.IGNORECASE)
-_VALUE = re.compile(r"val|wert|reading|mess(?!.*zeit)", re.IGNORECASE)
-_ID = re.compile(rf"{_TAG.pattern}|(?:\b|_)id$|[a-z]I[Dd]$|device", re.IGNORECASE)
-"""Headers of tags, and of those that are numbers."""
-_UNIT = re.compile(r"unit|uom|einheit", re.IGNORECASE)
+_TAG = re.compile(r"tag|point|signal|variable|sensor|channel|name", re.IGNORECASE)
+_ID = re.compile(rf"{_TAG.pattern}|(?:\b|_)id$|[a-z]I[Dd]$", re.IGNORECASE)
+_VALUE = re.compile(r"val|wert|reading", re.IGNORECASE)
+"""Headers of tags, of tags that are numbers, and of values: they decide where the rows leave it open."""
 
 SHARED, SORTED, RESTARTING, ALTERNATING, REGULAR = "shared", "sorted", "restarting", "alternating", "regular"
 """Arrangements of rows: several have one time; they are sorted by tag, on a clock, or with minutes that start again as
@@ -288,18 +293,22 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
     tags, values = (_option_columns(layout, f"--{name}", getattr(stated, name)) for name in ("tag", "value"))
     if set(tags) & set(values):
         raise InputError(f"--tag and --value must name different columns, got {stated.tag!r} and {stated.value!r}")
-    if not (is_stated or TEXT in kinds or any(map(_ID.search, headers))):
+    is_likely = is_stated or TEXT in kinds or any(map(_ID.search, headers))
+    codes = [item for item in columns if kinds[item] == NUMBER and item not in asked and _is_code(layout, item)]
+    if not (is_likely or codes):
         return None
     numbered = {int(name) - 1 for name in names if name.isdigit() and layout.header_row is None}
     time = choose_time(layout, stated, {*tags, *values, *asked, *numbered})
+    if not is_likely and not _share_times(layout, time):
+        return None
     free = [column for column in columns if column not in (*tags, *values, *time.columns)]
     qualities = find_qualities(layout, [column for column in free if column not in asked], stated)
     free = [column for column in free if column not in qualities]
     numbers = [item for item in free if kinds[item] == NUMBER]
     likely = [item for item in numbers if _VALUE.search(headers[item])]
-    texts = [item for item in free if kinds[item] == TEXT and item not in asked and not _UNIT.search(headers[item])]
+    texts = [item for item in free if kinds[item] == TEXT and item not in asked]
     named = [item for item in texts if _TAG.search(headers[item])] or (texts[:1] if layout.header_row is None else [])
-    ids = [item for item in numbers if item not in asked and _ID.search(headers[item])]
+    ids = [item for item in numbers if item not in asked and (_ID.search(headers[item]) or item in codes)]
     parts = list(dict.fromkeys((*named, *texts, *ids)))
     choices = [tags] if tags else [choice for size in (1, 2) for choice in combinations(parts, size)]
     if not choices or not time.columns:
@@ -315,6 +324,8 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
         index = np.asarray(labels.indices, dtype=np.intp)
         known = {*labels.dictionary.to_pylist(), *map(bare_name, labels.dictionary.to_pylist())}
         shape = "" if "" in known else _arrange(times, index)
+        is_code = any(item in codes and not _ID.search(headers[item]) for item in choice)
+        shape = "" if is_code and shape != SHARED else shape  # a state, such as that of a valve
         is_given = bool(tags or (values and len(labels.dictionary) > 1) or (words & known and not asked))
         is_named = not asked and choice[0] in named and len(choice) == 1
         if not (shape or is_given or is_named):
@@ -371,6 +382,18 @@ def _tag_cells(table: TextTable, columns: Sequence[int]) -> Any:
     return pc.binary_join_element_wise(*(pc.utf8_trim_whitespace(table.texts(column)) for column in columns), ".")
 
 
+def _is_code(layout: Layout, column: int) -> bool:
+    """True for a column of few different whole numbers."""
+    cells = layout.cells(column)
+    return all(cell.strip().isdecimal() for cell in cells) and 1 < len(set(cells)) <= MAX_TAGS * len(cells)
+
+
+def _share_times(layout: Layout, time: TimeColumn) -> bool:
+    """True if many of the first rows have the time of the row before."""
+    cells = list(zip(*map(layout.cells, time.columns), strict=True))
+    return bool(cells) and sum(map(eq, cells[1:], cells)) >= MIN_SHARED * len(cells)
+
+
 def _has_fractions(layout: Layout, column: int, _: Sequence[int]) -> bool:
     """True for a column of numbers that are not all whole, as codes and counts are."""
     return any("." in cell or "," in cell for cell in layout.cells(column))
@@ -380,7 +403,7 @@ def _varies(layout: Layout, column: int, tags: Sequence[int]) -> bool:
     """True for a column of numbers that do not count the rows and differ between rows of one tag."""
     known = [tuple(row[part] for part in tags) for row in layout.sample]
     pairs = set(zip(known, layout.cells(column), strict=True))
-    return len(pairs) > len(set(known)) and not counts_rows(layout, column)
+    return len(pairs) > len(set(known)) and not (column == 0 and counts_rows(layout, column))
 
 
 def _variance_share(table: TextTable, column: int, tags: NDArray[np.intp]) -> float:

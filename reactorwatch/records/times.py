@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.cells import NUMBER, TIME
+from reactorwatch.records.cells import NUMBER, TIME, to_numbers
 from reactorwatch.records.file_format import SECONDS, FileFormat
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, to_time_ns
 from reactorwatch.records.table import Layout, TextTable, bare_name
@@ -32,11 +32,12 @@ STANDARD = {"time_min": "min", "time_s": "s"}
 MAX_SHARE_BACK = 1 / 3
 """Largest share of rows with a step back in time; a file with more is not in time order."""
 
-_TIME_NAMES = """
-time zeit t ts tstamp timestamp datetime date datum uhrzeit zeitstempel zeitpunkt elapsed epoch unix clock temps heure
-horodatage fecha hora tiempo tempo seconds minutes hours sekunden minuten stunden x_value"""
-_INDEX_NAMES = "index idx sample samples row rows nr no n i k step steps id # zeile schritt"
-_TIME_WORDS, _INDEX_WORDS = frozenset(_TIME_NAMES.split()), frozenset(_INDEX_NAMES.split())
+_TIME_WORDS = frozenset(["time", "zeit", "t", "ts", "timestamp", "datetime", "date", "datum", "elapsed", "clock"])
+"""Names of times: they decide where several columns increase, or one does in steps that differ."""
+
+MIN_REGULAR = 0.9
+"""Smallest share of equal steps in a time under another name: records have gaps, and totals no equal steps."""
+
 _UNIT_WORDS = (
     "ns",
     "us µs",
@@ -107,16 +108,14 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
             cells = [f"{one} {other}" for one, other in zip(*map(layout.cells, columns), strict=True)]
             return TimeColumn(columns, pattern=guess_pattern(cells))
     stamps = [item for item in stamps if len(set(layout.cells(item.columns[0]))) > 2] or stamps  # not a query's ends
-    named = [
-        item
-        for item in candidates
-        if item.pattern is None and layout.kinds[item.columns[0]] == NUMBER and _has_time_name(layout, item)
-    ]
+    numbers = [item for item in candidates if item.pattern is None and layout.kinds[item.columns[0]] == NUMBER]
+    named = [item for item in numbers if _has_time_name(layout, item)]
     found = [*stamps, *(item for item in named if _increases(layout, item))]
     if not found:
-        numbers = [item for item in candidates if _increases(layout, item)]
+        numbers = [item for item in numbers if _increases(layout, item)]
         found = [item for item in numbers if find_epoch(layout, item, sample_values(layout, item.columns[0]))]
-        found = found or [item for item in numbers if counts_rows(layout, item.columns[0])] or named
+        regular = [item for item in numbers if counts_rows(layout, item.columns[0])]
+        found = found or [item for item in regular if not _is_index(layout, item)] or regular or named
     if len(found) > 1:
         names = ", ".join(repr(layout.names[item.columns[0]]) for item in found)
         raise InputError(f"{layout.path}: {len(found)} columns could be the time: {names}; state --time NAME")
@@ -153,25 +152,33 @@ def _has_time_name(layout: Layout, item: TimeColumn) -> bool:
 
 
 def counts_rows(layout: Layout, column: int) -> bool:
-    """True for a first column that counts the rows or their times, under a name that says nothing."""
-    name = layout.names[column].lower()
+    """True for a column of numbers in equal steps, up or down, but for gaps."""
     values = sample_values(layout, column)
     steps = np.diff(values)
-    if column != 0 or not steps.size or float(np.ptp(steps)) > 1e-6 * max(abs(values[-1]), steps[0]):
+    if not steps.size or not ((steps > 0).all() or (steps < 0).all()):
         return False
-    return steps[0] > 0 and (layout.header_row is None or name == "1" or name in _INDEX_WORDS)
+    usual = float(np.median(steps))
+    is_usual = np.abs(steps - usual) <= 1e-6 * max(abs(values[0]), abs(values[-1]), abs(usual))
+    return bool(np.mean(is_usual) >= MIN_REGULAR)
+
+
+def _is_index(layout: Layout, item: TimeColumn) -> bool:
+    """True for the numbers of the rows."""
+    values = sample_values(layout, item.columns[0])
+    return values[0] in (0.0, 1.0) and bool((np.diff(values) == 1.0).all()) and not item.unit
 
 
 def sample_values(layout: Layout, column: int) -> NDArray[np.float64]:
     """Numbers in the sample of a column, without cells that are none."""
-    cells = [cell.strip().replace(",", ".") for cell in layout.cells(column)]
-    return np.array([float(cell) for cell in cells if PLAIN.fullmatch(cell)])
+    import pyarrow as pa
+
+    values, _ = to_numbers(pa.array(layout.cells(column)), layout.decimal, layout.missing)
+    return values[np.isfinite(values)]
 
 
 def _increases(layout: Layout, item: TimeColumn) -> bool:
     steps = np.diff(sample_values(layout, item.columns[0]))
-    is_ordered = bool(np.count_nonzero(steps <= 0) <= MAX_SHARE_BACK * steps.size)
-    return is_ordered and layout.kinds[item.columns[0]] == NUMBER
+    return bool(np.count_nonzero(steps <= 0) <= MAX_SHARE_BACK * steps.size) or counts_rows(layout, item.columns[0])
 
 
 class Epoch(NamedTuple):
