@@ -88,17 +88,8 @@ TABLE_SUFFIXES = (*TEXT_SUFFIXES, *WORKBOOK_SUFFIXES, *PARQUET_SUFFIXES)
 _WIDE = {"utf-16", "utf-16-le", "utf-16-be", "utf-32"}
 """Encodings of several bytes a letter."""
 
-HEAD_BYTES = 4096
-"""Bytes by which the encoding is guessed."""
-
 LARGEST_TEXT = 2_000_000_000
 """Most bytes of a compressed text or workbook: a small file cannot exhaust memory."""
-
-CELL_BYTES = 32
-"""Memory of a cell in the rectangle of a sheet, empty or not, while it is read."""
-
-WHOLE = 1e16
-"""From here on, numbers are written with an exponent."""
 
 _COLUMN, _ROW = re.compile(rb'\br="([A-Z]+)\d'), re.compile(rb'\br="[A-Z]*(\d+)"')
 """References of cells and rows in a sheet."""
@@ -119,18 +110,7 @@ def is_table(path: Path) -> bool:
 
 
 def read_text(path: Path, sheet: str | None = None) -> tuple[bytes, list[str]]:
-    r"""Read a file as UTF-8 text with lines that end in \n.
-
-    Args:
-        path: the file.
-        sheet: name or number (from 1) of a workbook's sheet; None: the first that holds a table.
-
-    Returns:
-        The text, and what is unusual about the file.
-
-    Raises:
-        InputError: the file cannot be read, is empty or holds no text.
-    """
+    r"""Read a file as UTF-8 text with lines that end in \n."""
     with wrap_read_errors(path):
         try:
             data = path.read_bytes()
@@ -160,7 +140,7 @@ def read_text(path: Path, sheet: str | None = None) -> tuple[bytes, list[str]]:
     if kind == "parquet":
         return _parquet(path, data), [*notes, "Parquet"]
     encoding = next((name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark)), None)
-    encoding = encoding or _guess_encoding(data[:HEAD_BYTES])
+    encoding = encoding or _guess_encoding(data[:4096])
     if encoding not in _WIDE and b"\0" in data:
         raise InputError(f"{path}: expected a CSV file, got binary data; export the table as .csv")
     if encoding != "utf-8" or not data.isascii():
@@ -230,11 +210,7 @@ def _workbook(path: Path, data: bytes, asked: str | None) -> tuple[bytes, str]:
 
 
 def _unpack_workbook(path: Path, data: bytes) -> io.BytesIO:
-    """Copy of a workbook without compression, whose sheets fit into memory: the reader of sheets has no limits.
-
-    Raises:
-        InputError: it is too large, or its sheets are not those of an .xlsx file.
-    """
+    """Copy of a workbook without compression, whose sheets fit into memory: the reader of sheets has no limits."""
     plain, size = io.BytesIO(), 0
     with zipfile.ZipFile(io.BytesIO(data)) as packed, zipfile.ZipFile(plain, "w") as unpacked:
         if "xl/workbook.xml" not in packed.namelist():
@@ -248,7 +224,7 @@ def _unpack_workbook(path: Path, data: bytes) -> io.BytesIO:
                 width = max(map(_column_number, set(_COLUMN.findall(content))), default=0)
                 width = max(width, *(row.count(b"<c") for row in content.split(b"<row")))
                 cells = width * max(map(int, _ROW.findall(content)), default=0)
-            if max(size, cells * CELL_BYTES) > LARGEST_TEXT:
+            if max(size, cells * 32) > LARGEST_TEXT:  # bytes of a cell in memory, empty or not
                 raise InputError(
                     f"{path}: expected sheets that unpack to at most {LARGEST_TEXT / 1e9:g} GB, got more in "
                     f"{info.filename}; delete what is far from the table, split it, or save it as CSV"
@@ -273,7 +249,7 @@ def _holds_table(rows: list[list[Any]]) -> bool:
 def _cell(value: object) -> str:
     """Text of a cell; a spreadsheet has no whole numbers, and midnight is a date in it."""
     if isinstance(value, float):
-        return str(int(value)) if value.is_integer() and abs(value) < WHOLE else repr(value)
+        return str(int(value)) if value.is_integer() and abs(value) < 1e16 else repr(value)  # then 1e+16
     if isinstance(value, timedelta):
         return repr(value.total_seconds())
     if type(value) is date:

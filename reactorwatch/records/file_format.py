@@ -95,11 +95,7 @@ class FileFormat:
 
     @property
     def period_s(self) -> float | None:
-        """Sampling period in seconds; None: the file has a time column.
-
-        Raises:
-            InputError: the text is no period.
-        """
+        """Sampling period in seconds; None: the file has a time column."""
         if self.period is None:
             return None
         match = _PERIOD.fullmatch(self.period.strip())

@@ -89,11 +89,7 @@ def find_qualities(
 
 
 def check_stated(layout: Layout, found: Collection[int], stated: FileFormat) -> None:
-    """Check that there are columns of qualities if good ones are stated.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Check that there are columns of qualities if good ones are stated."""
     if stated.quality_good and not found:
         raise InputError(
             f"{layout.path}, row {layout.header_row or layout.first_row}: expected a column of qualities "
@@ -113,16 +109,7 @@ def _is_certain(layout: Layout, column: int, stated: FileFormat) -> bool:
 
 
 class QualityFilter:
-    """Removal of values whose quality is not good.
-
-    Args:
-        table: the table, which has the columns of qualities as texts.
-        columns: columns of values by their column of qualities; empty: all.
-        stated: statements of the user.
-
-    Raises:
-        InputError: a quality is neither known nor stated, or none is good.
-    """
+    """Removal of values whose quality is not good."""
 
     def __init__(self, table: TextTable, columns: Mapping[int, Collection[int]], stated: FileFormat) -> None:
         self.columns, self._names = columns, table.layout.names
@@ -181,11 +168,7 @@ def _key(name: str) -> str:
 def judge(
     cells: Sequence[str], header: str, stated: FileFormat, beside: Collection[str] = ()
 ) -> dict[str, bool | None]:
-    """Decide over all different cells of a column, with its header and those beside it: the code 0 has two meanings.
-
-    Returns:
-        True for good, False for not good, None for unknown, by cell.
-    """
+    """Decide over all different cells of a column, with its header and those beside it: the code 0 has two meanings."""
     codes = {cell: _code(cell) for cell in cells}
     if stated.quality_good:
         texts = (word for text in stated.quality_good for word in (text, *filter(None, text.split(","))))
@@ -257,14 +240,10 @@ those of batches do; tags alternate, or so do the labels of rows at regular time
 
 MAX_TAGS = 0.5
 """Largest share of different tags among the rows."""
-MIN_DISTINCT = 0.9
-"""Smallest share of steps from a value of a tag to its next at which the time goes on."""
 MIN_SHARED = 1 / 6
 """Smallest share of rows with the time of the row before; it is 1/2 for two tags that are sampled together."""
 MIN_CHANGES = 0.1
 """Smallest share of rows with another tag than the row before, if each tag has times of its own."""
-MIN_EXPLAINED = 0.9
-"""Smallest share of the variance that tags of different quantities explain."""
 
 
 class LongFormat(NamedTuple):
@@ -280,9 +259,6 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
     """Find the columns of a long table, as stated or by its rows; None if it is wide.
 
     A table with columns that are asked for by their `names`, beside that of values, is wide.
-
-    Raises:
-        InputError: a stated column is not there, or it is not known which column holds the values.
     """
     headers, kinds, columns = layout.names, layout.kinds, range(len(layout.names))
     is_stated = stated.tag is not None or stated.value is not None
@@ -339,7 +315,8 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
             continue
         signs = (
             value is not None and _VALUE.search(headers[value]) is not None,
-            value is not None and _variance_share(TextTable(layout, minutes, [value]), value, index) >= MIN_EXPLAINED,
+            value is not None
+            and _variance_share(TextTable(layout, minutes, [value]), value, index) >= 0.9,  # different quantities
             all(re.search(r"\d", label) for label in known),
         )
         is_shown = shape in (SHARED, SORTED) or (shape == RESTARTING and any(signs[:2]))
@@ -426,14 +403,14 @@ def _arrange(times: NDArray[Any], tags: NDArray[np.intp]) -> str:
         return ""  # most wide tables, without sorting
     order = np.argsort(tags, kind="stable")
     inner = np.diff(times[order])[np.diff(tags[order]) == 0]
-    if max(np.mean(inner > 0), np.mean(inner < 0)) < MIN_DISTINCT:
+    if max(np.mean(inner > 0), np.mean(inner < 0)) < 0.9:  # times of a tag are in order, but for repeats
         return ""
     steps = steps if np.median(inner) > 0 else -steps  # the newest may be first
     if np.mean(steps == 0) >= MIN_SHARED:
         return SHARED
     if (steps < 0).any() and changed[steps < 0].all():
         return SORTED if times.dtype.kind == "i" else RESTARTING
-    is_regular = np.mean(np.isclose(steps, np.median(steps), rtol=0.1)) > MIN_DISTINCT and changes < MIN_DISTINCT
+    is_regular = np.mean(np.isclose(steps, np.median(steps), rtol=0.1)) > 0.9 and changes < 0.9
     return "" if changes < MIN_CHANGES else REGULAR if is_regular else ALTERNATING
 
 
@@ -447,11 +424,7 @@ class TagSeries(NamedTuple):
 def read_tags(
     layout: Layout, long: LongFormat, stated: FileFormat, wanted: Collection[str] | None
 ) -> tuple[dict[str, TagSeries], bool, list[str]]:
-    """Series by tag, all or those wanted; True if their times are nanoseconds since 1970; and guesses, for people.
-
-    Raises:
-        InputError: a cell of a tag that is read is no time or no number, or its quality is unknown.
-    """
+    """Series by tag, all or those wanted; True if their times are nanoseconds since 1970; and guesses, for people."""
     stamps, minutes = _split_time(long.time)
     table = TextTable(layout, minutes, [*long.tags, long.value, *long.qualities, *stamps])
     tags = _tag_cells(table, long.tags).dictionary_encode()

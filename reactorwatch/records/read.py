@@ -343,11 +343,7 @@ def filled_rows(times: Times, columns: dict[str, NDArray[np.float64]]) -> NDArra
 
 
 def check_values(table: TextTable, column: int, values: NDArray[np.float64]) -> None:
-    """Check that the values of a column are possible measurements.
-
-    Raises:
-        InputError: one is not.
-    """
+    """Check that the values of a column are possible measurements."""
     if max(np.fmax.reduce(values, initial=0.0), -np.fmin.reduce(values, initial=0.0)) < LARGEST_VALUE:
         return
     row = int(np.flatnonzero(np.abs(values) >= LARGEST_VALUE)[0])

@@ -35,9 +35,6 @@ MAX_SHARE_BACK = 1 / 3
 _TIME_WORDS = frozenset(["time", "zeit", "t", "ts", "timestamp", "datetime", "date", "datum", "elapsed", "clock"])
 """Names of times: they decide where several columns increase, or one does in steps that differ."""
 
-MIN_REGULAR = 0.9
-"""Smallest share of equal steps in a time under another name: records have gaps, and totals no equal steps."""
-
 _UNIT_WORDS = (
     "ns",
     "us µs",
@@ -48,7 +45,6 @@ _UNIT_WORDS = (
     "d day days tage",
 )
 _UNIT_OF = {word: words.split()[0] for words in _UNIT_WORDS for word in words.split()}
-PLAIN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 _EPOCH_S, _EPOCH_UNITS_S = (6.3e8, 4.2e9), (1.0, 1e-3, 1e-6, 1e-9)
 """Smallest and largest Unix times of 1990 to 2100, and their units in seconds."""
 _SERIAL_DAYS, _SERIAL_ZERO, _SERIAL_STEP = (32_874, 73_050), 25_569, 0.05
@@ -73,16 +69,7 @@ class TimeColumn:
 
 
 def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> TimeColumn:
-    """Choose the time column.
-
-    Args:
-        layout: the table.
-        stated: statements of the user.
-        taken: columns of signals.
-
-    Raises:
-        InputError: none or several could be it.
-    """
+    """Choose the time column."""
     if stated.period is not None:
         return TimeColumn(())
     if stated.time is not None:
@@ -159,7 +146,7 @@ def counts_rows(layout: Layout, column: int) -> bool:
         return False
     usual = float(np.median(steps))
     is_usual = np.abs(steps - usual) <= 1e-6 * max(abs(values[0]), abs(values[-1]), abs(usual))
-    return bool(np.mean(is_usual) >= MIN_REGULAR)
+    return bool(np.mean(is_usual) >= 0.9)  # totals have no equal steps
 
 
 def _is_index(layout: Layout, item: TimeColumn) -> bool:
@@ -225,20 +212,9 @@ def _refuse_without_time(layout: Layout, taken: Collection[int]) -> None:
     )
 
 
-MIN_REVERSED = 3
-"""Fewest rows of a file that may have its newest row first."""
-
-
 @dataclass(frozen=True)
 class Times:
-    """Times of the rows.
-
-    Attributes:
-        values: minutes, or nanoseconds since 1970-01-01 UTC; shape (rows,).
-        valid: False where a row has no time, shape (rows,).
-        is_clock: the times are clock times, in nanoseconds.
-        notes: guesses, for people.
-    """
+    """Times of the rows."""
 
     values: NDArray[np.float64] | NDArray[np.int64]
     valid: NDArray[np.bool_]
@@ -254,11 +230,7 @@ class Times:
 
 
 def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Times:
-    """Read the times of the rows.
-
-    Raises:
-        InputError: a cell is no time, or local times are ambiguous.
-    """
+    """Read the times of the rows."""
     if stated.period is not None:
         minutes = np.arange(table.rows, dtype=np.float64) * (stated.period_s or 0.0) / 60.0
         return Times(minutes, np.isfinite(minutes), is_clock=False, notes=[f"a row each {stated.period}"])
@@ -279,13 +251,13 @@ def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Time
     unit = column.unit or "s"
     notes = [] if column.is_standard else [f"time {name} in {unit}"]
     seconds = SECONDS[unit]  # whole factors, so that decimal times stay exact
-    minutes = values * (seconds / 60.0) if seconds > 60.0 else values / units_per_minute(unit)
+    minutes = values * (seconds / 60.0) if seconds > 60.0 else values / (60.0 / seconds)
     return Times(minutes, valid, is_clock=False, notes=notes)
 
 
 def is_newest_first(layout: Layout, column: TimeColumn, dates: str | None) -> bool:
     """True if the first rows are before the rows above them, but for blocks that were written again."""
-    if not column.columns or len(layout.sample) < MIN_REVERSED:
+    if not column.columns or len(layout.sample) < 3:
         return False
     if column.pattern is None:
         steps = np.diff(sample_values(layout, column.columns[0]))
@@ -304,21 +276,17 @@ def find_written_zero_ns(layout: Layout, column: TimeColumn, taken: Collection[i
     if not column.is_standard or column.unit != "min" or CLOCK_COLUMN not in layout.names or not layout.sample:
         return 0
     at = layout.names.index(CLOCK_COLUMN)
-    cell, minutes = layout.sample[0][at], layout.sample[0][column.columns[0]].strip()
+    cell = layout.sample[0][at]
     pattern = guess_pattern([cell])
-    if at in taken or pattern is None or not pattern.has_date or not PLAIN.fullmatch(minutes):
+    if at in taken or pattern is None or not pattern.has_date:
         return 0
     import pyarrow as pa
 
     instants, form = parse(pa.array([cell]), pattern)
-    if form is None or not instants.valid[0] or not np.isfinite(instants.offset_s[0]):
+    minutes, _ = to_numbers(pa.array([layout.sample[0][column.columns[0]]]), layout.decimal, layout.missing)
+    if form is None or not instants.valid[0] or not np.isfinite(instants.offset_s[0] + minutes[0]):
         return 0
-    return int(instants.local_ns[0]) - int(instants.offset_s[0]) * 1_000_000_000 - to_time_ns(float(minutes))
-
-
-def units_per_minute(unit: str) -> float:
-    """Units of time in a minute."""
-    return 60.0 / SECONDS[unit]
+    return int(instants.local_ns[0]) - int(instants.offset_s[0]) * 1_000_000_000 - to_time_ns(float(minutes[0]))
 
 
 def _read_stamps(table: TextTable, column: TimeColumn, pattern: Pattern, stated: FileFormat, name: str) -> Times:
@@ -391,7 +359,7 @@ def numbered_runs(table: TextTable, column: int | None) -> NDArray[np.intp] | No
     if column is None:
         return None
     cells = [cell.strip() for cell in table.texts(column).to_pylist()]
-    if not all(cell.isdecimal() and len(cell) < LONGEST_NUMBER for cell in cells):
+    if not all(cell.isdecimal() and len(cell) < 18 for cell in cells):
         return None
     runs = np.array([int(cell) for cell in cells], dtype=np.intp)
     steps = np.diff(runs, prepend=0)
@@ -406,11 +374,7 @@ def check_times(
     runs: NDArray[np.intp] | None,
     rows: NDArray[np.intp],
 ) -> None:
-    """Check that each row has a time in the range of a record's, and another one than the row before.
-
-    Raises:
-        InputError: a row has not.
-    """
+    """Check that each row has a time in the range of a record's, and another one than the row before."""
     if not minutes.size:
         raise InputError(f"{table.layout.path}: expected rows below the header, got none")
     ends = np.abs(minutes[[0, -1]])
@@ -428,7 +392,7 @@ def check_times(
     at = int(np.flatnonzero(wrong)[0])
     row = int(rows[at])
     if times.valid[row] and not np.abs(minutes[at]) <= LONGEST_MIN:
-        most = f"{LONGEST_MIN * units_per_minute(time.unit or 's'):.3g}"
+        most = f"{LONGEST_MIN * 60.0 / SECONDS[time.unit or 's']:.3g}"
         rule = f"expected a time within 146 years of its zero ({most} at most)"
         table.refuse(row, column, rule, "check its unit: seconds are time_s")
     if np.isinf(minutes[at]):
@@ -446,11 +410,7 @@ def check_times(
 def find_runs(
     layout: Layout, time: TimeColumn, minutes: NDArray[np.float64], numbered: NDArray[np.intp] | None
 ) -> NDArray[np.intp] | None:
-    """Number of each row's run, from 1; None for one run.
-
-    Raises:
-        InputError: the time steps back too often for rows in time order.
-    """
+    """Number of each row's run, from 1; None for one run."""
     if numbered is None and (minutes[1:] >= minutes[:-1]).all():
         return None
     back = starts = np.diff(minutes, prepend=minutes[0]) < 0
@@ -464,7 +424,3 @@ def find_runs(
             f"{np.count_nonzero(back)} of {minutes.size} rows; sort the rows by time"
         )
     return 1 + np.cumsum(starts) if starts.any() else None
-
-
-LONGEST_NUMBER = 18
-"""Most digits of a run's number."""

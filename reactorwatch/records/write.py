@@ -56,15 +56,7 @@ def check_output_file(path: Path, sources: Iterable[Path | None] = (), *, force:
 
 
 def check_folder_name(folder: Path, option: str) -> None:
-    """Check that a folder's name is not that of a file.
-
-    Args:
-        folder: path of the folder.
-        option: option of the command line that names it.
-
-    Raises:
-        InputError: it is no folder, or a new one with the suffix of a file.
-    """
+    """Check that a folder's name is not that of a file."""
     if folder.exists():
         if not folder.is_dir():
             kind = "a file" if folder.is_file() else "no folder"
@@ -135,11 +127,7 @@ def file_mode(path: Path) -> int:
 
 
 def refuse_source(path: Path, sources: Iterable[Path | None]) -> None:
-    """Refuse an output that is one of the inputs, under any name.
-
-    Raises:
-        InputError: it is.
-    """
+    """Refuse an output that is one of the inputs, under any name."""
     if not path.exists():
         return
     for source in sources:
@@ -443,11 +431,7 @@ def _write_parquet(path: Path, record: "Record", clock: bool) -> None:
 
 
 def write_frame(frame: Any, path: Path) -> Path:
-    """Write a data frame (pandas, polars, Arrow) as a Parquet file; returns its path.
-
-    Raises:
-        InputError: the frame has columns that are no plain values.
-    """
+    """Write a data frame (pandas, polars, Arrow) as a Parquet file; returns its path."""
     import pyarrow as pa
     import pyarrow.parquet
 
