@@ -366,7 +366,7 @@ def _is_code(layout: Layout, column: int) -> bool:
 def _repeats(layout: Layout, column: int) -> bool:
     """True for a column, such as the time, with many cells like that of the row before."""
     cells = layout.cells(column)
-    return sum(map(eq, cells[1:], cells)) >= MIN_SHARED * len(cells)
+    return bool(sum(map(eq, cells[1:], cells)) >= MIN_SHARED * len(cells))
 
 
 def _has_fractions(layout: Layout, column: int, _: Sequence[int]) -> bool:

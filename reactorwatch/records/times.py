@@ -165,7 +165,7 @@ def sample_values(layout: Layout, column: int) -> NDArray[np.float64]:
         import pyarrow as pa
 
         values, _ = to_numbers(pa.array(cells), layout.decimal, layout.missing)
-    return values[np.isfinite(values)]
+    return np.asarray(values[np.isfinite(values)])
 
 
 def _increases(layout: Layout, item: TimeColumn) -> bool:
