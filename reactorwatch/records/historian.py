@@ -271,12 +271,10 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
         raise InputError(f"--tag and --value must name different columns, got {stated.tag!r} and {stated.value!r}")
     is_likely = is_stated or TEXT in kinds or any(map(_ID.search, headers))
     codes = [item for item in columns if kinds[item] == NUMBER and item not in asked and _is_code(layout, item)]
-    if not (is_likely or codes):
+    if not is_likely and not (codes and any(_repeats(layout, item) for item in columns if item not in codes)):
         return None
     numbered = {int(name) - 1 for name in names if name.isdigit() and layout.header_row is None}
     time = choose_time(layout, stated, {*tags, *values, *asked, *numbered})
-    if not is_likely and not _share_times(layout, time):
-        return None
     free = [column for column in columns if column not in (*tags, *values, *time.columns)]
     qualities = find_qualities(layout, [column for column in free if column not in asked], stated)
     free = [column for column in free if column not in qualities]
@@ -365,10 +363,10 @@ def _is_code(layout: Layout, column: int) -> bool:
     return all(cell.strip().isdecimal() for cell in cells) and 1 < len(set(cells)) <= MAX_TAGS * len(cells)
 
 
-def _share_times(layout: Layout, time: TimeColumn) -> bool:
-    """True if many of the first rows have the time of the row before."""
-    cells = list(zip(*map(layout.cells, time.columns), strict=True))
-    return bool(cells) and sum(map(eq, cells[1:], cells)) >= MIN_SHARED * len(cells)
+def _repeats(layout: Layout, column: int) -> bool:
+    """True for a column, such as the time, with many cells like that of the row before."""
+    cells = layout.cells(column)
+    return bool(sum(map(eq, cells[1:], cells)) >= MIN_SHARED * len(cells))
 
 
 def _has_fractions(layout: Layout, column: int, _: Sequence[int]) -> bool:
