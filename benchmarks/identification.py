@@ -12,8 +12,7 @@ from time import perf_counter
 import numpy as np
 
 from benchmarks.study_figures.neural import Neural
-from reactorwatch.identification.families import LINEAR_FAMILIES, Family
-from reactorwatch.identification.selection import select
+from reactorwatch.identification.selection import LINEAR_FAMILIES, Family, select
 from reactorwatch.identification.structure import Structure
 
 

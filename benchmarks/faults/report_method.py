@@ -11,6 +11,7 @@ distribution, because the residuals are neither independent nor normal where a l
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from typing import Any
 
@@ -22,9 +23,8 @@ from benchmarks.faults.runs import OUTPUTS, SIGNAL
 from benchmarks.faults.score import Interval
 from benchmarks.study_figures.report_scheme import ORDER
 from reactorwatch.arrays import Array
-from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import LinearModel
-from reactorwatch.identification.output_error import fit_oe
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record
 
@@ -55,7 +55,10 @@ class ReportMethod:
         return worst
 
 
-METHODS: tuple[ReportMethod, ...] = (ReportMethod("ARX", fit_arx), ReportMethod("OE", fit_oe))
+METHODS: tuple[ReportMethod, ...] = (
+    ReportMethod("ARX", partial(fit_linear, "arx")),
+    ReportMethod("OE", partial(fit_linear, "oe")),
+)
 
 
 def alarms_of(time_min: Array, statistic: Array, width: float) -> list[Interval]:

@@ -11,8 +11,7 @@ from benchmarks.study_figures.canvas import BLUE, ORANGE, PURPLE, label, panels
 from benchmarks.study_figures.figure import Finding, Verdict
 from benchmarks.study_figures.neural import Neural
 from benchmarks.study_figures.study import ORDERS, OUTPUTS, Study
-from reactorwatch.identification.families import LINEAR_FAMILIES, Family
-from reactorwatch.identification.selection import EQUAL_PERCENT, Candidate, Selection, select
+from reactorwatch.identification.selection import EQUAL_PERCENT, LINEAR_FAMILIES, Candidate, Family, Selection, select
 from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:

@@ -17,11 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.data import ScaledRecord, plan_run, rows_of
+from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
-from reactorwatch.identification.regressor import rows_of
-from reactorwatch.identification.scaled_record import ScaledRecord
-from reactorwatch.identification.simulation import plan_run
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 _DIVERGED = 1e6  # a scaled output beyond this, a million times its spread, has diverged
@@ -102,7 +100,7 @@ class Neural:
             from sklearn.neural_network import MLPRegressor  # type: ignore[import-untyped]
         except ImportError as missing:
             raise InputError("the neural model needs scikit-learn: pip install scikit-learn") from missing
-        linear = fit_arx(structure, inputs, outputs, time)
+        linear = fit_linear("arx", structure, inputs, outputs, time)
         record = ScaledRecord.of(structure, inputs, outputs, time)
         # Without the constant: the network has its own.
         rows = replace(record, structure=structure.without_offset()).enough_rows()

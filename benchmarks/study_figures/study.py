@@ -15,8 +15,8 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import Scenario
 from reactorwatch.arrays import Array
-from reactorwatch.identification.families import LINEAR_FAMILIES, Model
 from reactorwatch.identification.linear_model import LinearModel
+from reactorwatch.identification.selection import LINEAR_FAMILIES, Model
 from reactorwatch.identification.structure import Structure
 from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, cstr
 from reactorwatch.process.library.cstr.operation import NOISE_SD, OPERATION

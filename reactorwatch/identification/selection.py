@@ -11,8 +11,10 @@ significant.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -20,17 +22,58 @@ from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError
-from reactorwatch.identification.families import LINEAR_FAMILIES, Family, Model
-from reactorwatch.identification.linear_model import fit_percent
+from reactorwatch.identification.linear import fit_linear
+from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.structure import Structure, as_columns
 
-EQUAL_PERCENT = 0.5
+EQUAL_PERCENT = 0.5  # difference of fits that counts as none
+LEAST_PERCENT = 20.0  # fit on the held-out half: with less no model is recommended (the mean alone has 0 %)
+UNSEEN_SHARE, BEYOND_SHARE = 0.05, 0.1  # of the held-out inputs, beyond the range of the fitted half by this share
 
-LEAST_PERCENT = 20.0
-"""Least fit of a simulation on the held-out half; with less no model is recommended (the mean alone has 0 %)."""
 
-UNSEEN_SHARE, BEYOND_SHARE = 0.05, 0.1
-"""Share of the held-out inputs, and of the fitted half's range that they must exceed, for an unseen range."""
+class Model(Protocol):
+    """A fitted model. Signals are arrays of shape (rows,) or (rows, signals), NaN where nothing was measured."""
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of parameters."""
+
+    def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+        """One-step-ahead prediction, shape (rows, outputs); NaN where the rows before are incomplete."""
+
+    def simulate(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+        """Simulation, shape (rows, outputs); NaN in the rows that it starts from."""
+
+    def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+        """Measured minus predicted or simulated, as in the fit, shape (rows, outputs)."""
+
+
+class Family(Protocol):
+    """A model family."""
+
+    @property
+    def name(self) -> str:
+        """Name of the family."""
+
+    def fit(self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Model:
+        """Fit a model of a structure to a record.
+
+        Raises:
+            InputError: the record does not determine the model.
+        """
+
+
+class LinearFamily(NamedTuple):
+    """Linear models by their fit, see `Family`."""
+
+    name: str
+    fit: Callable[..., LinearModel]
+
+
+LINEAR_FAMILIES: tuple[Family, ...] = (
+    LinearFamily("arx", partial(fit_linear, "arx")),
+    LinearFamily("oe", partial(fit_linear, "oe")),
+)
 
 
 class Candidate(msgspec.Struct, frozen=True):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification.black_box.model import BlackBoxModel
+from reactorwatch.identification.black_box.model import BlackBoxModel, Shape, lagged_inputs
 from reactorwatch.identification.black_box.prediction_error import (
     NEXT,
     START,
@@ -26,35 +26,17 @@ from reactorwatch.identification.black_box.prediction_error import (
     log_likelihood,
     prediction_errors,
 )
-from reactorwatch.identification.black_box.state_map import Shape, lagged_inputs
 
-MOST_PARAMETERS = 90
-"""Parameters of all outputs; the filter's work grows with their square."""
-
+MOST_PARAMETERS = 90  # of all outputs; the filter's work grows with their square
 LARGEST_DEGREE, MOST_LAGS = 3, 3
-
-FINEST_DEGREE = 4
-"""Degree that is taken where it is likelier: with little noise a cubic is visibly wrong."""
-
-ROWS_A_PARAMETER = 4
-"""Least number of measured values for each parameter."""
-
-PRIOR_SD = (1.0, 1.0, 0.17, 0.07, 0.03)
-"""Standard deviations of the parameters by degree, of scaled signals."""
-
+FINEST_DEGREE = 4  # that is taken where it is likelier: with little noise a cubic is visibly wrong
+ROWS_A_PARAMETER = 4  # least number of measured values for each parameter
+PRIOR_SD = (1.0, 1.0, 0.17, 0.07, 0.03)  # of the parameters by degree, of scaled signals
 GAINS = (1.0, 0.6, 0.3, 0.1, 0.03, 0.0)
-MARGIN = 10.0
-"""Difference of log-likelihoods that a larger gain has to bring, or the finest degree."""
-
-NOISE_MARGIN = 5.0
-"""The same for noise of the process."""
-
-_ITERATIONS, _LAST_ITERATIONS = 5, 20
-LEAST_RELATIVE_SD = 1e-6
-"""Standard deviation of the measurements, relative to the output's own, below which it is rounding."""
-
-_CONVERGED = 1e-4  # relative decrease of the cost
-_LEAST_VARIANCE = 1e-8  # of the process, relative to that of the measurements
+MARGIN, NOISE_MARGIN = 10.0, 5.0  # of log-likelihood that a larger gain or the finest degree, and process noise, bring
+LEAST_RELATIVE_SD = 1e-6  # of the measurements, of the output's own: less is rounding
+_ITERATIONS, _LAST_ITERATIONS = 5, 20  # of a gain, and of the last one
+_LEAST_VARIANCE = 1e-8  # of the process, of that of the measurements
 
 
 @dataclass(frozen=True)
@@ -258,7 +240,7 @@ def _gauss_newton(shape: Shape, rows: Rows, theta: Array, gain: float, iteration
             damping = max(10.0 * damping, 1e-4)
         run(theta, weights, nothing)
         variances = _variances(errors, rows.smallest)
-        if before - after <= _CONVERGED * before:
+        if before - after <= 1e-4 * before:
             break
     run(theta, 1.0 / variances, gram)
     covariance = _inverse(gram + np.diag(precision))

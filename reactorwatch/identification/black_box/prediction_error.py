@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.identification.black_box.state_map import predict_outputs
+from reactorwatch.identification.black_box.model import predict_outputs
 
 START, NEXT = 1, 2
 """Kinds of a row: the state is set from its measurements; it follows the row before. 0: it is left out."""
@@ -43,7 +43,7 @@ def prediction_errors(
 
     Args:
         theta: parameters, shape (outputs, terms).
-        products: see `state_map.Products`.
+        products: see `model.Shape.products`.
         states: number of states.
         rows: rows of the training.
         gain: share of an error that corrects the state.

@@ -7,9 +7,8 @@ import pytest
 
 from benchmarks.study_figures.neural import Neural
 from reactorwatch.errors import InputError
-from reactorwatch.identification.families import LINEAR_FAMILIES
 from reactorwatch.identification.linear_model import fit_percent
-from reactorwatch.identification.selection import select
+from reactorwatch.identification.selection import LINEAR_FAMILIES, select
 from reactorwatch.identification.structure import Structure
 from tests.unit.identification.truth import Array, oscillating_plant
 
