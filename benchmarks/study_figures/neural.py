@@ -89,7 +89,6 @@ class Neural:
     neurons: int = 12  # number of neurons in the hidden layer
     seeds: tuple[int, ...] = (1, 2, 3)  # seeds of the initial weights; one network is fitted for each
     iterations: int = 200  # largest number of iterations of each search
-    name: str = "neural"
 
     def fit(
         self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None

@@ -35,7 +35,6 @@ from reactorwatch.identification.linear import instrumental_variable
 from reactorwatch.identification.linear_model import simulate
 from reactorwatch.identification.structure import Structure, as_columns
 
-INDEPENDENT = 0.01  # least ratio of the weakest to the strongest direction of the input's lagged copies
 LARGEST_CONDITION = 1e4  # of the scaled regressors: four digits are lost
 SLOWEST_SAMPLES, BEST_SAMPLES, FASTEST_SAMPLES = 3.0, 10.0, 30.0  # T95: about twice beyond what is advised is accepted
 LEAST_AMPLITUDE = 3.0  # of the output, in standard deviations of its noise
@@ -147,7 +146,7 @@ def _excited_order(copies: list[NDArray[np.float64]]) -> int:
     triangle = np.asarray(np.linalg.qr(np.concatenate([copy / size for copy in centred], axis=1), mode="r"))
     for lags in range(len(copies), 0, -1):
         values = np.linalg.svd(triangle[: lags * inputs, : lags * inputs], compute_uv=False)
-        if values[-1] >= INDEPENDENT * values[0]:
+        if values[-1] >= 0.01 * values[0]:
             return lags
     return 0
 

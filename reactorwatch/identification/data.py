@@ -17,8 +17,6 @@ from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
 from reactorwatch.records.record import Record
 
-GAP_TOLERANCE = 0.25  # an interval that differs from the period by more than this share of it is a gap
-
 PlanArrays: TypeAlias = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 
@@ -194,7 +192,8 @@ def consecutive_rows(signals: NDArray[np.float64], time: ArrayLike | None = None
 
     Args:
         signals: shape (rows, signals), NaN where nothing was measured.
-        time: shape (rows,), increasing; the period is the median interval. Without it no gap is looked for.
+        time: shape (rows,), increasing; the period is the median interval, and one that differs by a quarter is a gap.
+            Without it no gap is looked for.
 
     Raises:
         InputError: times that don't fit, or don't increase.
@@ -212,7 +211,7 @@ def consecutive_rows(signals: NDArray[np.float64], time: ArrayLike | None = None
             row = int(np.argmin(intervals > 0.0)) + 1
             raise InputError(f"time must increase, got {times[row]} after {times[row - 1]} in row {row + 1}")
         period = np.median(intervals)
-        gap = np.abs(intervals - period) > GAP_TOLERANCE * period
+        gap = np.abs(intervals - period) > 0.25 * period
         starts[1:] = np.where(gap & complete[1:], position[1:], starts[1:])
     return np.where(complete, position - np.maximum(np.maximum.accumulate(starts), 0) + 1, 0)
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
@@ -16,7 +16,7 @@ from reactorwatch.identification.checks import DEFAULT_LAGS, check_record, indep
 from reactorwatch.identification.data import Dataset, RunPlan, plan_run, rows_of
 from reactorwatch.identification.least_squares import SINGULAR_CONDITION, LeastSquares
 from reactorwatch.identification.linear import fit_linear, unscale
-from reactorwatch.identification.linear_model import LinearModel, fit_percent, simulate
+from reactorwatch.identification.linear_model import Kind, LinearModel, fit_percent, simulate
 from reactorwatch.identification.polynomial import PolynomialModel, fit_narx, fit_noe, name_product
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
@@ -24,10 +24,7 @@ from reactorwatch.identification.structure import Scaling, Structure
 FittedModel = LinearModel | PolynomialModel
 
 MODELS: dict[str, Callable[..., FittedModel]] = {
-    "arx": partial(fit_linear, "arx"),
-    "oe": partial(fit_linear, "oe"),
-    "armax": partial(fit_linear, "armax"),
-    "bj": partial(fit_linear, "bj"),
+    **{kind: partial(fit_linear, kind) for kind in get_args(Kind)},
     "narx": fit_narx,
     "noe": fit_noe,
 }

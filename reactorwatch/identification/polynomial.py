@@ -35,12 +35,9 @@ from reactorwatch.identification.least_squares import descend, least_squares, so
 from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
-LARGEST_NARX, LARGEST_NOE = 30, 24  # numbers of terms; each of the latter costs some descents
+LARGEST_SIZE = 30  # number of terms of a NARX model beyond which no more are selected
 DIVERGED = 1e6  # a scaled output beyond this, a million times its spread, has diverged
-NARX_DEGREE, NOE_DEGREES = 2, (3, 2)  # the last one where there would be more candidates than half of the rows
-TRIED = 5  # candidates that are fitted before one is added
-FOLDS = (2, 4)  # numbers of blocks into which the record is cut for cross-validation
-ITERATIONS, ROUGH_ITERATIONS = 40, 20  # of a descent, and of one whose model is only compared
+NARX_DEGREE = 2
 
 Product = tuple[int, ...]
 """Indices of the factors among the lagged signals, increasing; empty: the constant."""
@@ -67,11 +64,6 @@ class PolynomialModel:
     covariance: Array
     rows: int
     simulates: bool = False
-
-    @property
-    def parameter_count(self) -> int:
-        """Number of parameters."""
-        return self.values.size
 
     def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
         """See `LinearModel.predict`."""
@@ -158,13 +150,7 @@ def _multiply(signals: Array, products: tuple[Product, ...]) -> Array:
 def fit_narx(
     structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
 ) -> PolynomialModel:
-    """Fit a polynomial NARX model of one output.
-
-    Args:
-        structure: lags of output and inputs, with an offset.
-        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
-        time: shape (rows,), increasing, in any unit; None: gaps are not detected.
+    """Fit a polynomial NARX model of one output; arguments as for `linear.fit_linear`, a structure with an offset.
 
     Raises:
         InputError: an output that is constant, or fewer rows than candidates.
@@ -181,7 +167,7 @@ def fit_narx(
     regressors, target = _multiply(rows.regressors, candidates), rows.outputs[:, 0]
     linear = sum(len(product) < NARX_DEGREE for product in candidates)
     order = [*range(linear), *_select(regressors, target, linear)]
-    sizes = range(linear, min(len(order), LARGEST_NARX) + 1)
+    sizes = range(linear, min(len(order), LARGEST_SIZE) + 1)
 
     def fit(size: int, part: slice) -> PolynomialModel:
         solution = least_squares(regressors[part, order[:size]], target[part])
@@ -203,8 +189,7 @@ def fit_narx(
             total += float(np.nansum((y[part] - run) ** 2))
         return total
 
-    best = min(sizes, key=squares)
-    return fit(best, slice(None))
+    return fit(min(sizes, key=squares), slice(None))
 
 
 def _select(regressors: Array, target: Array, first: int) -> list[int]:
@@ -214,7 +199,7 @@ def _select(regressors: Array, target: Array, first: int) -> list[int]:
     error = target - base @ (base.T @ target)
     sizes = np.linalg.norm(regressors[:, first:], axis=0)
     taken: list[int] = []
-    while len(taken) < min(LARGEST_NARX - first, rest.shape[1]):
+    while len(taken) < min(LARGEST_SIZE - first, rest.shape[1]):
         norms = np.linalg.norm(rest, axis=0)
         usable = norms > 1e-6 * sizes  # less is a combination of those before
         usable[taken] = False
@@ -258,7 +243,7 @@ def fit_noe(
     record = ScaledRecord.of(structure, inputs, outputs, time)
     rows, y = replace(record, structure=structure.without_offset()).enough_rows(), record.y[:, 0]
     compared = np.flatnonzero(record.plan.running & np.isfinite(y))
-    for degree in NOE_DEGREES:
+    for degree in (3, 2):
         candidates = products_of(structure.without_offset().parameters, degree)
         if 2 * len(candidates) <= compared.size:
             break
@@ -271,14 +256,14 @@ def fit_noe(
     def errors_of(products: tuple[Product, ...], chosen: NDArray[np.int64] = compared) -> _SimulationErrors:
         return _SimulationErrors(products, record, chosen)
 
-    folds = [block for count in FOLDS for block in np.array_split(compared, count)]
+    folds = [block for count in (2, 4) for block in np.array_split(compared, count)]
 
     def held_out_error(products: tuple[Product, ...], theta: Array) -> float:
         """Mean over the folds of the rms error where they are left out of the fit; inf if one run diverges."""
         sizes = []
         for fold in folds:
             fitted = errors_of(products, np.setdiff1d(compared, fold))
-            run = fitted.run(descend(fitted, theta, ROUGH_ITERATIONS)[0])[0][fold]
+            run = fitted.run(descend(fitted, theta, 20)[0])[0][fold]
             if not np.all(np.isfinite(run)):
                 return np.inf
             sizes.append(float(np.sqrt(np.mean((y[fold] - run) ** 2))))
@@ -289,7 +274,7 @@ def fit_noe(
     start = arx if errors_of(linear).admits(arx) else np.zeros(len(linear))
     best = grown = linear, descend(errors_of(linear), start)[0]
     smallest = held_out_error(*grown)
-    while len(grown[0]) < min(LARGEST_NOE, len(candidates)):
+    while len(grown[0]) < min(24, len(candidates)):
         larger = _grow(errors_of, candidates, *grown)
         if larger is None:
             break
@@ -321,10 +306,10 @@ def _grow(
     usable = sizes > 1e-9 * np.sum(new**2, axis=0)  # less is a combination of those before
     explained = np.where(usable, (open_error @ left) ** 2 / np.where(usable, sizes, 1.0), -1.0)
     fits = []
-    for index in np.argsort(explained)[::-1][:TRIED]:
+    for index in np.argsort(explained)[::-1][:5]:  # the best few of them are fitted
         if explained[index] > 0.0:
             larger = (*products, rest[index])
-            values, squares = descend(errors_of(larger), np.append(theta, 0.0), ITERATIONS)
+            values, squares = descend(errors_of(larger), np.append(theta, 0.0), 40)
             fits.append((squares, larger, values))
     return min(fits, key=lambda fit: fit[0])[1:] if fits else None
 
@@ -343,7 +328,7 @@ def run_polynomial(
 
     Args:
         theta: coefficients, shape (terms,).
-        factors: indices of each term's factors among the lagged signals, shape (terms, degree); -1: none.
+        factors: see `factors_of`.
         orders: see `Structure`.
         u: shape (rows, inputs).
         y: shape (rows,).

@@ -214,8 +214,7 @@ class RecursiveLeastSquares:
     Regressors should be of the order of 1 (`structure.Scaling`): `covariance_limit` counts in their units.
 
     >>> rls = RecursiveLeastSquares(2)
-    >>> for k in range(5):
-    ...     innovation = rls.update([k, 1.0], 3.0 * k - 1.0)
+    >>> innovations = [rls.update([k, 1.0], 3.0 * k - 1.0) for k in range(5)]
     >>> rls.parameters
     array([ 3., -1.])
 

@@ -23,9 +23,6 @@ RowArrays: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[n
 """Scaled outputs, shape (rows, outputs), NaN where missing; scaled lagged inputs, shape (rows, inputs lags); kinds of
 the rows, shape (rows,)."""
 
-LARGEST_SQUARE = 25.0
-"""Largest square of a normalised error in the likelihood: more are outliers."""
-
 
 @jit
 def prediction_errors(
@@ -171,7 +168,7 @@ def log_likelihood(
         for j in range(outputs):
             S, error = P[j, j] + r[j], y[k, j] - signals[j]
             if abs(error) < inf:
-                total -= 0.5 * (np.log(S) + min(error * error / S, LARGEST_SQUARE))
+                total -= 0.5 * (np.log(S) + min(error * error / S, 25.0))  # more is an outlier
                 for a in range(states):
                     K[a] = P[a, j]
                 for a in range(states):

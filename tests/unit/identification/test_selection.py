@@ -10,10 +10,12 @@ from numpy.typing import ArrayLike
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.linear import fit_linear
-from reactorwatch.identification.linear_model import LinearModel, fit_percent
-from reactorwatch.identification.selection import LINEAR_FAMILIES, Model, bic, select
+from reactorwatch.identification.linear_model import fit_percent
+from reactorwatch.identification.selection import LINEAR_FITS, Model, bic, select
 from reactorwatch.identification.structure import Structure
 from tests.unit.identification.truth import Array, Daisy, NoisyPlant
+
+ARX = {"arx": LINEAR_FITS["arx"]}
 
 
 def test_with_measurement_noise_the_output_error_model_of_the_plants_order_is_chosen(noisy_plant: NoisyPlant) -> None:
@@ -52,7 +54,6 @@ def test_of_equal_models_the_smallest_is_taken(daisy: Daisy) -> None:
 class Persistence:
     """A family that is none of ours: tomorrow is like today."""
 
-    name: str = "persistence"
     parameter_count: int = 0
 
     def fit(self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Model:
@@ -72,7 +73,7 @@ class Persistence:
 
 def test_another_family_joins_the_table_like_a_shipped_one(noisy_plant: NoisyPlant) -> None:
     selection = select(
-        noisy_plant.inputs, noisy_plant.measured, families=(*LINEAR_FAMILIES, Persistence()), orders=(2,)
+        noisy_plant.inputs, noisy_plant.measured, fits={**LINEAR_FITS, "persistence": Persistence().fit}, orders=(2,)
     )
     assert [candidate.family for candidate in selection.candidates] == ["arx", "oe", "persistence"]
     assert selection.candidates[-1].free_run_percent < 10.0
@@ -83,7 +84,7 @@ def test_a_model_that_cannot_be_fitted_stays_in_the_table_with_its_reason(noisy_
     u, y = noisy_plant.inputs, np.zeros(4000)
     for k in range(1, 4000):
         y[k] = 0.5 * y[k - 1] + u[k - 1]
-    selection = select(u, y, families=LINEAR_FAMILIES[:1], orders=(1, 3))
+    selection = select(u, y, fits=ARX, orders=(1, 3))
     assert "don't determine 7 parameters" in selection.candidates[1].refusal
     assert "don't determine 7 parameters" in selection.table()
     assert selection.chosen.order == 1
@@ -91,9 +92,9 @@ def test_a_model_that_cannot_be_fitted_stays_in_the_table_with_its_reason(noisy_
 
 def test_where_nothing_can_be_chosen_every_reason_is_given() -> None:
     with pytest.raises(InputError, match="no model can be chosen: arx 1: output 1 is constant"):
-        select(np.arange(50.0), np.ones(50), families=LINEAR_FAMILIES[:1], orders=(1,))
+        select(np.arange(50.0), np.ones(50), fits=ARX, orders=(1,))
     with pytest.raises(InputError, match="no family or order was given"):
-        select(np.arange(50.0), np.ones(50), families=())
+        select(np.arange(50.0), np.ones(50), fits={})
     with pytest.raises(InputError, match="order must be at least 1, got 0"):
         select(np.arange(50.0), np.arange(50.0), orders=(0,))
     with pytest.raises(InputError, match="equally many rows, got 50 and 49"):
@@ -124,7 +125,7 @@ def test_where_no_model_fits_it_recommends_none_and_reports_the_reason(case: str
     moved, seen, why = DIFFERENT_HALVES[case]
     u = moved(np.repeat(np.random.default_rng(1).standard_normal(400), 10))
     y = seen(second_order(u, np.ones(4000))) + 0.01 * np.random.default_rng(3).standard_normal(4000)
-    selection = select(u, y, families=LINEAR_FAMILIES[:1])
+    selection = select(u, y, fits=ARX)
     assert not selection.fits
     assert max(candidate.free_run_percent for candidate in selection.candidates) < 20.0
     assert re.match(
@@ -144,12 +145,3 @@ def test_bic_is_schwarzs() -> None:
     residuals = np.array([1.0, -2.0, np.nan, 2.0])
     assert bic(residuals, 4) == pytest.approx(3.0 * np.log(9.0 / 3.0) + 4.0 * np.log(3.0))
     assert bic(np.zeros(3), 1) == -np.inf
-
-
-def test_models_know_what_they_are() -> None:
-    assert [family.name for family in LINEAR_FAMILIES] == ["arx", "oe"]
-    plant_rows = np.random.default_rng(1).standard_normal((200, 2))
-    for family in LINEAR_FAMILIES:
-        model = family.fit(Structure.of_order(1), plant_rows[:, 0], plant_rows[:, 1])
-        assert isinstance(model, LinearModel)
-        assert model.parameter_count == 3
