@@ -28,7 +28,7 @@ RUN COMMIT=${COMMIT} pip install --no-cache-dir --no-deps --no-build-isolation .
 USER reactorwatch
 WORKDIR /home/reactorwatch
 # Else each new container compiles for half a minute in the middle of a watch.
-RUN reactorwatch compile
+RUN python -m reactorwatch.codegen
 STOPSIGNAL SIGTERM
 ENTRYPOINT ["reactorwatch"]
 

@@ -27,7 +27,7 @@ $(READY): pyproject.toml
 		$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1' && \
 		$(BIN)/python -m pip install --quiet --editable . --group dev; \
 	fi
-	@$(BIN)/reactorwatch compile
+	@$(BIN)/python -m reactorwatch.codegen
 	@touch $@
 
 demo: $(READY) ## run a reactor with a fault, watch, record and draw it

@@ -22,11 +22,9 @@ from reactorwatch.cli.printing import json_line, print_lines
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError, UnfitRecordError
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.cells import quote_formula
+from reactorwatch.records.decode import list_files, quote_formula
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.folder import fill_folder
-from reactorwatch.records.input_file import list_files
+from reactorwatch.records.write import atomic_write, fill_folder
 from reactorwatch.runtime.parallel import choose_executor
 from reactorwatch.runtime.parallel.jobs import Failed, in_job_order
 

@@ -22,6 +22,7 @@ from reactorwatch.cli.bus_settings import (
     write_node_settings,
 )
 from reactorwatch.cli.display import format_age, print_report
+from reactorwatch.cli.kernels import compile_at_first_start
 from reactorwatch.cli.plant_settings import WAIT_FOR, complete_plant_settings
 from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.processes import Processes
@@ -37,9 +38,8 @@ from reactorwatch.diagnosis.result import NAMED, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
+from reactorwatch.records.write import atomic_write, make_folder
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import section
 from reactorwatch.runtime.crash import INTERRUPTED
@@ -113,6 +113,7 @@ def run(flags: dict[str, Any], fault: str | None, out: Path | None, site: Path |
         processes={PLANT: flags["process"] or DEFAULT_PROCESS},
         about={"seed": str(plant.seed)},
     )
+    compile_at_first_start()
     with open_router(site, join) as bus:
         make_folder(folder, "--out")
         tables = {"plant": plant, "monitor": monitor}

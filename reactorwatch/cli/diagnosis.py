@@ -17,10 +17,8 @@ from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import report_object
 from reactorwatch.diagnosis.result import Experiment
 from reactorwatch.errors import UnfitRecordError
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.folder import fill_folder
 from reactorwatch.records.record import Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import atomic_write, fill_folder, write_table
 from reactorwatch.runtime.model_file import write_extended_model
 
 PAGE, OBJECT, MODEL, DRAWING = "report.html", "report.json", "extended.json", "report.rrd"

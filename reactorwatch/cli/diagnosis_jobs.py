@@ -18,8 +18,8 @@ from reactorwatch.diagnosis.report.machine import as_object
 from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import Cause
 from reactorwatch.errors import InputError, UnfitRecordError
-from reactorwatch.records.output import check_output_folder
-from reactorwatch.records.source_text import is_table
+from reactorwatch.records.decode import is_table
+from reactorwatch.records.write import check_output_folder
 
 
 def diagnosis_jobs(

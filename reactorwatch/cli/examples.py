@@ -8,7 +8,7 @@ from typer import Argument, Option
 from reactorwatch.cli.options import Force, check_output
 from reactorwatch.cli.printing import print_lines
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.records.output import check_output_file
+from reactorwatch.records.write import check_output_file
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record
@@ -30,8 +30,7 @@ def example(
     import msgspec
 
     from reactorwatch.cli.progress import task
-    from reactorwatch.records.atomic import atomic_write
-    from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
+    from reactorwatch.records.write import WRITTEN_SUFFIXES, atomic_write, write_table
 
     out = check_output(out, WRITTEN_SUFFIXES, (), force=force)
     beside = check_output_file(out.with_name(f"{out.name}.truth.json"), force=force)

@@ -109,7 +109,7 @@ def export_csv(
 ) -> None:
     """Turn a recording (.mcap) into a record (.csv, .csv.gz, .xlsx or .parquet), with all its signals."""
     from reactorwatch.cli.progress import task
-    from reactorwatch.records.write_table import WRITTEN_SUFFIXES
+    from reactorwatch.records.write import WRITTEN_SUFFIXES
     from recorder.tools.convert import export_csv as convert
 
     choice = chosen.choose()
@@ -120,7 +120,7 @@ def export_csv(
 
 
 def _report_text(out: Path, record: "Record") -> str:
-    from reactorwatch.records.cells import quote_formula
+    from reactorwatch.records.decode import quote_formula
 
     remarks, quoted = list(record.remarks), [name for name in record.columns if quote_formula(name) != name]
     if quoted and out.suffix.lower() in (".csv", ".gz"):

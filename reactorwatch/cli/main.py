@@ -8,8 +8,9 @@ Only the imports for `--help` are here; each command imports its own when it is 
 import gc
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import cast
+from typing import NoReturn, cast
 
 import typer
 
@@ -18,7 +19,6 @@ from reactorwatch.cli import (
     baseline,
     causes,
     charts,
-    compilation,
     examples,
     files,
     models,
@@ -60,7 +60,6 @@ COMMANDS: dict[str, Command] = {
     "monitor": nodes.monitor,
     "record": nodes.record,
     "replay": nodes.replay,
-    "alive": nodes.alive,
     "example": examples.example,
     "view": view.view,
     "certify": site.certify,
@@ -80,7 +79,6 @@ COMMANDS: dict[str, Command] = {
     "causes": causes.causes,
     "identify": models.identify,
     "linearise": models.linearise,
-    "compile": compilation.compile_kernels,
 }
 add_commands(app, COMMANDS)
 for name, group, text in (
@@ -106,13 +104,26 @@ def _root(
 
 def main() -> None:
     """Run the command and end the process with its exit code."""
+    run_command(_run)
+
+
+def run_command(run: Callable[[], int]) -> NoReturn:
+    """Run a command's work and end the process with its exit code, 130 after Ctrl-C."""
     # Before NumPy is imported: the matrices are small, and threads of the linear algebra would wait for each other
     # longer than they work; and the last bits of a chart's limit depend on their number. With one thread a back-test
     # reproduces the live monitor on any machine. Another setting has to be the same for both; nodes inherit it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("RUST_LOG", "off")  # a full disk or a closed viewer is reported here, not by Rerun
     raise_until_handled()
-    code = guard(NAME, _run)
+
+    def until_interrupted() -> int:
+        try:
+            return run()
+        except (typer.Abort, KeyboardInterrupt):
+            clear_interrupt()
+            return INTERRUPTED
+
+    code = guard(NAME, until_interrupted)
     gc.freeze()  # the process ends: garbage collection of a million objects would take a third of a second
     sys.exit(code)
 
@@ -128,7 +139,4 @@ def _run() -> int:
     except UsageProblem as error:
         print_error(NAME, error.format_message())
         return UNUSABLE
-    except (typer.Abort, KeyboardInterrupt):
-        clear_interrupt()
-        return INTERRUPTED
     return code if isinstance(code, int) else 0

@@ -1,16 +1,13 @@
 """Commands that run one node until it is finished or stopped: `plant`, `monitor`, `record`, `replay`."""
 
-import logging
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer import Argument, Option
+from typer import Option
 
 from reactorwatch.cli.option_groups import TableOptions, stated_settings
 from reactorwatch.cli.options import (
-    MAX_WAIT_S,
-    TIMEOUT_S,
     Begin,
     BusOptions,
     Columns,
@@ -30,17 +27,15 @@ from reactorwatch.cli.options import (
     parse_pace,
     parse_span_ns,
 )
-from reactorwatch.cli.printing import print_lines
 from reactorwatch.errors import InputError
 
 
-def _settings(target: BusOptions, *, quiet: bool = False) -> tuple[dict[str, dict[str, Any]], Any]:
+def _settings(target: BusOptions) -> tuple[dict[str, dict[str, Any]], Any]:
     from reactorwatch.runtime.config import BusConfig, LogConfig, read_settings, section
     from reactorwatch.runtime.logs import configure
 
     tables = read_settings(target.config)
-    log = section(LogConfig, "log", tables, {})
-    configure(logging.WARNING if quiet else logging.INFO, as_json=log.format == "json")
+    configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
     return tables, section(BusConfig, "bus", tables, {"endpoint": target.endpoint})
 
 
@@ -106,8 +101,9 @@ def monitor(
     from monitor_node.__main__ import run
     from monitor_node.config import MonitorConfig
     from monitor_node.fleet.config import FleetConfig
+    from reactorwatch.cli.kernels import compile_at_first_start
     from reactorwatch.cli.supervise import diagnosis_settings, run_diagnosis_node
-    from reactorwatch.records.output import check_folder_name
+    from reactorwatch.records.write import check_folder_name
     from reactorwatch.runtime.config import LogConfig, section
 
     tables, bus = _settings(target)
@@ -130,6 +126,7 @@ def monitor(
         raise InputError("--shard is a part of the plants that --plants names; give both")
     if state is not None:
         check_folder_name(state, "--state")
+    compile_at_first_start()
     if fleet.plants is not None:
         run(config_of_monitor, bus, _metrics(tables), fleet)
         return
@@ -146,7 +143,7 @@ def record(
     ] = None,
 ) -> None:
     """Record everything on the bus into an MCAP file."""
-    from reactorwatch.records.output import check_folder_name
+    from reactorwatch.records.write import check_folder_name
     from reactorwatch.runtime.config import section
     from recorder.__main__ import run
     from recorder.config import RecorderConfig
@@ -205,8 +202,8 @@ def replay(
         pace = {"name": name, "speed": parse_pace(rate, "--rate"), "process": chosen.process}
         played = PlayedRecord(check_recording(file), table.stated)
         raise typer.Exit(run_until_stopped(target, None, pace, None, None, played))
+    from reactorwatch.records.decode import is_table
     from reactorwatch.records.record import MINUTE_NS
-    from reactorwatch.records.source_text import is_table
     from reactorwatch.runtime.config import section
     from recorder.config import ReplayConfig
     from recorder.tools.replay import run_replay
@@ -236,19 +233,3 @@ def _refuse(given: dict[str, Any], why: str) -> None:
     for option, value in given.items():
         if value:
             raise InputError(f"{why}; leave out {option}")
-
-
-def alive(
-    *,
-    node: Annotated[str, Argument(help="plant, monitor or recorder.")],
-    target: PlantOptions,
-    timeout: Annotated[float, Option(help="Seconds to wait for it.", min=0.1, max=MAX_WAIT_S)] = TIMEOUT_S,
-) -> None:
-    """Check that a node is alive: ends with 0 or 1."""
-    from reactorwatch.cli.liveliness import wait_for_node
-    from reactorwatch.contract.keys import DEFAULT_PLANT
-
-    _, bus = _settings(target, quiet=True)
-    there = wait_for_node(bus, target.name or DEFAULT_PLANT, node, timeout)
-    print_lines(f"{node} is {'alive' if there else f'not there within {timeout:g} s'}")
-    raise typer.Exit(0 if there else 1)

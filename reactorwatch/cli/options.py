@@ -14,7 +14,7 @@ import typer
 from typer import Argument, Option
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.output import check_output_file
+from reactorwatch.records.write import check_output_file
 
 if TYPE_CHECKING:
     from reactorwatch.description.choice import ProcessChoice

@@ -16,7 +16,7 @@ from typing import Any, Self
 import msgspec
 import structlog
 
-from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.write import atomic_write
 from reactorwatch.runtime.node_main import SUPERVISED
 
 log = structlog.get_logger()

@@ -55,8 +55,8 @@ def info(
     from reactorwatch.cli.recording_reports import info_object, info_text
     from reactorwatch.cli.table_report import table_object, table_text
     from reactorwatch.description.read import read_signals
-    from reactorwatch.records.read_table import read_table
-    from reactorwatch.records.source_text import is_table
+    from reactorwatch.records.decode import is_table
+    from reactorwatch.records.read import read_table
     from recorder.tools.inspect import inspect
 
     choice = chosen.choose()

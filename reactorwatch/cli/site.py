@@ -6,7 +6,16 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from reactorwatch.cli.options import MAX_WAIT_S, BusOptions, Json, PlantOptions, Process, Settings, check_input
+from reactorwatch.cli.options import (
+    MAX_WAIT_S,
+    TIMEOUT_S,
+    BusOptions,
+    Json,
+    PlantOptions,
+    Process,
+    Settings,
+    check_input,
+)
 from reactorwatch.cli.printing import json_line, print_lines
 from reactorwatch.errors import InputError
 
@@ -128,18 +137,29 @@ def doctor(
 
 def status(
     *,
+    nodes: Annotated[list[str] | None, Argument(help="With --check: these nodes [plant, monitor, recorder].")] = None,
     target: BusOptions,
     name: Annotated[str | None, Option("--plant", help="Which plant [all that may be read].")] = None,
     process: Process = None,
+    check: Annotated[
+        bool, Option("--check", help="Check that nodes are alive, and nothing else. Ends with 0 if all are, 1 if not.")
+    ] = False,
+    timeout: Annotated[
+        float, Option(help="With --check: seconds to wait for them.", min=0.1, max=MAX_WAIT_S)
+    ] = TIMEOUT_S,
     once: Annotated[bool, Option("--once", help="Show it once.")] = False,
     seconds: Annotated[float, Option(help="How long to listen before showing it once.", min=0.1, max=MAX_WAIT_S)] = 4.0,
     as_json: Json = False,
 ) -> None:
-    """Show the current state of plants, nodes, rates and alarms, until stopped."""
+    """Show the current state of plants, nodes, rates and alarms, until stopped; or check that nodes are alive."""
     from reactorwatch.cli.observer import load_recorder_settings, observed_process
-    from reactorwatch.cli.status import run
+    from reactorwatch.cli.status import check_alive, run
 
     bus, recorder = load_recorder_settings(PlantOptions(target.config, target.endpoint, name))
+    if check:
+        raise typer.Exit(check_alive(bus, recorder.plant, tuple(nodes or ()), timeout, as_json=as_json))
+    if nodes:
+        raise InputError(f"{nodes[0]}: nodes are named for --check alone; give it, or leave them out")
     described = observed_process(process, recorder)
     # a certificate is for one plant, and messages of others are not received
     plant = recorder.plant if name is not None or bus.ca is not None else None

@@ -4,12 +4,13 @@ import contextlib
 import threading
 import time
 from collections import Counter
+from collections.abc import Sequence
 from math import inf, isnan
 from typing import TYPE_CHECKING, Any
 
 from reactorwatch.cli.alarm_rows import ANNUNCIATED, Now, age_s, sort_alarms
 from reactorwatch.cli.display import has_colour, print_screen_text, screen_width
-from reactorwatch.cli.printing import json_line
+from reactorwatch.cli.printing import json_line, print_lines
 from reactorwatch.cli.status_view import format_plant
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import priority_word, set_suspects, state_word
@@ -26,7 +27,7 @@ from reactorwatch.contract.messages_pb2 import (
 )
 from reactorwatch.contract.promise_text import promise_fields
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
+from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, connect_now
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
 from reactorwatch.terminal import printable
@@ -230,6 +231,59 @@ def run(
                 _show(bus, board, stop)
         finally:
             bus.close()
+
+
+def check_alive(config: BusConfig, plant: str, nodes: Sequence[str], timeout_s: float, *, as_json: bool) -> int:
+    """Wait until nodes of a plant are alive, by their liveliness tokens, and print which are.
+
+    Args:
+        config: connection to the bus.
+        plant: name of the plant.
+        nodes: names of the nodes; empty: those that publish health, with a replay in place of the plant.
+        timeout_s: seconds to wait for router and nodes together.
+        as_json: print one JSON object.
+
+    Returns:
+        0 if all of them are alive within the time, else 1.
+
+    Raises:
+        InputError: Zenoh does not understand the endpoint.
+    """
+    alive: set[str] = set()
+    changed, stop = threading.Condition(), StopSignal()
+    until_s = time.monotonic() + timeout_s
+
+    def wanted_nodes() -> Sequence[str]:
+        return nodes or ("replay" if "replay" in alive else "plant", "monitor", "recorder")
+
+    def on_token(key: str, is_alive: bool) -> None:
+        topic = keys.parse(key)
+        if topic is not None:
+            with changed:
+                (alive.add if is_alive else alive.discard)(topic.name)
+                changed.notify_all()
+
+    timer = threading.Timer(timeout_s, stop.set)
+    timer.start()
+    try:
+        bus = connect(config, "status", stop)
+    finally:
+        timer.cancel()
+    if bus is not None:
+        try:
+            bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), on_token)
+            with changed:
+                changed.wait_for(lambda: alive.issuperset(wanted_nodes()), max(until_s - time.monotonic(), 0.0))
+        finally:
+            bus.close()
+    found = {node: node in alive for node in wanted_nodes()}
+    if as_json:
+        states = [{"node": node, "alive": is_alive} for node, is_alive in found.items()]
+        print_screen_text(json_line({"plant": plant, "nodes": states}))
+    else:
+        for node, is_alive in found.items():
+            print_lines(f"{node} is {'alive' if is_alive else f'not there within {timeout_s:g} s'}")
+    return 0 if all(found.values()) else 1
 
 
 def _subscribe(bus: ZenohBus, plant: str, process: "Process | None") -> StatusBoard:

@@ -58,7 +58,7 @@ def simulate(
     from reactorwatch.api.simulation import report, simulate_along
     from reactorwatch.cli.progress import task
     from reactorwatch.description.choice import ProcessChoice
-    from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
+    from reactorwatch.records.write import WRITTEN_SUFFIXES, write_table
 
     choice = ProcessChoice(process)
     out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
@@ -109,7 +109,7 @@ def backtest(
     from reactorwatch.cli.batch import SUMMARY, expand_files, make_jobs, run_jobs, unfit_lines
     from reactorwatch.cli.progress import task
     from reactorwatch.contract.keys import DEFAULT_PLANT
-    from reactorwatch.records.output import check_output_folder
+    from reactorwatch.records.write import check_output_folder
     from reactorwatch.runtime.config import read_settings, section
 
     named, choice = expand_files(files), chosen.choose(modes)

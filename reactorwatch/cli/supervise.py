@@ -22,6 +22,7 @@ from reactorwatch.cli.bus_settings import (
     restrict_to_plant,
     write_node_settings,
 )
+from reactorwatch.cli.kernels import compile_at_first_start
 from reactorwatch.cli.options import BusOptions
 from reactorwatch.cli.plant_settings import PlayedRecord, load_source
 from reactorwatch.cli.processes import Processes, write_settings
@@ -30,8 +31,7 @@ from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
 from reactorwatch.limits import limits
-from reactorwatch.records.folder import make_folder
-from reactorwatch.records.output import check_folder_name
+from reactorwatch.records.write import check_folder_name, make_folder
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import stop_on_signals
 from reactorwatch.runtime.logs import configure
@@ -91,6 +91,7 @@ def run_until_stopped(
     metrics = section(MetricsConfig, "metrics", tables, {})
     if Path(recorder.out).suffix != ENDING:
         check_folder_name(Path(recorder.out), "--out")
+    compile_at_first_start()
     with open_router(site, join) as bus:  # before anything is written, in case the address is taken
         tables_written = {source.node: source.settings, "monitor": monitor, "diagnosis": diagnosis, "metrics": metrics}
         nodes = ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", source.node)

@@ -22,7 +22,7 @@ from .conftest import PATIENCE_S, Command, Start, WaitAlive
 
 COMMANDS = (
     *("up", "demo", "view", "alarm"),
-    *("plant", "monitor", "record", "replay", "alive", "certify", "router", "doctor", "status"),
+    *("plant", "monitor", "record", "replay", "certify", "router", "doctor", "status"),
     *("dashboard", "import", "export", "recover", "info", "cut"),
     *("simulate", "backtest", "diagnose", "identify", "linearise", "charts"),
 )
@@ -212,9 +212,15 @@ def test_the_plant_obeys_commands_on_the_bus(bus: ZenohBus, endpoint: str, start
 
 
 def test_a_node_that_is_not_there_is_not_alive(bus: ZenohBus, endpoint: str, called: Command) -> None:
-    done = called("alive", "monitor", "--endpoint", endpoint, "--timeout", "1")
-    assert done.returncode == 1
-    assert "not there" in done.stdout
+    nothing = called("status", "--check", "--endpoint", endpoint, "--timeout", "1")
+    assert (nothing.returncode, nothing.stdout.count("not there")) == (1, 3)
+    bus.declare_token(keys.key("cstr", keys.ALIVE, "monitor"))
+    there = called("status", "--check", "monitor", "--endpoint", endpoint)
+    assert (there.returncode, there.stdout) == (0, "monitor is alive\n")
+    bus.undeclare_token(keys.key("cstr", keys.ALIVE, "monitor"))
+    gone = called("status", "--check", "monitor", "--endpoint", endpoint, "--timeout", "1", "--json")
+    assert gone.returncode == 1
+    assert json.loads(gone.stdout) == {"plant": "cstr", "nodes": [{"node": "monitor", "alive": False}]}
 
 
 def test_simulate_and_backtest_speak_json_to_machines(called: Command, record_csv: Path, tmp_path: Path) -> None:

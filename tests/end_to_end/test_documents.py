@@ -25,7 +25,7 @@ DECISIONS = sorted((ROOT / "docs" / "decisions").glob("*.md"))
 DOCUMENTS = [*PAGES, ROOT / "CHANGELOG.md", ROOT / "tests" / "README.md", *DECISIONS]
 JOINS_THE_BUS = (
     *("up", "demo", "plant", "monitor", "record", "replay", "router"),
-    *("view", "alive", "doctor", "status", "alarm"),
+    *("view", "doctor", "status", "alarm"),
 )
 """Commands that run as processes on the page's machine; others are called within this process, which is faster."""
 
@@ -46,7 +46,7 @@ NOT_HERE = {
         (
             "systemd-run --wait --uid=reactorwatch -p CacheDirectory=reactorwatch"
             " -E NUMBA_CACHE_DIR=/var/cache/reactorwatch -E XDG_CACHE_HOME=/var/cache"
-            " /opt/reactorwatch/bin/reactorwatch compile",
+            " /opt/reactorwatch/bin/python -m reactorwatch.codegen",
             ROOT_ONLY,
         ),
         ("systemctl enable --now reactorwatch-router reactorwatch@monitor reactorwatch@record", ROOT_ONLY),

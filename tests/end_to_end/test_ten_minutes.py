@@ -68,7 +68,7 @@ def test_from_a_clean_clone_to_a_named_cause_in_a_reader_s_own_file(
     header = (clone / block.clauses["given"]).read_text(encoding="utf-8").split("\n", 1)[0]
     assert header != "time_min,qc,C,T", "the columns have the reader's names"
     set_up, alarms, cause = (run(clone, command) for command in block.commands)
-    assert "reactorwatch compile" in set_up
+    assert "python -m reactorwatch.codegen" in set_up
     assert "Detected since 120 min: 15 % of the coolant lost (" in alarms
     assert "coolant leak" in cause
     assert (clone / "report" / "report.html").is_file()

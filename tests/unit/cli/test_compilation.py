@@ -1,4 +1,4 @@
-"""After `reactorwatch compile` no monitor and no diagnosis compiles a kernel: each is loaded from the disk."""
+"""After `python -m reactorwatch.codegen` no monitor and no diagnosis compiles a kernel: each is on the disk."""
 
 import os
 import signal
@@ -33,7 +33,7 @@ def register(*function, **options):
 numba.njit = register
 from monitor_node.config import MonitorConfig
 from monitor_node.causes.stage import preparation
-from reactorwatch.cli import compilation
+from reactorwatch.cli import kernels
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.codegen.cache import CodeCache
 
@@ -42,8 +42,8 @@ CodeCache._store = lambda self, path, code: made.append(path.name)
 parts = sum(1 for _ in preparation(MonitorConfig(), cstr()))
 CodeCache._store = keep
 print(parts, len(made))
-compilation.FAULT = "feed_temperature:step:3@40min"
-compilation.compile_kernels()
+kernels.FAULT = "feed_temperature:step:3@40min"
+kernels.compile_kernels()
 print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))
 print([kernel.__name__ for kernel in kernels if kernel.stats.cache_misses])
 """
@@ -51,7 +51,7 @@ print([kernel.__name__ for kernel in kernels if kernel.stats.cache_misses])
 
 @pytest.mark.slow
 def test_another_record_finds_every_kernel_compiled() -> None:
-    command = [sys.executable, "-m", "reactorwatch", "compile"]
+    command = [sys.executable, "-m", "reactorwatch.codegen"]
     subprocess.run(command, check=True, capture_output=True)
     run = subprocess.run([sys.executable, "-c", PROGRAM], check=True, capture_output=True, text=True)
     prepared, hits, missed = run.stdout.splitlines()
@@ -61,17 +61,18 @@ def test_another_record_finds_every_kernel_compiled() -> None:
     assert missed == "[]"
 
 
-@pytest.mark.parametrize("command", [["compile"], ["diagnose", "record.csv"]], ids=lambda command: command[0])
+@pytest.mark.parametrize(
+    "command", [["reactorwatch.codegen"], ["reactorwatch", "diagnose", "record.csv"]], ids=lambda command: command[0]
+)
 def test_ctrl_c_while_kernels_are_compiled_ends_the_command_in_order(command: list[str], tmp_path: Path) -> None:
     """On a new machine; the interrupt comes when the first kernel is stored, while the next one is compiled."""
-    reactorwatch = [sys.executable, "-m", "reactorwatch"]
-    subprocess.run(
-        [*reactorwatch, "example", "leak", "-o", "record.csv"], cwd=tmp_path, check=True, capture_output=True
-    )
+    python = [sys.executable, "-m"]
+    example = [*python, "reactorwatch", "example", "leak", "-o", "record.csv"]
+    subprocess.run(example, cwd=tmp_path, check=True, capture_output=True)
     cache = tmp_path / "cache"
     fresh = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "XDG_CACHE_HOME": str(cache)}
     process = subprocess.Popen(
-        [*reactorwatch, *command], cwd=tmp_path, env=fresh, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*python, *command], cwd=tmp_path, env=fresh, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     while not any(cache.rglob("*.nbc")):
         with suppress(subprocess.TimeoutExpired):

@@ -21,11 +21,11 @@ from reactorwatch.cli.files import _report_text
 from reactorwatch.cli.progress import _escape_markup
 from reactorwatch.diagnosis.report import mathml, svg
 from reactorwatch.errors import InputError
-from reactorwatch.records.cells import quote_formula, unquote_formula
-from reactorwatch.records.layout import bare_name
-from reactorwatch.records.read_table import read_table
+from reactorwatch.records.decode import quote_formula, unquote_formula
+from reactorwatch.records.read import read_table
 from reactorwatch.records.record import Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.table import bare_name
+from reactorwatch.records.write import write_table
 from reactorwatch.terminal import printable
 
 FORMULAS = [
