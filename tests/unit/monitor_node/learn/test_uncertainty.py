@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
+from benchmarks.harness.plants import INPUTS, KINDS, Kind, simulate
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.learn.process_reference import ProcessMemory, ProcessReference
