@@ -51,7 +51,7 @@ from benchmarks.harness.bank import (
 )
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Suspect
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import start_state

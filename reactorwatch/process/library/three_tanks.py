@@ -16,11 +16,15 @@ h / (h^2 + s^2)^(1/4), as a slow flow through a hole does (Modelica.Fluid, `regR
 """
 
 from functools import cache
+from typing import ClassVar
 
 import casadi as ca
 
+from reactorwatch.process.effect import Effect, ParameterEffect
 from reactorwatch.process.model import Output, Place, ProcessModel, new_clock, parameter, variable
+from reactorwatch.process.operation import Controller, Example, InputLevels, Operation
 from reactorwatch.process.places import FACTOR, SENSOR, SOURCE
+from reactorwatch.process.signal_effects import InputOffset, OutputBias
 
 SMALL_LEVEL_CM = 0.01
 """Difference of levels below which the root becomes a straight line; at 1 cm that changes it by 3 in 100,000."""
@@ -102,3 +106,89 @@ def leak_name(tank: int) -> str:
 def signed_root(head: ca.SX) -> ca.SX:
     """Root of a difference of levels with its sign, and a straight line where it is nearly zero."""
     return head / ca.sqrt(ca.sqrt(head**2 + SMALL_LEVEL_CM**2))
+
+
+class Leak(Effect):
+    """A tank loses m s sqrt(2 g h) through a hole: m is the share of a pipe's cross-section that is open."""
+
+    unit = "1"
+    lower = 0.0
+    upper = 5.0
+    typical = 0.05
+    tank: ClassVar[int]
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`."""
+        return model.add_rate(f"h{self.tank}", size * model.term(leak_name(self.tank)))
+
+
+# fmt: off
+EFFECTS: tuple[Effect, ...] = (
+    *(
+        InputOffset(name=f"pump{i}", label=f"wrong flow of pump {i}", location=f"pump{i}", input=f"Q{i}", unit="cm3/s",
+                    larger=f"{{}} cm3/s more from pump {i}", smaller=f"{{}} cm3/s less from pump {i}",
+                    lower=-150.0, upper=150.0, typical=1.0)
+        for i in (1, 2)
+    ),
+    *(
+        OutputBias(name=f"h{i}.bias", label=f"bias of the level sensor of tank {i}", location=f"h{i}", output=f"h{i}",
+                   larger=f"level sensor of tank {i} shows {{}} cm too much",
+                   smaller=f"level sensor of tank {i} shows {{}} cm too little",
+                   unit="cm", lower=-62.0, upper=62.0, typical=1.0,
+                   labels={"ramp": f"drift of the level sensor of tank {i}"})
+        for i in (1, 2, 3)
+    ),
+    *(
+        Leak(name=f"leak{i}", label=f"leak of tank {i}", location=f"tank{i}", tank=i,
+             larger=f"tank {i} leaks through {{}} % of a pipe's cross-section")
+        for i in (1, 2, 3)
+    ),
+    *(
+        ParameterEffect(name=f"clog{pipe}", label=f"clogging of the {text}", location=f"pipe{pipe}",
+                        parameter=coefficient, is_loss=True, larger=f"{{}} % of the {text} clogged",
+                        lower=0.0, upper=0.99, typical=0.05)
+        for pipe, coefficient, text in (
+            (13, "a1", "pipe from tank 1 to tank 3"),
+            (20, "a2", "outlet of tank 2"),
+            (32, "a3", "pipe from tank 3 to tank 2"),
+        )
+    ),
+)
+# fmt: on
+"""Pumps, sensors, tanks, pipes."""
+
+SET_POINTS_CM = {"h1": 40.0, "h2": 20.0}
+BASE_FLOWS_CM3_S = {"Q1": 31.86, "Q2": 27.56}
+
+OPERATION = Operation(
+    inputs={
+        pump: InputLevels(level=flow, low=flow - 8.0, high=flow + 8.0, swing=4.0, hold_min=2.0)
+        for pump, flow in BASE_FLOWS_CM3_S.items()
+    },
+    noise_sd={"h1": 0.05, "h2": 0.05, "h3": 0.05},
+    fault="leak1:step:0.05",
+    examples={
+        "three_tanks": Example(
+            "the pipe between tanks 1 and 3 is clogged by 20 % from minute 150 on", ("clog13:step:0.2@150min",)
+        )
+    },
+    controllers=tuple(
+        Controller(
+            input=pump,
+            output=level,
+            set_point=SET_POINTS_CM[level],
+            gain=-5.0,
+            base=BASE_FLOWS_CM3_S[pump],
+            integral_time_min=2.0,
+            dither=True,
+        )
+        for pump, level in zip(BASE_FLOWS_CM3_S, SET_POINTS_CM, strict=True)
+    ),
+)
+"""Operation in closed loop: each pump holds the level of its tank.
+
+With a gain of 5 cm3/s a cm a tank of 154 cm2 follows its set point with a time constant of half a minute; with rows
+0.1 min apart the loop is far from its limit of stability (51 cm3/s a cm). The integral action makes a fault visible in
+the pumps rather than in the levels. Base flows are those of the steady state at the set points. Dither moves the pumps
+about them, so that a record in closed loop informs about the plant.
+"""
