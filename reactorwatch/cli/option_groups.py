@@ -26,6 +26,9 @@ class TableOptions:
     time_format: Annotated[
         str | None, Option(help="Format of timestamps, such as '%d.%m.%Y %H:%M:%S' [by their form].")
     ] = None
+    sheet: Annotated[
+        str | None, Option(help="The sheet of a workbook, by its name or number [the first with a table].")
+    ] = None
     dates: Annotated[
         str | None, Option(help="Order in dates such as 03/04/2026, month-first or day-first [by all rows].")
     ] = None
@@ -50,9 +53,6 @@ class TableOptions:
         str | None, Option(help="The column of tags of a table with a row for each value; none: wide [by its rows].")
     ] = None
     value: Annotated[str | None, Option(help="The column of values of such a table [by its name and content].")] = None
-    sheet: Annotated[
-        str | None, Option(help="The sheet of a workbook, by its name or number [the first with a table].")
-    ] = None
     quality_good: Annotated[
         list[str] | None,
         Option(help="Qualities of usable values, such as 'Good,192', or '*' (repeatable) [words and codes of OPC]."),
