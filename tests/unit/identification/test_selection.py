@@ -18,7 +18,7 @@ ARX = {"arx": LINEAR_FITS["arx"]}
 
 
 def test_with_measurement_noise_the_output_error_model_of_the_plants_order_is_chosen(noisy_plant: NoisyPlant) -> None:
-    """Noise makes up for order in ARX models; OE of order 2 is the plant, and order 3 gains less than half a percent."""
+    """Noise makes up for order in ARX models; OE of order 2 is the plant, and order 3 gains under half a percent."""
     selection = select(noisy_plant.inputs, noisy_plant.measured)
     assert (selection.chosen.family, selection.chosen.order) == ("oe", 2)
     assert [(c.family, c.order) for c in selection.candidates] == [(f, n) for f in ("arx", "oe") for n in (1, 2, 3)]
