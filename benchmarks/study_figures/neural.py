@@ -56,7 +56,8 @@ class NeuralModel:
         u = scaling.inputs(as_columns(inputs, "inputs", structure.inputs))
         y = scaling.outputs(as_columns(outputs, "outputs", 1))
         plan = plan_run(structure, u, y, time)
-        theta = scaling.scale_parameters(structure, self.linear.parameters)
+        matrix, shift = scaling.unscaling(structure)
+        theta = np.linalg.solve(matrix, self.linear.parameters - shift)
         weights, constant = (theta[:-1], theta[-1]) if structure.offset else (theta, 0.0)
         spread = scaling.output_spreads[0]
         own, run = y[:, 0].copy(), np.full(y.shape, np.nan)

@@ -22,7 +22,7 @@ from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorLinearization
 from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.model import ProcessModel
 from tests.unit.kalman.plant import SENSORS, record_of
 
