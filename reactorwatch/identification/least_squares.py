@@ -10,9 +10,8 @@ that the function does not admit, such as a model with a pole on or outside the 
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,21 +82,18 @@ def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
     return LeastSquares(theta[:, 0], inverse_factor @ inverse_factor.T, variance, condition, rows)
 
 
-class Objective(Protocol):
-    """Errors of one record as a function of the parameters."""
-
-    def __call__(self, theta: Array) -> tuple[Array, Array]:
-        """Errors, shape (compared rows,), and the gradient of the prediction, shape (compared rows, parameters)."""
-
-    def admits(self, theta: Array) -> bool:
-        """True if a model with these parameters is usable."""
+Objective = Callable[[Array], tuple[Array, Array] | None]
+"""Errors of a record as a function of the parameters, shape (compared rows,), and the gradient of the prediction, shape
+(compared rows, parameters); None where a model with these parameters is not usable."""
 
 
 def descend(objective: Objective, start: Array, iterations: int = ITERATIONS) -> tuple[Array, float]:
-    """Minimise from a start that the objective admits; returns the parameters and their sum of squares."""
+    """Minimise from a start; returns the parameters and their sum of squares, inf where the start is not usable."""
     size = start.size
-    theta, damping = start, 1e-3
-    errors, gradient = objective(theta)
+    theta, damping, evaluated = start, 1e-3, objective(start)
+    if evaluated is None:
+        return start, math.inf
+    errors, gradient = evaluated
     squares = float(errors @ errors)
     for _ in range(iterations):
         factor = _triangle(np.ascontiguousarray(np.concatenate([gradient, errors[:, None]], axis=1).T))[:size]
@@ -108,14 +104,13 @@ def descend(objective: Objective, start: Array, iterations: int = ITERATIONS) ->
             stacked = np.concatenate([factor[:, :size] / scales, math.sqrt(damping) * np.eye(size)])
             step = np.linalg.lstsq(stacked, np.concatenate([factor[:, size], np.zeros(size)]))[0] / scales
             candidate = theta + step
-            if objective.admits(candidate):
-                new_errors, new_gradient = objective(candidate)
-                new_squares = float(new_errors @ new_errors)
-                if new_squares <= squares:
-                    gain = squares - new_squares
-                    theta, errors, gradient, squares = candidate, new_errors, new_gradient, new_squares
-                    damping = max(0.1 * damping, 1e-12)
-                    break
+            evaluated = objective(candidate)
+            new_squares = math.inf if evaluated is None else float(evaluated[0] @ evaluated[0])
+            if evaluated is not None and new_squares <= squares:
+                gain = squares - new_squares
+                theta, (errors, gradient), squares = candidate, evaluated, new_squares
+                damping = max(0.1 * damping, 1e-12)
+                break
             damping *= 10.0
         if not 1e-12 * squares < gain < math.inf:
             break
@@ -133,7 +128,10 @@ def solution_at(objective: Objective, theta: Array) -> LeastSquares:
     Raises:
         InputError: the rows don't determine the parameters.
     """
-    errors, gradient = objective(theta)
+    evaluated = objective(theta)
+    if evaluated is None:
+        raise UnfitRecordError("no stable model was found to start the search from; try a lower order or other rows")
+    errors, gradient = evaluated
     linear = least_squares(gradient, errors)
     free = errors.size - theta.size
     variance = float(errors @ errors) / free if free > 0 else math.inf

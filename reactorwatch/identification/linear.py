@@ -118,7 +118,7 @@ def _minimise(kind: Kind, record: ScaledRecord, iterations: int = ITERATIONS) ->
     if kind == "bj":
         best = best_descent(_errors("armax", record), starts, ROUGH_ITERATIONS)
         v = np.full(record.y.shape, np.nan)
-        v[simulation.compared, 0] = simulation(plant)[0]
+        v[simulation.compared] = record.y[simulation.compared] - simulation.predict(plant)[0][simulation.compared, None]
         alone = replace(record, structure=Structure(lags, lags, inputs=0), u=np.empty((len(v), 0)), y=v)
         noise, _ = _minimise("armax", alone)
         starts = [

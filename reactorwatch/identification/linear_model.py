@@ -191,16 +191,14 @@ class PredictionErrors:
             gradient[:, i] += full[1][:, column]
         return full[0], gradient
 
-    def __call__(self, theta: Array) -> tuple[Array, Array]:
-        """Errors, shape (compared rows,), and the gradient of the prediction, shape (compared rows, parameters)."""
-        predicted, gradient = self.predict(theta)
-        return (self._outputs - predicted)[self.compared], gradient[self.compared]
-
-    def admits(self, theta: Array) -> bool:
-        """True if all poles and the zeros of the disturbance are inside the unit circle."""
+    def __call__(self, theta: Array) -> tuple[Array, Array] | None:
+        """Errors and gradient; None unless all poles and the zeros of the disturbance are inside the unit circle."""
         full, plant = theta[self._index], self._plant
         d, c = full[plant : plant + self._noise_lags], full[plant + self._noise_lags :]
-        return all(bool(is_stable(np.ascontiguousarray(part))) for part in (full[: self._lags], d, -c))
+        if not all(is_stable(np.ascontiguousarray(part)) for part in (full[: self._lags], d, -c)):
+            return None
+        predicted, gradient = self.predict(theta)
+        return (self._outputs - predicted)[self.compared], gradient[self.compared]
 
 
 def simulate(

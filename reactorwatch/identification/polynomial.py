@@ -226,14 +226,11 @@ class _SimulationErrors:
         signals = record.structure.orders, record.u, record.y[:, 0], record.plan.arrays
         return run_polynomial(theta, self._factors, *signals, True)
 
-    def __call__(self, theta: Array) -> tuple[Array, Array]:
-        """Errors, shape (compared rows,), and the gradient, shape (compared rows, terms)."""
+    def __call__(self, theta: Array) -> tuple[Array, Array] | None:
+        """Errors and gradient; None if the simulation diverges."""
         run, gradient = self.run(theta)
-        return (self._record.y[:, 0] - run)[self._rows], gradient[self._rows]
-
-    def admits(self, theta: Array) -> bool:
-        """True if the simulation does not diverge."""
-        return bool(np.all(np.isfinite(self.run(theta)[0][self._rows])))
+        errors = (self._record.y[:, 0] - run)[self._rows]
+        return (errors, gradient[self._rows]) if np.all(np.isfinite(errors)) else None
 
 
 def fit_noe(
@@ -271,7 +268,7 @@ def fit_noe(
 
     linear = tuple(product for product in candidates if len(product) < 2)
     arx = least_squares(np.column_stack([np.ones(rows.position.size), rows.regressors]), rows.outputs).parameters
-    start = arx if errors_of(linear).admits(arx) else np.zeros(len(linear))
+    start = np.zeros(len(linear)) if errors_of(linear)(arx) is None else arx
     best = grown = linear, descend(errors_of(linear), start)[0]
     smallest = held_out_error(*grown)
     while len(grown[0]) < min(24, len(candidates)):
@@ -298,7 +295,10 @@ def _grow(
 ) -> tuple[tuple[Product, ...], Array] | None:
     """Add the candidate that lowers the simulation error most; None if none can be fitted."""
     rest = tuple(product for product in candidates if product not in products)
-    errors, gradient = errors_of((*products, *rest))(np.concatenate([theta, np.zeros(len(rest))]))
+    evaluated = errors_of((*products, *rest))(np.concatenate([theta, np.zeros(len(rest))]))
+    if evaluated is None:
+        return None
+    errors, gradient = evaluated
     own, new = gradient[:, : theta.size], gradient[:, theta.size :]
     base, _ = np.linalg.qr(own)
     left, open_error = new - base @ (base.T @ new), errors - base @ (base.T @ errors)

@@ -35,11 +35,7 @@ def test_arx_33_has_seven_parameters_and_reaches_back_three_rows() -> None:
     assert structure.history == 3
     assert structure.parameter_names() == ("a1", "a2", "a3", "b1", "b2", "b3", "c")
     assert Structure(1, 2, delay=4).history == 5
-
-
-def test_names_of_several_signals_have_their_number() -> None:
-    structure = Structure(1, 1, inputs=2, offset=False)
-    assert structure.parameter_names() == ("a1", "b1_1", "b1_2")
+    assert Structure(1, 1, inputs=2, offset=False).parameter_names() == ("a1", "b1_1", "b1_2")
 
 
 def test_undoing_the_scaling_gives_the_same_predictions() -> None:
