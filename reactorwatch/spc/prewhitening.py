@@ -239,18 +239,13 @@ def _expected_value(numbers: Any) -> float:
 
 
 @jit
-def _innovation(numbers: Any, z: float) -> float:
-    return innovation(numbers[0], z)
-
-
-@jit
 def _innovations(numbers: Any, z: Array) -> int:
     for i in range(z.size):
         z[i] = innovation(numbers[i], z[i])
     return int(z.size)
 
 
-_EXPECTED_VALUE, _INNOVATION, _INNOVATIONS = Entry(_expected_value), Entry(_innovation), Entry(_innovations)
+_EXPECTED_VALUE, _INNOVATIONS = Entry(_expected_value), Entry(_innovations)
 
 
 def innovations(numbers: NDArray[np.void], z: Sequence[float]) -> list[float]:
@@ -323,8 +318,7 @@ class Prewhitener:
         Args:
             z: the next value; NaN if it is missing.
         """
-        value: float = _INNOVATION.call(self.numbers, z)
-        return value
+        return innovations(self.numbers, [z])[0]
 
     def reject_last(self) -> None:
         """Treat the last value as an outlier: replace it by its prediction."""

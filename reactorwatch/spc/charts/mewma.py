@@ -74,7 +74,7 @@ def move(numbers: Array, x: Array, weight: float) -> float:
     """Take x into the average, in white coordinates; returns the statistic, -1 if x cannot be taken.
 
     Args:
-        numbers: numbers of the chart, see `Mewma.numbers`.
+        numbers: numbers of the chart, see `MewmaMemory`.
         x: shape (p,).
         weight: lambda.
     """
@@ -146,19 +146,11 @@ class Mewma(JointChart):
         self.memory, self.weight, numbers = memory, memory.weight, memory.numbers
         if not np.all(np.isfinite(numbers)):
             raise ValueError(f"numbers of the chart must be finite, got {numbers.tolist()}")
-        p = signals_of(numbers)
-        self.limit, mean, self._average = (
-            positive("limit", float(numbers[0])),
-            numbers[1 : 1 + p],
-            numbers[1 + p : 1 + 2 * p],
-        )
-        self.whitening = Whitening(mean, numbers[1 + 2 * p + p * p :].reshape(p, p))
-
-    @property
-    def numbers(self) -> Array:
-        """Numbers of the chart, see `MewmaMemory`."""
-        numbers: Array = self.memory.numbers
-        return numbers
+        p = round(0.5 * (sqrt(2.0 * numbers.size - 1.0) - 1.0)) if numbers.size else 0
+        if p < 1 or count_numbers(p) != numbers.size:
+            raise ValueError(f"there must be as many numbers as a chart has, got {numbers.size}")
+        self.limit, self._average = positive("limit", float(numbers[0])), numbers[1 + p : 1 + 2 * p]
+        self.whitening = Whitening(numbers[1 : 1 + p], numbers[1 + 2 * p + p * p :].reshape(p, p))
 
     @classmethod
     def fastest(cls, arl0: float, shift: float, dimension: int, rules: tuple[int, ...]) -> Design:
@@ -220,18 +212,6 @@ class Mewma(JointChart):
 def count_numbers(signals: int) -> int:
     """Count of a chart's numbers."""
     return 1 + 2 * signals + 2 * signals * signals
-
-
-def signals_of(numbers: Array) -> int:
-    """Number of signals of a chart with given numbers.
-
-    Raises:
-        ValueError: no chart has so many.
-    """
-    found = next((p for p in range(1, numbers.size) if count_numbers(p) == numbers.size), None)
-    if found is None:
-        raise ValueError(f"there must be as many numbers as a chart has, got {numbers.size}")
-    return found
 
 
 @cache

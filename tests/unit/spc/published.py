@@ -22,7 +22,7 @@ CUSUM = {
     (5.0, 0.0): dict(zip(_SHIFTS, (465.444, 139.494, 37.996, 17.048, 10.376, 5.75, 4.01, 2.57, 2.01), strict=True)),
     (4.774, 0.0): {0.0: 370.06},
 }
-ONE_SIDED_CUSUM = {4.0: 335.37, 5.0: 930.89}
+HIGH_SUM = {4.0: 335.37, 5.0: 930.89}
 
 # Lucas & Saccucci (1990), Technometrics 32(1), table 3; the last from the SAS/QC manual (1999). Lambda and L; by shift.
 EWMA = {

@@ -1,10 +1,14 @@
 """Run lengths, against published ones and against independent methods."""
 
+from collections.abc import Callable
+from functools import partial
 from math import floor, log10
+from typing import Any
 
 import numpy as np
 import pytest
-from scipy import integrate, special, stats
+from scipy import integrate, sparse, special, stats
+from scipy.sparse import linalg as sparse_linalg
 
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.cusum import cusum_run_length
@@ -13,43 +17,51 @@ from reactorwatch.spc.charts.mewma import mewma_run_length
 from reactorwatch.spc.charts.shewhart import Shewhart, shewhart_run_length
 from reactorwatch.spc.charts.t2 import t2_run_length
 from tests.unit.spc import published
-from tests.unit.spc.lattice import Lattice
-from tests.unit.spc.members import Plants
+from tests.unit.spc.members import Array, Plants
 from tests.unit.spc.published import flat
+from tests.unit.spc.tables import BEGIN, END, PAGE, table
 
 UNIVARIATE, MULTIVARIATE = 0.005, 0.02
 
 
-@pytest.mark.parametrize(("rules", "shift", "length"), flat(published.RUN_RULES))
-def test_run_rules(rules: tuple[int, ...], shift: float, length: float) -> None:
-    """Exact: to the last digit that Champ & Woodall print."""
-    assert shewhart_run_length(shift, rules=rules) == pytest.approx(length, abs=0.00501)
+def to_three_digits(length: float) -> float:
+    """0.5 %, and what a number of three digits leaves open."""
+    return UNIVARIATE * length + 0.5 * 10.0 ** (floor(log10(length)) - 2)
 
 
-@pytest.mark.parametrize(("chart", "shift", "length"), flat(published.CUSUM))
-def test_two_sided_cusum(chart: tuple[float, float], shift: float, length: float) -> None:
-    h, head_start = chart
-    assert cusum_run_length(shift, 0.5, h, head_start) == pytest.approx(length, rel=UNIVARIATE)
+TABLES: list[tuple[str, Callable[[Any, float], float], dict[Any, dict[float, float]], Callable[[float], float]]] = [
+    # Exact: to the last digit that Champ & Woodall print.
+    ("run rules", lambda rules, d: shewhart_run_length(d, rules=rules), published.RUN_RULES, lambda _: 0.00501),
+    ("cusum", lambda chart, d: cusum_run_length(d, 0.5, *chart), published.CUSUM, lambda n: UNIVARIATE * n),
+    ("high sum", lambda d, h: cusum_run_length(d, 0.5, h, one_sided=True), {0.0: published.HIGH_SUM}, lambda _: 0.006),
+    ("ewma", lambda chart, d: ewma_run_length(d, *chart), published.EWMA, lambda n: UNIVARIATE * n),
+    ("mewma", lambda chart, d: mewma_run_length(d, *chart), published.MEWMA, lambda n: MULTIVARIATE * n),
+    ("t2", lambda chart, d: t2_run_length(d, *chart), published.T2, lambda _: 0.005),
+    (
+        "steady cusum",
+        lambda chart, d: cusum_run_length(d, *chart, steady_state=True),
+        {(0.5, 4.0): published.STEADY_CUSUM},
+        to_three_digits,
+    ),
+    ("steady ewma", lambda c, d: ewma_run_length(d, *c, steady_state=True), published.STEADY_EWMA, to_three_digits),
+    # By simulation, with one decimal.
+    (
+        "exact limits",
+        lambda chart, d: ewma_run_length(d, *chart, exact_limits=True),
+        {(0.03, 2.437): published.EXACT_LIMITS_EWMA},
+        lambda _: 0.07,
+    ),
+]
+PUBLISHED = [
+    pytest.param(partial(computed, chart, d), length, tolerance(length), id=f"{name} {chart}, {d:g}")
+    for name, computed, table_, tolerance in TABLES
+    for chart, d, length in flat(table_)
+]
 
 
-@pytest.mark.parametrize(("h", "length"), published.ONE_SIDED_CUSUM.items())
-def test_one_sided_cusum(h: float, length: float) -> None:
-    assert cusum_run_length(0.0, 0.5, h, one_sided=True) == pytest.approx(length, abs=0.006)
-
-
-@pytest.mark.parametrize(("chart", "shift", "length"), flat(published.EWMA))
-def test_ewma(chart: tuple[float, float], shift: float, length: float) -> None:
-    assert ewma_run_length(shift, *chart) == pytest.approx(length, rel=UNIVARIATE)
-
-
-@pytest.mark.parametrize(("chart", "shift", "length"), flat(published.MEWMA))
-def test_mewma(chart: tuple[int, float, float], shift: float, length: float) -> None:
-    assert mewma_run_length(shift, *chart) == pytest.approx(length, rel=MULTIVARIATE)
-
-
-@pytest.mark.parametrize(("chart", "shift", "length"), flat(published.T2))
-def test_t2(chart: tuple[int, float], shift: float, length: float) -> None:
-    assert t2_run_length(shift, *chart) == pytest.approx(length, abs=0.005)
+@pytest.mark.parametrize(("computed", "length", "tolerance"), PUBLISHED)
+def test_run_lengths_are_those_published(computed: Callable[[], float], length: float, tolerance: float) -> None:
+    assert computed() == pytest.approx(length, abs=tolerance)
 
 
 @pytest.mark.parametrize(("dimension", "length", "limit"), flat(published.T2_LIMITS))
@@ -58,27 +70,9 @@ def test_t2_limits(dimension: int, length: float, limit: float) -> None:
     assert t2_run_length(0.0, dimension, limit) == pytest.approx(length, rel=5e-4)
 
 
-def to_three_digits(length: float) -> float:
-    """0.5 %, and what a number of three digits leaves open."""
-    return UNIVARIATE * length + 0.5 * 10.0 ** (floor(log10(length)) - 2)
-
-
-@pytest.mark.parametrize(("shift", "length"), published.STEADY_CUSUM.items())
-def test_steady_state_of_the_cusum(shift: float, length: float) -> None:
-    computed = cusum_run_length(shift, 0.5, 4.0, steady_state=True)
-    assert computed == pytest.approx(length, abs=to_three_digits(length))
-
-
-@pytest.mark.parametrize(("chart", "shift", "length"), flat(published.STEADY_EWMA))
-def test_steady_state_of_the_ewma(chart: tuple[float, float], shift: float, length: float) -> None:
-    computed = ewma_run_length(shift, *chart, steady_state=True)
-    assert computed == pytest.approx(length, abs=to_three_digits(length))
-
-
-@pytest.mark.parametrize(("shift", "length"), published.EXACT_LIMITS_EWMA.items())
-def test_ewma_with_exact_limits(shift: float, length: float) -> None:
-    """Numbers by simulation, with one decimal."""
-    assert ewma_run_length(shift, 0.03, 2.437, exact_limits=True) == pytest.approx(length, abs=0.07)
+def test_the_table_of_the_page_is_the_one_computed() -> None:
+    """If not: `python -m tests.unit.spc.tables` writes it anew."""
+    assert PAGE.read_text().split(BEGIN)[1].split(END)[0] == table()
 
 
 @pytest.mark.parametrize(
@@ -96,6 +90,65 @@ def test_the_published_start_of_the_ewma_is_off(weight: float, limit: float, shi
     error = 4.0 * lengths.std() / np.sqrt(plants)
     assert abs(lengths.mean() - ewma_run_length(shift, weight, limit, exact_limits=True)) < error
     assert abs(lengths.mean() - printed) > error + 0.05
+
+
+class Lattice:
+    """States and transitions of a two-sided CUSUM: an independent solver for how the sides combine.
+
+    Values are rounded to multiples of a step that divides k, so both sums stay on the lattice and every state that can
+    be reached is known exactly. The limit lies midway between two points of it. Then the error is of the order of
+    step^2, and a third of the step, for which the same limit is midway too, tells where both lead (Richardson).
+
+    Args:
+        k: allowance.
+        points: of the lattice in (0, h): h = (points + 1/2) k / steps.
+        steps: in k.
+        start: where both sums start.
+    """
+
+    def __init__(self, k: float, points: int, steps: int, start: float = 0.0) -> None:
+        self.step = k / steps
+        self.limit = points
+        first = (round(start / self.step),) * 2
+        self.number = {first: 0}
+        todo = [first]
+        self.moves: list[tuple[int, int, int]] = []
+        reach = range(-2 * self.limit - 2 * steps, 2 * self.limit + 2 * steps + 1)
+        while todo:
+            state = todo.pop()
+            for move in reach:
+                target = (max(0, state[0] + move - steps), max(0, state[1] - move - steps))
+                if max(target) > self.limit:
+                    continue
+                if target not in self.number:
+                    self.number[target] = len(self.number)
+                    todo.append(target)
+                self.moves.append((self.number[state], self.number[target], move))
+
+    def transitions(self, shift: float) -> sparse.csc_array:
+        """K for a shift."""
+        source, target, move = np.array(self.moves).T
+        share = special.ndtr((move + 0.5) * self.step - shift) - special.ndtr((move - 0.5) * self.step - shift)
+        size = len(self.number)
+        return sparse.csc_array((share, (source, target)), shape=(size, size))
+
+    def zero_state(self, shift: float) -> float:
+        """The run length from the start."""
+        return float(self._lengths(shift)[0])
+
+    def steady_state(self, shift: float) -> float:
+        """The run length after long without a signal."""
+        in_control = self.transitions(0.0)
+        solver = sparse_linalg.splu((sparse.eye_array(in_control.shape[0]) - in_control).T.tocsc())
+        share = np.ones(in_control.shape[0]) / in_control.shape[0]
+        for _ in range(30):
+            share = solver.solve(share)
+            share /= share.sum()
+        return float(share @ self._lengths(shift))
+
+    def _lengths(self, shift: float) -> Array:
+        K = self.transitions(shift)
+        return np.asarray(sparse_linalg.spsolve((sparse.eye_array(K.shape[0]) - K).tocsc(), np.ones(K.shape[0])))
 
 
 @pytest.mark.parametrize("start", [0.0, 1.5])
