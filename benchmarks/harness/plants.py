@@ -1,7 +1,7 @@
-"""Sound plants: the reactor, a little different from its model since ever, under three kinds of input.
+"""Simulated plants: the reactor, a little different from its model since ever, and sound records of it.
 
-The equations are written out in NumPy and integrated by the classical Runge-Kutta method with fixed steps, for all
-plants of a kind alike.
+The equations of the differing plants are written out in NumPy and integrated by the classical Runge-Kutta method with
+fixed steps, for all plants of a kind alike; the other records are by the product's simulator.
 """
 
 from collections.abc import Callable
@@ -9,8 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from monitor_node.config import MonitorConfig, ReferenceName
 from reactorwatch.arrays import Array
+from reactorwatch.contract.codec import Encoded, encode
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.simulate import Simulator
+from reactorwatch.process.steady_state import start_state
 from reactorwatch.records.record import Record
+from recorder.tools.player import samples_of
 
 PERIOD_MIN, SPAN_MIN = 0.1, 750.0
 NOISE = {"C": 0.002, "T": 0.3}
@@ -130,3 +136,56 @@ def _integrate(
             T += step / 6.0 * (a[1] + 2.0 * b[1] + 2.0 * c[1] + d[1])
         T += float(kicks[k])
     return states[:, 0], states[:, 1]
+
+
+def messages_of(record: Record, plant: str = "cstr") -> list[Encoded]:
+    """Messages of a record, as its plant publishes them."""
+    return [encode(item) for item in samples_of(record, plant)]
+
+
+TRAINING_MIN = 100.0
+FLOWS = {
+    "wide": (1.0, 90.0, 111.0),
+    "mid": (1.0, 97.0, 109.0),
+    "moves": (75.0, 93.0, 109.0),
+    "sines": (0.0, 93.0, 109.0),
+}
+"""Inputs of sound records: minutes between two new levels, and their range; three sines within it."""
+
+NOISE_SD = {"none": (0.0, 0.0), "low": (0.0005, 0.05), "medium": (0.002, 0.3), "high": (0.005, 1.0)}
+"""Levels of noise: standard deviations of C in mol/l and of T in K."""
+
+
+def _flows_of(kind: str, rows: int, rng: np.random.Generator) -> Array:
+    time_min = np.arange(rows) * PERIOD_MIN
+    every, low, high = FLOWS[kind]
+    if kind == "sines":
+        phases = rng.uniform(0.0, 2.0 * np.pi, 3)
+        waves = zip((3.0, 3.0, 2.0), (3.1, 7.7, 19.0), phases, strict=True)
+        return np.asarray(101.0 + sum(a * np.sin(2 * np.pi * time_min / period + phase) for a, period, phase in waves))
+    index = (time_min / every).astype(int)
+    return np.asarray(rng.uniform(low, high, index[-1] + 1)[index])
+
+
+def sound_record(kind: str, noise: str, seed: int, span_min: float) -> Record:
+    """Record of a sound reactor under a kind of input, with a level of noise."""
+    rng, rows = np.random.default_rng(seed), round(span_min / PERIOD_MIN)
+    time_min, flows = np.round(np.arange(rows) * PERIOD_MIN, 6), _flows_of(kind, rows, rng)
+    outputs = Simulator(cstr()).run(time_min, flows, start_state(cstr(), flows[:1], "operating")).outputs
+    outputs = outputs + np.array(NOISE_SD[noise]) * rng.standard_normal(outputs.shape)
+    return Record(time_min, {"qc": flows, "C": outputs[:, 0], "T": outputs[:, 1]}, f"{kind}, {noise} noise, {seed}")
+
+
+def without_equations(reference: ReferenceName = "auto") -> MonitorConfig:
+    """Settings of a monitor that knows the names of the reactor's signals only."""
+    return MonitorConfig(
+        process="",
+        inputs=("qc",),
+        outputs=("C", "T"),
+        reference=reference,
+        training_min=TRAINING_MIN,
+        false_alarms_per_30_days=30.0,
+        isolation=False,
+        smallest_sd={},
+        priorities={},
+    )
