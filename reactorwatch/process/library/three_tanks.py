@@ -125,13 +125,15 @@ class Leak(Effect):
 # fmt: off
 EFFECTS: tuple[Effect, ...] = (
     *(
-        InputOffset(name=f"pump{i}", label=f"wrong flow of pump {i}", location=f"pump{i}", input=f"Q{i}", unit="cm3/s",
+        InputOffset(f"The real flow of pump {i} is Q{i} + m.", name=f"pump{i}",
+                    label=f"wrong flow of pump {i}", location=f"pump{i}", input=f"Q{i}", unit="cm3/s",
                     larger=f"{{}} cm3/s more from pump {i}", smaller=f"{{}} cm3/s less from pump {i}",
                     lower=-150.0, upper=150.0, typical=1.0)
         for i in (1, 2)
     ),
     *(
-        OutputBias(name=f"h{i}.bias", label=f"bias of the level sensor of tank {i}", location=f"h{i}", output=f"h{i}",
+        OutputBias(f"The measured level of tank {i} is h{i} + m.", name=f"h{i}.bias",
+                   label=f"bias of the level sensor of tank {i}", location=f"h{i}", output=f"h{i}",
                    larger=f"level sensor of tank {i} shows {{}} cm too much",
                    smaller=f"level sensor of tank {i} shows {{}} cm too little",
                    unit="cm", lower=-62.0, upper=62.0, typical=1.0,
@@ -139,14 +141,14 @@ EFFECTS: tuple[Effect, ...] = (
         for i in (1, 2, 3)
     ),
     *(
-        Leak(name=f"leak{i}", label=f"leak of tank {i}", location=f"tank{i}", tank=i,
+        Leak(f"Leak of tank {i}.", name=f"leak{i}", label=f"leak of tank {i}", location=f"tank{i}", tank=i,
              larger=f"tank {i} leaks through {{}} % of a pipe's cross-section")
         for i in (1, 2, 3)
     ),
     *(
-        ParameterEffect(name=f"clog{pipe}", label=f"clogging of the {text}", location=f"pipe{pipe}",
-                        parameter=coefficient, is_loss=True, larger=f"{{}} % of the {text} clogged",
-                        lower=0.0, upper=0.99, typical=0.05)
+        ParameterEffect(f"Clogging of the {text}.", name=f"clog{pipe}", label=f"clogging of the {text}",
+                        location=f"pipe{pipe}", parameter=coefficient, is_loss=True,
+                        larger=f"{{}} % of the {text} clogged", lower=0.0, upper=0.99, typical=0.05)
         for pipe, coefficient, text in (
             (13, "a1", "pipe from tank 1 to tank 3"),
             (20, "a2", "outlet of tank 2"),
