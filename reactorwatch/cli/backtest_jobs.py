@@ -31,7 +31,8 @@ from reactorwatch.cli.printing import json_line
 from reactorwatch.cli.unit_remarks import FirstSamples
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.description.find import DEFAULT_PROCESS, ProcessChoice
+from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.find import DEFAULT_PROCESS
 from reactorwatch.description.process import Process
 from reactorwatch.errors import prefix_errors
 from reactorwatch.records.decode import quote_formula

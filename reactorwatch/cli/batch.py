@@ -20,7 +20,7 @@ from reactorwatch.api.files import expand_folder
 from reactorwatch.cli.display import format_rows, print_report
 from reactorwatch.cli.printing import json_line, print_lines
 from reactorwatch.cli.progress import bar, task
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.records.decode import list_files, quote_formula
 from reactorwatch.records.file_format import GUESS, FileFormat

@@ -26,7 +26,7 @@ def causes(
     from reactorwatch.api.files import record_of_process
     from reactorwatch.cli.causes_report import as_json_text, as_matrix
     from reactorwatch.cli.progress import task
-    from reactorwatch.description.find import ProcessChoice
+    from reactorwatch.description.choice import ProcessChoice
     from reactorwatch.diagnosis.identifiability import identifiability
     from reactorwatch.diagnosis.record_checks import make_run
     from reactorwatch.diagnosis.usual_excitation import excite

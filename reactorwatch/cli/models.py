@@ -100,6 +100,6 @@ def linearise(
 ) -> None:
     """Print the linear models at all steady states of constant inputs."""
     from reactorwatch.cli.linear_models import describe
-    from reactorwatch.description.find import ProcessChoice
+    from reactorwatch.description.choice import ProcessChoice
 
     print_text(describe(ProcessChoice(process).load().require_model(), levels, step, as_json=as_json))

@@ -7,7 +7,8 @@ import logging
 from typing import Any
 
 from reactorwatch.cli.options import BusOptions, PlantOptions
-from reactorwatch.description.find import PlantProcesses, find_process
+from reactorwatch.description.find import find_process
+from reactorwatch.description.plants import PlantProcesses
 from reactorwatch.description.process import Process
 from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.logs import configure

@@ -17,7 +17,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.write import check_output_file
 
 if TYPE_CHECKING:
-    from reactorwatch.description.find import ProcessChoice
+    from reactorwatch.description.choice import ProcessChoice
 
 Value = TypeVar("Value")
 
@@ -109,7 +109,7 @@ class ProcessOptions:
         Raises:
             InputError: as `ProcessChoice`.
         """
-        from reactorwatch.description.find import ProcessChoice
+        from reactorwatch.description.choice import ProcessChoice
 
         return ProcessChoice(self.process, *(tuple(_split(texts)) for texts in (self.inputs, self.outputs, modes)))
 

@@ -15,7 +15,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS
 
 if TYPE_CHECKING:
-    from reactorwatch.description.find import ProcessChoice
+    from reactorwatch.description.choice import ProcessChoice
 
 Site = Annotated[
     Path | None, Option(help="Folder that `certify` made: run its router, and each node with its certificate [none].")

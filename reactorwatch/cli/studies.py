@@ -57,7 +57,7 @@ def simulate(
     from reactorwatch.api.files import record_of_process
     from reactorwatch.api.simulation import report, simulate_along
     from reactorwatch.cli.progress import task
-    from reactorwatch.description.find import ProcessChoice
+    from reactorwatch.description.choice import ProcessChoice
     from reactorwatch.records.write import WRITTEN_SUFFIXES, write_table
 
     choice = ProcessChoice(process)
@@ -186,7 +186,7 @@ def diagnose(
     from reactorwatch.cli.batch import expand_files, run_jobs, unfit_lines
     from reactorwatch.cli.diagnosis import DiagnosisOptions
     from reactorwatch.cli.diagnosis_jobs import DIAGNOSIS, check_out, diagnosis_jobs
-    from reactorwatch.description.find import ProcessChoice
+    from reactorwatch.description.choice import ProcessChoice
 
     named = expand_files(files)
     choice = ProcessChoice(process)

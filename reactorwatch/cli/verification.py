@@ -11,7 +11,8 @@ from reactorwatch.cli.printing import json_line, print_lines, print_text
 from reactorwatch.cli.progress import task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.description.find import ProcessChoice, find_in_catalogue, find_process
+from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.find import find_in_catalogue, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import is_table

@@ -9,7 +9,8 @@ from typer.testing import CliRunner
 from monitor_node.config import MonitorConfig
 from reactorwatch.cli.main import app
 from reactorwatch.cli.runs import describe_in_file
-from reactorwatch.description.find import ProcessChoice, find_process
+from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
 
 

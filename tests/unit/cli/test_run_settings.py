@@ -11,7 +11,8 @@ from plant_node.record import simulate_record
 from reactorwatch.cli.demonstration import choose_fault
 from reactorwatch.cli.observer import observed_process
 from reactorwatch.cli.plant_settings import PlayedRecord, load_source
-from reactorwatch.description.find import ProcessChoice, find_process
+from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS

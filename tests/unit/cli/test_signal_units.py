@@ -15,7 +15,7 @@ from plant_node.record import simulate_record
 from reactorwatch.api.files import open_messages
 from reactorwatch.cli import identification
 from reactorwatch.cli.backtest_jobs import choose_settings
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process import MODELS
