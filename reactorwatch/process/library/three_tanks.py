@@ -29,8 +29,6 @@ from reactorwatch.process.signal_effects import InputOffset, OutputBias
 SMALL_LEVEL_CM = 0.01
 """Difference of levels below which the root becomes a straight line; at 1 cm that changes it by 3 in 100,000."""
 
-SECONDS_PER_MIN = 60.0
-
 PLACES = (
     Place("pipe13", "pipe13", FACTOR, flows={"h1": "flow 13", "h3": "inflow 13"}, variables=("head 13",)),
     Place("pipe32", "pipe32", FACTOR, flows={"h3": "flow 32", "h2": "inflow 32"}, variables=("head 32",)),
@@ -68,7 +66,7 @@ def three_tanks() -> ProcessModel:
     Q13 = pipe(a1.symbol, h1.symbol - h3.symbol)
     Q32 = pipe(a3.symbol, h3.symbol - h2.symbol)
     Q20 = pipe(a2.symbol, h2.symbol)
-    per_min = SECONDS_PER_MIN / A.symbol
+    per_min = 60.0 / A.symbol  # of a flow a second
     levels = (h1, h2, h3)
     return ProcessModel(
         name="three_tanks",
