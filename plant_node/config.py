@@ -16,8 +16,8 @@ from reactorwatch.errors import InputError, describe_unknown, prefix_errors
 from reactorwatch.process import OPERATIONS
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.process.library.cstr_operation import LevelControl, TemperatureControl
-from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.operation import ContinuousController, Controller, InputLevels
+from reactorwatch.process.model import Extension, ProcessModel
+from reactorwatch.process.operation import Controller, InputLevels
 from reactorwatch.runtime.setting_rules import MODEL_IS_PROCESS, OlderKeys, check_bounds
 from reactorwatch.units import conversion
 
@@ -191,7 +191,7 @@ def _controllers(
             item = item.controller()
         if isinstance(item, Controller):
             found[item.input] = item
-        elif isinstance(item, ContinuousController):
+        elif isinstance(item, Extension):
             with prefix_errors("level_control" if item is config.level_control else type(item).__name__, ValueError):
                 model = item.extend(model)
         else:

@@ -48,6 +48,7 @@ class Effect(ABC):
     """A physical deviation: a class with its attributes, or a class of effects with the attributes of one of them.
 
     Args:
+        meaning: what it does, which reports show; empty: the docstring of the class.
         **facts: attributes that the class leaves open, such as the name.
 
     Attributes:
@@ -96,11 +97,11 @@ class Effect(ABC):
     is_generic: ClassVar[bool] = False
     constants: ClassVar[tuple[EffectConstant, ...]] = ()
 
-    def __init__(self, **facts: Any) -> None:
+    def __init__(self, meaning: str = "", /, **facts: Any) -> None:
         known = {name for kind in type(self).__mro__ for name in get_annotations(kind)}
         if unknown := facts.keys() - known:
             raise TypeError(f"{type(self).__name__} has no attribute {', '.join(sorted(unknown))}")
-        vars(self).update(facts)
+        vars(self).update(facts, **({"__doc__": meaning} if meaning else {}))
 
     @property
     def has_derivative(self) -> bool:

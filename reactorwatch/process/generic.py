@@ -108,6 +108,7 @@ def exchanges(model: ProcessModel) -> tuple[Effect, ...]:
             if one.unit == other.unit and slopes[i, j] > 0.0 and slopes[j, i] > 0.0:
                 result.append(
                     Exchange(
+                        f"An unmodelled flow from {other.name} to {one.name}.",
                         name=f"{one.name}.{other.name}.exchange",
                         label=f"unknown flow between {one.name} and {other.name}",
                         is_generic=True,
@@ -160,8 +161,27 @@ def _slopes(model: ProcessModel, expressions: ca.SX, by: ca.SX) -> Array:
     return np.array(slopes(*reference_point(model), model.values(), 0.0, 0.0))
 
 
+_MEANINGS: dict[type[Effect], str] = {
+    OutputBias: "The measured {} is too high by m.",
+    OutputGain: "The measured {} is the true one times (1 + m).",
+    OutputLag: "The measured {} follows the true one with a time constant of m.",
+    OutputDelay: "The measured {} is that of m before.",
+    StuckOutput: "The share m of the measured {} is a constant.",
+    OutputNoise: "The measured {} has further noise with a standard deviation of m.",
+    InputGain: "The real {} is the commanded one times (1 + m).",
+    InputOffset: "The real {} is the commanded one plus m.",
+    InputLag: "The real {} follows the commanded one with a time constant of m.",
+    InputDelay: "The real {} is what was commanded m before.",
+    InputStiction: "The real {} moves only when its command is more than m away.",
+    ParameterEffect: "{} (1 + m).",
+    ParameterShift: "{} + m.",
+    Source: "An unmodelled source adds m to the balance of {}.",
+}
+
+
 def _make(kind: type[Effect], name: str, label: str, larger: str, smaller: str = "", **facts: Any) -> Effect:
-    return kind(name=name, label=label, larger=larger, smaller=smaller, is_generic=True, **facts)
+    meaning = _MEANINGS[kind].format(name.rpartition(".")[0])
+    return kind(meaning, name=name, label=label, larger=larger, smaller=smaller, is_generic=True, **facts)
 
 
 def _deviation(unit: str, scale: float) -> dict[str, Any]:

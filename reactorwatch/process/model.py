@@ -1,7 +1,7 @@
 """A process model: balances as symbolic expressions, parameters with units and bounds.
 
-Everything else is derived from it: trajectories and their exact sensitivities, steady states, linear models, and the
-model with an effect in it, which is again a `ProcessModel`.
+Everything else is derived from it: trajectories, steady states, linear models, and the model with an effect in it,
+which is again a `ProcessModel`.
 
 Time is in minutes. The right-hand side may depend on it through the profiles of effects. Where an effect sets in at
 once, the right-hand side jumps, and an integrator that steps across the jump loses its order. So such an expression
@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -120,11 +120,12 @@ class Place:
     apart: str = ""
 
 
+@runtime_checkable
 class Extension(Protocol):
-    """Addition to the equations of a model: an effect, or a law."""
+    """Addition to the equations of a model: an effect, a law, or a controller in continuous time."""
 
     def extend(self, model: "ProcessModel") -> "ProcessModel":
-        """Copy of the model with the extension."""
+        """Copy of the model with the extension; a ValueError if the model lacks what it acts on."""
 
 
 def variable(
@@ -272,10 +273,8 @@ class ProcessModel:
         """Copy with other nominal values; a ValueError as in `values`."""
         if not changes:
             return self
-        parameters, values = list(self.parameters), self.values(changes)
-        for name in changes:
-            index = self._indices[name]
-            parameters[index] = replace(parameters[index], value=float(values[index]))
+        values = zip(self.parameters, self.values(changes).tolist(), strict=True)
+        parameters = (replace(item, value=value) if item.name in changes else item for item, value in values)
         return replace(self, parameters=tuple(parameters))
 
     def term(self, name: str) -> ca.SX:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf, isfinite
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, TypeAlias
 
 import msgspec
 
@@ -68,18 +68,6 @@ class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def is_integral(self) -> bool:
         """True if it has integral action."""
         return isfinite(self.integral_time_min)
-
-
-@runtime_checkable
-class ContinuousController(Protocol):
-    """A controller that is part of the equations."""
-
-    def extend(self, model: ProcessModel) -> ProcessModel:
-        """Model with the controller in it.
-
-        Raises:
-            ValueError: the model lacks what it acts on.
-        """
 
 
 def steps_of(set_point: SetPoint) -> tuple[tuple[float, float], ...]:

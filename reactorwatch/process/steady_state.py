@@ -160,9 +160,6 @@ def _lattice(dimensions: int) -> Array:
 BEFORE_MIN = nextafter(0.0, -1.0)
 """Last time before plant time 0: an onset at 0 does not affect the initial steady state."""
 
-REST_ITERATIONS = 50
-REST_TOLERANCE = 1e-9  # scales
-
 
 def start_state(
     model: ProcessModel, inputs: Array, start: Literal["operating", "extinguished"] | Mapping[str, float]
@@ -229,10 +226,10 @@ def complete_state(model: ProcessModel, known: Mapping[str, float], inputs: Arra
         [ca.solve(ca.jacobian(balance, free), balance)],
     )
     scales = np.array([model.states[index].scale for index in missing])
-    for _ in range(REST_ITERATIONS):
+    for _ in range(50):
         change = np.array(step(state, inputs, model.values(), time_min, time_min)).ravel()
         state[missing] -= change
-        if np.all(np.abs(change) <= REST_TOLERANCE * scales):
+        if np.all(np.abs(change) <= 1e-9 * scales):
             return state
     names = ", ".join(model.states[index].name for index in missing)
     raise InputError(f"{model.name}: {names} cannot be at rest while {dict(known)}; give a start for them")

@@ -130,7 +130,10 @@ class Overflow(Effect):
 
 
 class LowerOverflow(Effect):
-    """m times the level above the brim of the lower tank runs over into the basin; the brim is fitted, too."""
+    """m times the level above the brim of the lower tank runs over into the basin.
+
+    The brim is fitted, too.
+    """
 
     name = "lower_overflow"
     label = "overflow of the lower tank"
@@ -172,16 +175,19 @@ class LowerOutlet(Effect):
 
 # fmt: off
 EFFECTS: tuple[Effect, ...] = (
-    ParameterEffect(name="pump_gain", label="wrong flow of the pump", location="pump", parameter="k4", typical=0.03,
+    ParameterEffect("k4 (1 + m).", name="pump_gain",
+                    label="wrong flow of the pump", location="pump", parameter="k4", typical=0.03,
                     larger="{} % more flow from the pump", smaller="{} % less flow from the pump"),
     UpperLeak(),
-    ParameterEffect(name="outlet_clogging", label="clogged outlet of the upper tank", location="upper_tank",
+    ParameterEffect("The outlet of the upper tank lets (1 - m) of the water through: k1 (1 - m) and k2 (1 - m).",
+                    name="outlet_clogging", label="clogged outlet of the upper tank", location="upper_tank",
                     larger="{} % of the outlet of the upper tank clogged", parameter="k1", proportional=("k2",),
                     is_loss=True, lower=0.0, upper=0.99, typical=0.03),
     Overflow(),
     LowerOverflow(),
     LowerOutlet(),
-    OutputBias(name="level_bias", label="bias of the level sensor", location="level_sensor", output="x2", unit="V",
+    OutputBias("The measured level is x2 + m.", name="level_bias",
+               label="bias of the level sensor", location="level_sensor", output="x2", unit="V",
                larger="level sensor shows {} V too much", smaller="level sensor shows {} V too little",
                lower=-10.0, upper=10.0, typical=0.05, labels={"ramp": "drift of the level sensor"}),
 )

@@ -187,13 +187,12 @@ EXAMPLES = {
 """The sample records, by name: four hours at the plant's period of 0.1 min."""
 
 ONSET_MIN = 220.0
-DURATION_MIN = 400.0
 NOISE_SD = {"C": 0.002, "T": 0.3, "qc": 0.0}
 
 
 def _preset(name: str, meaning: str, *faults: str) -> Preset:
     settings = {
-        "duration_min": DURATION_MIN,
+        "duration_min": 400.0,
         "scenario": {"kind": "random-steps", "low": 85.0, "high": 105.0, "hold_min": 1.0},
         "noise_sd": NOISE_SD,
         "faults": [f"{fault}@{ONSET_MIN:g}min" for fault in faults],

@@ -29,8 +29,6 @@ from reactorwatch.process.signal_effects import InputOffset, OutputBias
 SMALL_LEVEL_CM = 0.01
 """Difference of levels below which the root becomes a straight line; at 1 cm that changes it by 3 in 100,000."""
 
-SECONDS_PER_MIN = 60.0
-
 PLACES = (
     Place("pipe13", "pipe13", FACTOR, flows={"h1": "flow 13", "h3": "inflow 13"}, variables=("head 13",)),
     Place("pipe32", "pipe32", FACTOR, flows={"h3": "flow 32", "h2": "inflow 32"}, variables=("head 32",)),
@@ -68,7 +66,7 @@ def three_tanks() -> ProcessModel:
     Q13 = pipe(a1.symbol, h1.symbol - h3.symbol)
     Q32 = pipe(a3.symbol, h3.symbol - h2.symbol)
     Q20 = pipe(a2.symbol, h2.symbol)
-    per_min = SECONDS_PER_MIN / A.symbol
+    per_min = 60.0 / A.symbol  # of a flow a second
     levels = (h1, h2, h3)
     return ProcessModel(
         name="three_tanks",
@@ -125,13 +123,15 @@ class Leak(Effect):
 # fmt: off
 EFFECTS: tuple[Effect, ...] = (
     *(
-        InputOffset(name=f"pump{i}", label=f"wrong flow of pump {i}", location=f"pump{i}", input=f"Q{i}", unit="cm3/s",
+        InputOffset(f"The real flow of pump {i} is Q{i} + m.", name=f"pump{i}",
+                    label=f"wrong flow of pump {i}", location=f"pump{i}", input=f"Q{i}", unit="cm3/s",
                     larger=f"{{}} cm3/s more from pump {i}", smaller=f"{{}} cm3/s less from pump {i}",
                     lower=-150.0, upper=150.0, typical=1.0)
         for i in (1, 2)
     ),
     *(
-        OutputBias(name=f"h{i}.bias", label=f"bias of the level sensor of tank {i}", location=f"h{i}", output=f"h{i}",
+        OutputBias(f"The measured level of tank {i} is h{i} + m.", name=f"h{i}.bias",
+                   label=f"bias of the level sensor of tank {i}", location=f"h{i}", output=f"h{i}",
                    larger=f"level sensor of tank {i} shows {{}} cm too much",
                    smaller=f"level sensor of tank {i} shows {{}} cm too little",
                    unit="cm", lower=-62.0, upper=62.0, typical=1.0,
@@ -139,14 +139,14 @@ EFFECTS: tuple[Effect, ...] = (
         for i in (1, 2, 3)
     ),
     *(
-        Leak(name=f"leak{i}", label=f"leak of tank {i}", location=f"tank{i}", tank=i,
+        Leak(f"Leak of tank {i}.", name=f"leak{i}", label=f"leak of tank {i}", location=f"tank{i}", tank=i,
              larger=f"tank {i} leaks through {{}} % of a pipe's cross-section")
         for i in (1, 2, 3)
     ),
     *(
-        ParameterEffect(name=f"clog{pipe}", label=f"clogging of the {text}", location=f"pipe{pipe}",
-                        parameter=coefficient, is_loss=True, larger=f"{{}} % of the {text} clogged",
-                        lower=0.0, upper=0.99, typical=0.05)
+        ParameterEffect(f"Clogging of the {text}.", name=f"clog{pipe}", label=f"clogging of the {text}",
+                        location=f"pipe{pipe}", parameter=coefficient, is_loss=True,
+                        larger=f"{{}} % of the {text} clogged", lower=0.0, upper=0.99, typical=0.05)
         for pipe, coefficient, text in (
             (13, "a1", "pipe from tank 1 to tank 3"),
             (20, "a2", "outlet of tank 2"),

@@ -129,3 +129,47 @@ def test_an_input_that_is_interpolated_is_held_and_stamped_half_a_period_late_to
         for size in (0.05, 0.0)
     )
     assert np.all(np.std(late, axis=0) < 0.1 * np.std(in_time, axis=0))
+
+
+def test_coolant_flow_is_the_command_times_one_plus_its_size() -> None:
+    model = effect_of("coolant_flow").extend(cstr()).with_values({"coolant_flow.size": -0.05})
+    found = Simulator(model).run(TIMES, FLOWS, START).states
+    np.testing.assert_allclose(found, Simulator(cstr()).run(TIMES, 0.95 * FLOWS, START).states, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("cause", "changes"),
+    [
+        ("heat_transfer", {"K3": 714.0}),
+        ("reaction_rate", {"k0": 7.2e10 * 1.02, "K1": 1.44e13 * 1.02}),
+        ("activation_energy", {"E_R": 1e4 * 1.02}),
+        ("reaction_heat", {"K1": 1.44e13 * 1.02}),
+        ("feed_flow", {"q": 102.0}),
+        ("feed_temperature", {"Tf": 350.02}),
+        ("feed_concentration", {"Cf": 1.02}),
+        ("coolant_temperature", {"Tcf": 350.02}),
+    ],
+)
+def test_effects_on_a_constant_are_that_constant_changed(cause: str, changes: dict[str, float]) -> None:
+    effect = effect_of(cause)
+    found = Simulator(effect.extend(cstr())).run(TIMES, FLOWS, START, {f"{cause}.size": 0.02}).states
+    np.testing.assert_allclose(found, Simulator(cstr()).run(TIMES, FLOWS, START, changes).states, rtol=1e-12)
+
+
+def test_heat_loss_is_newton_s_cooling_to_the_surroundings() -> None:
+    """With neither reaction nor coolant: dT/dt = q/V (Tf - T) - m (T - 298), whose solution is an exponential."""
+    effect = effect_of("heat_loss")
+    model = effect.extend(cstr()).with_values({"k0": 0.0, "K1": 0.0, "K2": 0.0, "heat_loss.size": 0.5})
+    rest = (350.0 + 0.5 * 298.0) / 1.5
+    found = Simulator(model).run(TIMES, FLOWS, START).outputs[:, 1]
+    np.testing.assert_allclose(found, rest + (START[1] - rest) * np.exp(-1.5 * TIMES), rtol=0, atol=1e-5)
+
+
+def test_effects_on_the_analyser_change_what_it_shows_and_nothing_else() -> None:
+    nominal = Simulator(cstr()).run(TIMES, FLOWS, START)
+    for cause, factor, shift in (("concentration_bias", 1.0, 0.01), ("concentration_gain", 1.01, 0.0)):
+        effect = effect_of(cause)
+        run = Simulator(effect.extend(cstr())).run(TIMES, FLOWS, START, {f"{cause}.size": 0.01})
+        np.testing.assert_array_equal(run.states, nominal.states)
+        np.testing.assert_array_equal(run.outputs[:, 1], nominal.outputs[:, 1])
+        np.testing.assert_allclose(run.outputs[:, 0], factor * nominal.outputs[:, 0] + shift, rtol=1e-14)

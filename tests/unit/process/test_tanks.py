@@ -4,20 +4,15 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cascaded_tanks import EFFECTS as TANK_EFFECTS
 from reactorwatch.process.library.cascaded_tanks import tanks
 from reactorwatch.process.linearise import linearise
-from reactorwatch.process.profiles import CONSTANT, FREE, PROFILES, Profile
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states
 
 TIMES = np.arange(60) / 15
 FLOWS = np.repeat(np.random.default_rng(1).uniform(2.0, 5.0, 12), 5)
 START = np.array([9.5, 6.0])  # the upper tank comes over its brim
-SHAPE = {"onset": 1.2, "end": 3.4, "time_constant": 0.5, "period": 2.5, "phase": 0.4}
-
-of_every_effect = pytest.mark.parametrize("effect", TANK_EFFECTS, ids=lambda effect: effect.name)
 
 
 def test_a_run_is_that_of_the_equations_by_hand() -> None:
@@ -59,29 +54,6 @@ def test_an_empty_tank_stays_empty_and_has_a_derivative() -> None:
     assert np.all(found >= -1e-9)
     assert found[-1, 0] < 1e-3
     assert np.all(np.isfinite(linearise(tanks(), np.zeros(2), np.zeros(1)).A))
-
-
-@of_every_effect
-@pytest.mark.parametrize("profile", [item for item in PROFILES if item is not FREE], ids=lambda item: item.name)
-def test_at_its_neutral_size_it_is_the_base_model_and_at_another_it_is_not(effect: Effect, profile: Profile) -> None:
-    shape = {f"{effect.name}.{item.name}": SHAPE[item.name] for item in profile.parameters}
-    model = effect.extend(tanks(), profile).with_values(shape)
-    base = Simulator(tanks()).run(TIMES, FLOWS, START).outputs
-    np.testing.assert_array_equal(Simulator(model).run(TIMES, FLOWS, START).outputs, base)
-    changed = Simulator(model).run(TIMES, FLOWS, START, {f"{effect.name}.size": effect.typical}).outputs
-    onset = 0 if profile is CONSTANT else int(np.searchsorted(TIMES, SHAPE["onset"]))
-    np.testing.assert_array_equal(changed[:onset], base[:onset])
-    assert np.max(np.abs(changed - base)) > 1e-3
-
-
-@of_every_effect
-def test_its_facts_make_sense(effect: Effect) -> None:
-    assert effect.lower <= effect.neutral <= effect.upper
-    assert effect.lower <= effect.typical <= effect.upper
-    assert effect.typical != effect.neutral
-    assert effect.label
-    assert effect.location in ("pump", "upper_tank", "lower_tank", "level_sensor")
-    assert set(effect.labels) <= {profile.name for profile in PROFILES}
 
 
 def test_a_firm_brim_holds_the_level() -> None:

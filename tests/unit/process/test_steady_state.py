@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from reactorwatch.arrays import Array
 from reactorwatch.process.library.cstr import cstr
-from reactorwatch.process.linearise import linearise
+from reactorwatch.process.linearise import compare_step, linearise, step_response
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, steady_states
 
@@ -74,27 +75,50 @@ def test_every_steady_state_is_found_and_no_other(model: ProcessModel, coolant_f
     np.testing.assert_allclose(found, expected, rtol=0, atol=5e-6)
 
 
-@pytest.mark.parametrize("coolant_flow", [85.0, 103.41, 111.0])
-def test_linear_model_equals_differences(model: ProcessModel, coolant_flow: float) -> None:
-    point = operating(model, coolant_flow).state
-    linear = linearise(model, point, np.array([coolant_flow]))
-    function, p = model.function(), model.values()
-
-    def at(x: Array, u: Array) -> tuple[Array, Array]:
-        rhs, y = function(x, u, p, 0, 0)
-        return np.array(rhs).ravel(), np.array(y).ravel()
-
-    u = np.array([coolant_flow])
-    for column, step in enumerate((1e-6, 1e-3)):
-        delta = step * np.eye(2)[column]
-        (f_up, y_up), (f_down, y_down) = at(point + delta, u), at(point - delta, u)
-        np.testing.assert_allclose(linear.A[:, column], (f_up - f_down) / (2 * step), rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(linear.C[:, column], (y_up - y_down) / (2 * step), rtol=1e-6, atol=1e-6)
-    (f_up, y_up), (f_down, y_down) = at(point, u + 1e-3), at(point, u - 1e-3)
-    np.testing.assert_allclose(linear.B[:, 0], (f_up - f_down) / 2e-3, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(linear.D[:, 0], (y_up - y_down) / 2e-3, atol=1e-12)
-
-
 def test_inputs_that_do_not_fit_are_refused(model: ProcessModel) -> None:
     with pytest.raises(ValueError, match=r"^inputs must be 1 finite numbers \(\('qc',\)\), got \[100\. *nan\]$"):
         steady_states(model, np.array([100.0, np.nan]))
+
+
+FLOWS = (85.0, 100.0, 110.0)
+
+
+@pytest.mark.parametrize("flow", FLOWS)
+def test_the_matrices_are_the_plant_s_differences(flow: float) -> None:
+    model, u = cstr(), np.array([flow])
+    function = model.function()
+    for point in steady_states(model, u):
+        linear = linearise(model, point.state, u)
+        x, h = point.state, np.array([1e-6, 1e-3])
+
+        def rhs(x: Array, u: Array) -> Array:
+            return np.array(function(x, u, model.values(), 0.0, 0.0)[0]).ravel()
+
+        A = np.column_stack([(rhs(x + e, u) - rhs(x - e, u)) / (2 * e.sum()) for e in np.diag(h)])
+        B = (rhs(x, u + 1e-3) - rhs(x, u - 1e-3)) / 2e-3
+        assert np.allclose(linear.A, A, rtol=1e-5, atol=1e-7)
+        assert np.allclose(linear.B[:, 0], B, rtol=1e-5, atol=1e-9)
+        assert np.array_equal(linear.C, np.eye(2))
+        assert np.array_equal(linear.D, np.zeros((2, 1)))
+
+
+@pytest.mark.parametrize("flow", FLOWS)
+def test_the_error_against_the_plant_falls_with_the_square_of_the_step(flow: float) -> None:
+    model, u = cstr(), np.array([flow])
+    point = steady_states(model, u)[-1]
+    errors = []
+    for step in (0.4, 0.2, 0.1):
+        comparison = compare_step(model, point.state, u, np.array([step]))
+        errors.append(np.abs(comparison.linear - comparison.plant).max(axis=0))
+    order = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    assert np.all(np.abs(order - 2.0) < 0.1)
+
+
+def test_the_linear_step_response_is_the_solution_of_its_equation() -> None:
+    model, u = cstr(), np.array([100.0])
+    linear = linearise(model, steady_states(model, u)[-1].state, u)
+    time_min, step = np.linspace(0, 5, 51), np.array([3.0])
+    solved = solve_ivp(
+        lambda _t, x: linear.A @ x + linear.B @ step, (0, 5), [0, 0], "DOP853", time_min, rtol=1e-11, atol=1e-13
+    )
+    assert np.allclose(step_response(linear, step, time_min), solved.y.T @ linear.C.T, rtol=1e-7, atol=1e-9)
