@@ -33,8 +33,8 @@ def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
 def _reproduce(asked: argparse.Namespace) -> int:
     from benchmarks.study_figures.reproduce import check_out, reproduce
     from reactorwatch.api.files import record
+    from reactorwatch.cli.display import print_text
     from reactorwatch.cli.options import check_recording
-    from reactorwatch.cli.printing import print_text
 
     if asked.seed < 0:
         raise InputError(f"--seed: must be at least 0, got {asked.seed}")

@@ -7,7 +7,7 @@ little to be judged, with an exit code of 3 if no other was judged. This process
 import csv
 import glob
 import io
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,11 +17,12 @@ import msgspec
 import typer
 
 from reactorwatch.api.files import expand_folder
-from reactorwatch.cli.display import format_rows, print_report
-from reactorwatch.cli.printing import json_line, print_lines
-from reactorwatch.cli.progress import bar, task
+from reactorwatch.arrays import Array
+from reactorwatch.cli.display import bar, format_rows, json_line, print_lines, print_report, task
 from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError, UnfitRecordError
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.cells import quote_formula
 from reactorwatch.records.file_format import GUESS, FileFormat
@@ -31,7 +32,6 @@ from reactorwatch.runtime.parallel import choose_executor
 from reactorwatch.runtime.parallel.jobs import Failed, in_job_order
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Options = TypeVar("Options", bound="FileOptions")
@@ -114,15 +114,7 @@ class JobKind(Generic[Options]):
 
 
 def expand_files(names: Sequence[Path]) -> list[Path]:
-    """Expand folders and patterns to files, in the order given; files of one are sorted.
-
-    Args:
-        names: names of files, folders (see `expand_folder`), or patterns such as `runs/*.csv` and `runs/**/*.mcap`.
-            Names of files are not checked.
-
-    Raises:
-        InputError: a pattern has no match, or a folder holds no records and recordings.
-    """
+    """Expand folders and patterns to files, in the order given; files of one are sorted."""
     files: list[Path] = []
     for name in names:
         if glob.has_magic(str(name)) and not name.exists():
@@ -144,14 +136,7 @@ def _expand_match(folder: Path) -> list[Path]:
 def make_jobs(
     files: Sequence[Path], asked: Options, folders: Sequence[Path | None] | None = None, *, elsewhere: bool
 ) -> list[Job[Options]]:
-    """Make a job for each file.
-
-    Args:
-        files: the files.
-        asked: options of the command.
-        folders: a folder for each file; None: there are none.
-        elsewhere: use absolute paths, for workers with another working folder.
-    """
+    """Make a job for each file."""
     folders = [None] * len(files) if folders is None else folders
     if not elsewhere:
         return [Job(file, file, asked, folder) for file, folder in zip(files, folders, strict=True)]
@@ -171,21 +156,7 @@ def run_jobs(
     scheduler: str | None,
     on_end: Callable[[list[Any]], None] | None = None,
 ) -> None:
-    """Run the jobs and print the result of each file in their order, and a summary of several.
-
-    Args:
-        kind: kind of the jobs.
-        jobs: one for each file; as JSON, each result is an object on a line, and there is no summary.
-        out: folder for the summary of several files; None: no folder.
-        processes: number of processes; None: one a core.
-        scheduler: address of a cluster, or None.
-        on_end: called with the `extra` of the files that were watched, in their order; None: not called.
-
-    Raises:
-        InputError: the single file cannot be used, or there are no such workers.
-        typer.Exit: with 2, some of several files could not be used; with 3, none of them could be watched. Each of
-            these has its line.
-    """
+    """Run the jobs and print the result of each file in their order, and a summary of several."""
     file, as_json = jobs[0].file, jobs[0].asked.as_json
     if len(jobs) == 1 and scheduler is None:
         with task(f"{kind.doing} {file.name}"), unfit_lines([file], as_json=as_json):
@@ -254,19 +225,6 @@ def results_in_order(
 
     Left to the garbage collection, the work would be ended while nothing handles the interrupt, which would be raised
     again in the midst of it.
-
-    Args:
-        work: a plain function.
-        jobs: arguments of the calls.
-        doing: name of the work, for the bar.
-        processes: number of processes; None: one a core.
-        scheduler: address of a cluster, or None.
-
-    Yields:
-        The results in the order of the jobs.
-
-    Raises:
-        InputError: there are no such workers.
     """
     executor = choose_executor(processes, scheduler)
     with bar(doing, len(jobs)) as advance, closing(executor.map_unordered(work, jobs)) as outcomes:
@@ -300,11 +258,7 @@ def _count_failed(rows: Sequence[Row]) -> int:
 
 
 def write_summary(folder: Path, rows: Sequence[Row]) -> None:
-    """Write `summary.json` and `summary.csv`.
-
-    Raises:
-        InputError: the folder cannot be made or written to.
-    """
+    """Write `summary.json` and `summary.csv`."""
     unwatched = sum(row["watched"] is False for row in rows)
     summary = {"files": len(rows), "failed": _count_failed(rows), "not_watched": unwatched, "results": list(rows)}
     table = io.StringIO()
@@ -325,3 +279,11 @@ def as_table(rows: Sequence[dict[str, str]]) -> str:
     """Format rows as a table; empty columns are left out."""
     names = [name for name in rows[0] if any(row[name] for row in rows)]
     return format_rows([names, *([row[name] for name in names] for row in rows)])
+
+
+def unit_remark(model: ProcessModel, columns: Mapping[str, Array], time_min: Array) -> str:
+    """Remark on the first unit that is not the model's; empty if there is none."""
+    wrong = find_wrong_unit(model, columns, time_min)
+    return (
+        "" if wrong is None else f"{wrong.text}. The plant's equations cannot be its reference; an identified model can"
+    )

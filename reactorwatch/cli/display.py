@@ -5,16 +5,17 @@ without colours. Colours: red for what is wrong now, yellow for what needs atten
 names of causes. `NO_COLOR` is respected.
 """
 
+import contextlib
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from io import StringIO
 from textwrap import wrap
 from typing import NamedTuple
 
 import typer
 
-from reactorwatch.terminal import printable
+from reactorwatch.terminal import printable, printable_lines
 
 WRONG, ATTENTION, RIGHT, CAUSE, FAINT, STRONG = "bold red", "yellow", "green", "cyan", "dim", "bold"
 """Styles by meaning."""
@@ -22,9 +23,9 @@ WRONG, ATTENTION, RIGHT, CAUSE, FAINT, STRONG = "bold red", "yellow", "green", "
 GAP = 2
 """Blanks between columns."""
 
-
 _NAME = re.compile(r"\s+\S(?:\S| (?! ))*\s{2,}(?=\S)| *[A-Za-z][\w ]{1,20}: |- ")
 _COLUMNS = re.compile(r"\S {3,}\S")
+
 _MEANINGS = (
     (r"^(?:The simulation is right|no alarms|no gaps|nothing was damaged)(?s:.*)$", RIGHT),
     (r"the same alarms, value for value", RIGHT),
@@ -75,12 +76,7 @@ def print_headline(text: str, style: str = STRONG) -> None:
 
 
 def print_report(text: str, *, as_json: bool = False) -> None:
-    """Print a text of several lines: wrapped and coloured on a terminal, elsewhere as it is.
-
-    Args:
-        text: sentences, `  name   value` lines and tables.
-        as_json: it is for machines, and stays as it is everywhere.
-    """
+    """Print a text of several lines: wrapped and coloured on a terminal, elsewhere as it is."""
     width = None if as_json else screen_width()
     lines = [printable(line) for line in text.split("\n")]
     typer.echo("\n".join(lines) if width is None else format_report(lines, width, colour=has_colour()))
@@ -91,11 +87,6 @@ def format_report(lines: Sequence[str], width: int, *, colour: bool) -> str:
 
     Sentences are wrapped at words, and the value of a `  name   value` line below itself. A line with more columns is a
     row of a table, and is cut.
-
-    Args:
-        lines: the lines.
-        width: width of the terminal.
-        colour: add escape sequences.
     """
     from rich.text import Text
 
@@ -133,14 +124,7 @@ def _wrap(line: str, indent: int, width: int) -> list[str]:
 
 
 def format_rows(rows: Sequence[Row], indent: int = 0, *, width: int | None = None, colour: bool = False) -> str:
-    """Format rows in aligned columns, one line each.
-
-    Args:
-        rows: cells of each row; a row may have fewer cells than others.
-        indent: blanks before each row.
-        width: width to which lines are cut; None: they are not cut.
-        colour: add the escape sequences of the styles.
-    """
+    """Format rows in aligned columns, one line each."""
     cells = [[_cell(item) for item in row] for row in rows]
     columns = max(map(len, cells), default=0)
     widths = [max(_length(row[i].text) for row in cells if i < len(row)) for i in range(columns)]
@@ -230,3 +214,58 @@ def _render(texts: Sequence[object], width: int, *, colour: bool) -> str:
     for text in texts:
         console.print(text, soft_wrap=width >= 10_000)
     return file.getvalue().rstrip("\n")
+
+
+def print_lines(*lines: str, err: bool = False) -> None:
+    """Print lines without line breaks and control characters in them."""
+    typer.echo(printable_lines(lines), err=err)
+
+
+def print_text(text: str) -> None:
+    """Print a text of several lines; see `printable_lines`."""
+    print_lines(*text.split("\n"))
+
+
+def json_line(value: object) -> str:
+    """Format as JSON on one line."""
+    import msgspec
+
+    return msgspec.json.encode(value).decode()
+
+
+Advance = Callable[[float, str], None]
+
+
+def _escape_markup(text: str) -> str:
+    """Escape a text, which may hold names of files, for the terminal and for Rich."""
+    from rich.markup import escape
+
+    return escape(printable(text))
+
+
+@contextlib.contextmanager
+def bar(text: str, total: float | None) -> Iterator[Advance]:
+    """Show a bar while the context lasts; yields a function of the progress and a text."""
+    if not sys.stderr.isatty():
+        yield lambda _completed, _now: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    label = TextColumn("{task.description}")
+    columns = (
+        (SpinnerColumn(), label, TimeElapsedColumn()) if total is None else (label, BarColumn(), TimeRemainingColumn())
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
+        number = progress.add_task(_escape_markup(text), total=total)
+
+        def advance(completed: float, now: str) -> None:
+            progress.update(number, completed=completed, description=_escape_markup(now))
+
+        yield advance
+
+
+def task(text: str) -> contextlib.AbstractContextManager[Advance]:
+    """Show a spinner while the context lasts."""
+    return bar(text, None)

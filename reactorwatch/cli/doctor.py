@@ -51,19 +51,7 @@ class Finding(NamedTuple):
 def run_checks(
     config: BusConfig, plant: str, folder: Path, room_mb: float, timeout_s: float, now: datetime
 ) -> Iterator[Finding]:
-    """Run the checks of a deployment; those that need a router are skipped without one.
-
-    Args:
-        config: connection to the bus.
-        plant: name of the plant.
-        folder: folder of the recordings.
-        room_mb: space that recordings need there.
-        timeout_s: seconds to wait for nodes.
-        now: the time.
-
-    Raises:
-        InputError: a certificate or key cannot be read.
-    """
+    """Run the checks of a deployment; those that need a router are skipped without one."""
     yield from _check_certificate(config, plant, now)
     yield _check_disk(folder, room_mb)
     try:

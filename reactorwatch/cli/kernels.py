@@ -27,7 +27,6 @@ from reactorwatch.version import version
 from recorder.tools.player import samples_of
 
 log = structlog.get_logger()
-
 ROWS = 600
 """Rows of the record: enough for a diagnosis, and for a fault after the monitor's training."""
 

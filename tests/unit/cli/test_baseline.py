@@ -6,9 +6,9 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from reactorwatch.cli import baseline
+from reactorwatch.cli import bus_client
 from reactorwatch.cli.main import app
-from reactorwatch.cli.options import ClientOptions, ProcessOptions
+from reactorwatch.cli.option_groups import ClientOptions, ProcessOptions
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply
 from reactorwatch.errors import InputError
 
@@ -31,7 +31,7 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
             accepted=True, text=f"{command.what} by {command.by}, from the next row on", baselines=listed
         )
 
-    monkeypatch.setattr(baseline, "send_command", send)
+    monkeypatch.setattr(bus_client, "send_command", send)
     return commands
 
 
@@ -69,7 +69,7 @@ def test_the_list_is_one_line_or_one_object_a_baseline(sent: list[tuple[Any, ...
 
 
 def test_a_mode_is_a_column_of_a_process_without_a_file() -> None:
-    process = ProcessOptions(None, ["q"], ["th"]).choose(["phase,auto"]).load()
+    process = ProcessOptions(inputs=["q"], outputs=["th"]).choose(["phase,auto"]).load()
     assert process.names("mode") == ("phase", "auto")
     with pytest.raises(InputError, match="--mode needs an --output, got only the mode phase"):
         ProcessOptions().choose(["phase"])

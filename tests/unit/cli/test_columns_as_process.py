@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from monitor_node.config import MonitorConfig
 from reactorwatch.cli.main import app
-from reactorwatch.cli.runs import describe_in_file
+from reactorwatch.cli.my_plant import describe_in_file
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError

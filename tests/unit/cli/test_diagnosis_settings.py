@@ -7,7 +7,7 @@ import pytest
 
 from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
-from reactorwatch.cli.supervise import diagnosis_settings
+from reactorwatch.cli.up import diagnosis_settings
 from reactorwatch.errors import InputError
 
 MODEL = '{"format": "reactorwatch.model.v1", "model": "cstr"}'

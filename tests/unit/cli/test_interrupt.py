@@ -8,7 +8,7 @@ import pytest
 from llvmlite.binding import ExecutionEngine, create_pass_builder
 from llvmlite.binding.ffi import ObjectRef
 
-from reactorwatch.cli.interrupt import _BINDING, clear_interrupt, raise_until_handled
+from reactorwatch.cli.main import _BINDING, clear_interrupt, raise_until_handled
 
 
 @pytest.fixture(autouse=True)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from monitor_node.config import MonitorConfig
 from reactorwatch.cli.main import app
-from reactorwatch.cli.verification import _recorded_process
+from reactorwatch.cli.replay import _recorded_process
 from reactorwatch.errors import InputError
 from reactorwatch.process.fingerprint import fingerprint
 from reactorwatch.process.library.three_tanks.model import three_tanks

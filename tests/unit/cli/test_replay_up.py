@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from reactorwatch.cli import supervise
+from reactorwatch.cli import up
 from reactorwatch.cli.main import main
 
 
@@ -28,7 +28,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ..
         made.append(arguments)
         return 0
 
-    monkeypatch.setattr(supervise, "run_until_stopped", run_until_stopped)
+    monkeypatch.setattr(up, "run_until_stopped", run_until_stopped)
     return made
 
 

@@ -14,7 +14,7 @@ from plant_node.record import simulate_record
 from plant_node.scenario import HeldRecord
 from reactorwatch.api.backtest_report import backtest_object, backtest_text
 from reactorwatch.api.simulation import report, simulate_along
-from reactorwatch.cli import identification
+from reactorwatch.cli import identify
 from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
@@ -64,7 +64,7 @@ def test_no_row_is_identified_from_rows_of_another_run(whole: Record, model: str
         runs = 1 + (np.arange(ROWS) >= row)
         record = replace(whole, time_min=whole.time_min - back_min * (runs - 1), runs=runs)
         form = ModelForm(model, order=2)
-        return json.loads(identification.fit(record, ("qc",), ("T",), form, as_json=True))
+        return json.loads(identify.fit(record, ("qc",), ("T",), form, as_json=True))
 
     after_a_gap = identified(-50.0)
     assert identified(60.0) == after_a_gap

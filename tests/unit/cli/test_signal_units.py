@@ -13,8 +13,8 @@ from monitor_node.replay.backtest import Backtest, run
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.api.files import open_messages
-from reactorwatch.cli import identification
-from reactorwatch.cli.backtest_jobs import choose_settings
+from reactorwatch.cli import identify
+from reactorwatch.cli.backtest import choose_settings
 from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
@@ -100,11 +100,11 @@ def test_units_go_into_recordings_and_drawings_and_back(rig: Path, tmp_path: Pat
 def test_identification_uses_the_known_unit(rig: Path) -> None:
     measured = read_csv(rig, COLUMNS)
     form = ModelForm(order=2)
-    text = identification.fit(measured, ("qc",), ("C", "T"), form, as_json=False)
+    text = identify.fit(measured, ("qc",), ("C", "T"), form, as_json=False)
     assert "C (degC) from" in text
     assert "T (unit not known) from" in text
     own = replace(measured, units=UNITS)
-    assert "T (K) from" in identification.fit(own, ("qc",), ("T",), form, as_json=False)
+    assert "T (K) from" in identify.fit(own, ("qc",), ("T",), form, as_json=False)
 
 
 @given(

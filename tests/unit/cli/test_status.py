@@ -2,7 +2,7 @@
 
 from google.protobuf.message import Message
 
-from reactorwatch.cli.alarm import _line as alarm_line
+from reactorwatch.cli.alarm import _alarm_line as alarm_line
 from reactorwatch.cli.status import StatusBoard
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Priority, Quality, Sample, Suspect

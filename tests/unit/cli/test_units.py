@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from monitor_node.config import MonitorConfig
-from reactorwatch.cli import backtest_jobs
+from reactorwatch.cli import backtest
 from reactorwatch.cli.batch import Job
 from reactorwatch.cli.main import app
 from reactorwatch.diagnosis.units import find_wrong_unit
@@ -51,8 +51,8 @@ def remarks_of(record: Record, folder: Path) -> dict[str, str]:
     """What each command says of the units."""
     path, found = folder / "a.csv", {}
     write_table(path, record)
-    job = Job(path, path, backtest_jobs.BacktestOptions(settings=LEARNING, as_json=True))
-    found["backtest"] = backtest_jobs.run_job(job).remark
+    job = Job(path, path, backtest.BacktestOptions(settings=LEARNING, as_json=True))
+    found["backtest"] = backtest.run_job(job).remark
     for command in (["identify"], ["simulate", "-o", str(folder / "out.csv")], ["diagnose"]):
         result = CliRunner().invoke(app, [*command, str(path)])
         found[command[0]] = str(result.exception) if isinstance(result.exception, InputError) else result.stderr

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from monitor_node.config import MonitorConfig
-from reactorwatch.cli import supervise
+from reactorwatch.cli import up
 from reactorwatch.cli.main import main
-from reactorwatch.cli.options import BusOptions
+from reactorwatch.cli.option_groups import BusOptions
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import BusConfig, section
 from reactorwatch.runtime.event_loop import StopSignal
@@ -53,19 +53,19 @@ def test_up_records_in_the_folder_of_flag_then_settings_then_default(
 
     monkeypatch.chdir(tmp_path)
     Path("settings.toml").write_text(settings, encoding="utf-8")
-    monkeypatch.setattr(supervise, "open_router", lambda *_: nullcontext())
-    monkeypatch.setattr(supervise, "Processes", stop_here)
+    monkeypatch.setattr(up, "open_router", lambda *_: nullcontext())
+    monkeypatch.setattr(up, "Processes", stop_here)
     with pytest.raises(KeyboardInterrupt):
-        supervise.run_until_stopped(BusOptions(Path("settings.toml")), Path(flag) if flag else None, {})
+        up.run_until_stopped(BusOptions(Path("settings.toml")), Path(flag) if flag else None, {})
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [expected]
     assert len(list((tmp_path / expected).glob("*.toml"))) == 1
 
 
 def test_up_leaves_a_recording_of_that_name_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervise, "open_router", lambda *_: nullcontext())
+    monkeypatch.setattr(up, "open_router", lambda *_: nullcontext())
     (tmp_path / "run.mcap").write_bytes(b"")
     with pytest.raises(InputError, match="a recording of that name exists"):
-        supervise.run_until_stopped(BusOptions(), tmp_path / "run.mcap", {})
+        up.run_until_stopped(BusOptions(), tmp_path / "run.mcap", {})
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
 
 

@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 from rich.text import Text
 
 from reactorwatch.axis import axis
-from reactorwatch.cli.backtest_jobs import RowsOfFile, write_rows
+from reactorwatch.cli.backtest import RowsOfFile, write_rows
 from reactorwatch.cli.batch import write_summary
-from reactorwatch.cli.display import format_report, format_rows
-from reactorwatch.cli.files import _report_text
-from reactorwatch.cli.progress import _escape_markup
+from reactorwatch.cli.display import _escape_markup, format_report, format_rows
+from reactorwatch.cli.recordings import _report_text
 from reactorwatch.diagnosis.report import mathml, svg
 from reactorwatch.errors import InputError
 from reactorwatch.records.cells import quote_formula, unquote_formula

@@ -7,8 +7,7 @@ from typing import Any
 from monitor_node.config import MonitorConfig
 from monitor_node.replay.message_diff import Difference
 from monitor_node.replay.verification import COMPARED, Verification, verify
-from reactorwatch.cli.printing import json_line, print_lines, print_text
-from reactorwatch.cli.progress import task
+from reactorwatch.cli.display import json_line, print_lines, print_text, task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.choice import ProcessChoice
@@ -26,26 +25,13 @@ from recorder.tools.inspect import zero_ns_of
 
 SETTINGS = "settings"
 """Name of the nodes' settings in the metadata of a recording."""
+
 MAX_LINES = 10
 MAX_VALUE = 60
 
 
 def run(file: Path, config: Path | None, plant: str | None, process: str | None = None, *, as_json: bool) -> int:
-    """Verify a recording and print the result.
-
-    Args:
-        file: the recording, or a folder of them.
-        config: settings file; None: the settings in the recording.
-        plant: plant of the monitor; None: the only one in the recording.
-        process: name or file of the process; None: that of the settings file, or the one that the recording describes.
-        as_json: print one JSON object.
-
-    Returns:
-        The exit code: 0 if every recorded message is reproduced, 1 if not.
-
-    Raises:
-        InputError: the recording cannot be read, or holds nothing to verify.
-    """
+    """Verify a recording and print the result."""
     if is_table(file):
         raise InputError(f"{file}: holds no alarms to verify; a recording (.mcap) was expected")
     recording = Recording(file)
@@ -96,9 +82,6 @@ def _recorded_process(recording: Recording, monitor: MonitorConfig) -> Process |
     """Process that the settings in a recording name: of the catalogue, or as the recording itself describes it.
 
     A file that they name is not opened. None: they name none.
-
-    Raises:
-        InputError: the recording does not hold the equations that judged.
     """
     path = ProcessChoice(monitor.process).file
     described = None if path is None else recording.process(monitor.plant)
@@ -108,11 +91,7 @@ def _recorded_process(recording: Recording, monitor: MonitorConfig) -> Process |
 
 
 def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: str) -> MonitorConfig:
-    """Settings of the monitor when this was recorded.
-
-    Raises:
-        InputError: they are neither given nor in the recording.
-    """
+    """Settings of the monitor when this was recorded."""
     if config is not None:
         tables = read_settings(config)
     elif SETTINGS in metadata:
