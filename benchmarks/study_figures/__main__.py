@@ -33,7 +33,7 @@ def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
 def _reproduce(asked: argparse.Namespace) -> int:
     from benchmarks.study_figures.reproduce import check_out, reproduce
     from reactorwatch.api.files import record
-    from reactorwatch.cli.display import print_text
+    from reactorwatch.cli.display import print_report
     from reactorwatch.cli.options import check_recording
 
     if asked.seed < 0:
@@ -44,7 +44,7 @@ def _reproduce(asked: argparse.Namespace) -> int:
     measured = None if asked.record is None else record(check_recording(asked.record))
     if measured is not None and measured.runs is not None:
         raise InputError(f"--record {asked.record}: must be one run, {measured.describe_runs()}; cut one run out of it")
-    print_text(reproduce(asked.out, asked.seed, asked.only, measured, data=asked.data, processes=asked.jobs))
+    print_report(reproduce(asked.out, asked.seed, asked.only, measured, data=asked.data, processes=asked.jobs))
     return 0
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
-from reactorwatch.cli.display import json_line, print_lines, print_report, print_text, task
+from reactorwatch.cli.display import json_line, print_lines, print_report, task
 from reactorwatch.cli.option_groups import (
     FILE,
     ProcessOption,
@@ -293,7 +293,7 @@ def causes(
     with task(f"comparing the causes of {described.name}"):
         found = identifiability(model, described.causes, run)
     show = as_json_text if as_json else as_matrix
-    print_text(show(found, described.name, run.time_min.size))
+    print_report(show(found, described.name, run.time_min.size), as_json=as_json)
 
 
 def simulate(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 from typer import Option
 
-from reactorwatch.cli.display import print_text
+from reactorwatch.cli.display import print_lines
 from reactorwatch.cli.options import MAX_WAIT_S, parse_columns, split_at_commas
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
@@ -301,7 +301,7 @@ def _help_option(group: str, names: list[str]) -> inspect.Parameter:
             option.hidden = False  # type: ignore[attr-defined] # arguments are in no group
         with formatter.section(GROUPS[group]):
             formatter.write_dl([record for option in options if (record := option.get_help_record(context))])
-        print_text(formatter.getvalue().rstrip())
+        print_lines(*formatter.getvalue().rstrip().split("\n"))
         raise typer.Exit
 
     others = len(names) - _NAMED

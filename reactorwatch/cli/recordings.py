@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from reactorwatch.cli.display import json_line, print_lines, print_text, task
+from reactorwatch.cli.display import json_line, print_lines, print_report, task
 from reactorwatch.cli.option_groups import (
     ColumnOptions,
     PlantOptions,
@@ -197,7 +197,7 @@ def import_csv(
     with task(f"importing {files[0].name}"):
         sources = list(map(check_input, files))
         record = convert(sources, out, table.plant, table.columns, stated=table.stated, choice=choice)
-    print_text(_report_text(out, record))
+    print_report(_report_text(out, record))
 
 
 def export_csv(
@@ -217,7 +217,7 @@ def export_csv(
     out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
     with task(f"exporting {file.name}"):
         record = convert(check_recording(file), out, table.plant, clock=clock, stated=table.stated, choice=choice)
-    print_text(_report_text(out, record))
+    print_report(_report_text(out, record))
 
 
 def _report_text(out: Path, record: "Record") -> str:
@@ -248,7 +248,8 @@ def recover(
     out = check_output(out, ".mcap", (file,), force=force) if out is not None else _beside(file)
     with task(f"recovering {file.name}"):
         saved = save(file, out)
-    print_text(json_line(saved_object(saved, out)) if as_json else saved_text(saved, file, out))
+    text = json_line(saved_object(saved, out)) if as_json else saved_text(saved, file, out)
+    print_report(text, as_json=as_json)
 
 
 def cut(

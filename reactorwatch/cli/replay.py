@@ -7,7 +7,7 @@ from typing import Any
 from monitor_node.config import MonitorConfig
 from monitor_node.replay.message_diff import Difference
 from monitor_node.replay.verification import COMPARED, Verification, verify
-from reactorwatch.cli.display import json_line, print_lines, print_text, task
+from reactorwatch.cli.display import json_line, print_lines, print_report, task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.choice import ProcessChoice
@@ -17,7 +17,6 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import parse_tables, read_settings, section
-from reactorwatch.terminal import printable_lines
 from reactorwatch.version import UNKNOWN, describe_build, this_build
 from recorder.files.metadata import gaps_of
 from recorder.files.recording import Recording, has_clock
@@ -64,7 +63,7 @@ def run(file: Path, config: Path | None, plant: str | None, process: str | None 
     }
     if as_json:
         report["notes"] = other_builds + report["notes"]
-    print_text(json_line(report) if as_json else _text(report))
+    print_report(json_line(report) if as_json else _text(report), as_json=as_json)
     return 0 if verification.exact else 1
 
 
@@ -154,7 +153,7 @@ def _text(report: dict[str, Any]) -> str:
     if report["after_the_end"]:
         lines.append(f"{report['after_the_end']} more would have come after the end of the recording")
     lines += [f"note: {note}" for note in report["notes"]]
-    return printable_lines(lines)
+    return "\n".join(lines)
 
 
 def _short(text: str) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from math import inf, isnan
 from typing import TYPE_CHECKING, Any
 
-from reactorwatch.cli.display import has_colour, json_line, print_lines, print_screen_text, screen_width
+from reactorwatch.cli.display import Screen, json_line, print_lines, print_screen_text, screen
 from reactorwatch.cli.status_view import ANNUNCIATED, Now, age_s, format_plant, sort_alarms
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import priority_word, set_suspects, state_word
@@ -134,14 +134,14 @@ class StatusBoard:
                 **promise_fields(self._promises.get(name)),
             }
 
-    def text(self, now_ns: int, width: int | None = None, *, colour: bool = False) -> str:
+    def text(self, now_ns: int, to: Screen = Screen()) -> str:  # noqa: B008 (it is frozen)
         """State of all plants for people; see `format_plant`."""
         parts = []
         for name in self.plants:
             plant = self.plant(name, now_ns)
             with self._lock:
                 alarms, now = self._visible_alarms(name), self._now(name, now_ns)
-            parts.append(format_plant(plant, alarms, now, width=width, colour=colour))
+            parts.append(format_plant(plant, alarms, now, to))
         return "\n\n".join(parts) or "no nodes"
 
     def _visible_alarms(self, plant: str) -> list[Alarm]:
@@ -295,7 +295,7 @@ def _text(board: StatusBoard, *, as_json: bool = False) -> str:
     if as_json:
         plants = [board.plant(name, now_ns) for name in board.plants]
         return printable(json_line({"plants": plants}))
-    return board.text(now_ns, screen_width(), colour=has_colour())
+    return board.text(now_ns, screen())
 
 
 def _alarm(alarm: Alarm, now: Now) -> dict[str, Any]:

@@ -7,14 +7,16 @@ from reactorwatch.cli.display import (
     ATTENTION,
     CAUSE,
     FAINT,
+    GAP,
     RIGHT,
     STRONG,
     WRONG,
     Cell,
     Row,
+    Screen,
     format_age,
-    format_report,
     format_rows,
+    wrap_line,
 )
 from reactorwatch.contract.alarm_text import describe_suspects, priority_word, state_word
 from reactorwatch.contract.keys import RECORDING
@@ -92,20 +94,24 @@ _INDENT = 2
 
 
 def format_plant(
-    plant: dict[str, Any], alarms: Sequence[Alarm], now: Now, *, width: int | None = None, colour: bool = False
+    plant: dict[str, Any],
+    alarms: Sequence[Alarm],
+    now: Now,
+    to: Screen = Screen(),  # noqa: B008 (it is frozen)
 ) -> str:
-    """Format the status of a plant."""
-    parts = [format_rows([_values(plant)], width=width, colour=colour)]
+    """Format the status of a plant, the object that `status --json` prints for it, with its annunciated alarms."""
     nodes = [_node(node) for node in plant["nodes"]]
-    parts.append(format_rows(nodes or [("no nodes",)], _INDENT, width=width, colour=colour))
-    promise = format_rows(_promise(plant), _INDENT, colour=colour and width is None)
-    parts.append(promise if width is None else format_report(promise.split("\n"), width, colour=colour))
+    parts = [
+        format_rows([_values(plant)], to=to),
+        format_rows(nodes or [("no nodes",)], _INDENT, to),
+        format_rows(_promise(plant, to.width), _INDENT, to),
+    ]
     if alarms:
-        parts.append(format_rows(alarm_rows(alarms, now), _INDENT, width=width, colour=colour))
         advice = advise_acknowledgement(alarms, plant["plant"])
-        parts.append(format_rows([(Cell(advice, FAINT),)] if advice else [], _INDENT, width=width, colour=colour))
+        parts.append(format_rows(alarm_rows(alarms, now), _INDENT, to))
+        parts.append(format_rows([(Cell(advice, FAINT),)] if advice else [], _INDENT, to))
     else:
-        parts.append(format_rows([(Cell("no alarms", RIGHT),)], _INDENT, width=width, colour=colour))
+        parts.append(format_rows([(Cell("no alarms", RIGHT),)], _INDENT, to))
     return "\n".join(filter(None, parts))
 
 
@@ -124,16 +130,21 @@ def _values(plant: dict[str, Any]) -> Row:
     return (*cells, *([] if rate is None else [Cell(f"{rate:.3g} samples/s", FAINT if rate else WRONG)]))
 
 
-def _promise(plant: dict[str, Any]) -> list[Row]:
-    """Promise of false alarms and the power, if they are known."""
+def _promise(plant: dict[str, Any], width: int | None) -> list[Row]:
+    """Promise of false alarms and the power, if they are known, each wrapped beside its name."""
     promise = plant["promise"]
     if promise is None:
         return []
     is_good = promise["kept"] and not promise["drifted"]
-    rows: list[Row] = [("promise", Cell(promise["text"], "" if is_good else ATTENTION))]
+    named = {"promise": Cell(promise["text"], "" if is_good else ATTENTION)}
     if plant["power"]:
-        rows.append(("seen in an hour", Cell(describe_power(plant["power"]), FAINT)))
-    return rows
+        named["seen in an hour"] = Cell(describe_power(plant["power"]), FAINT)
+    room = None if width is None else width - _INDENT - max(map(len, named)) - GAP
+    return [
+        (name if index == 0 else "", Cell(line, style))
+        for name, (text, style) in named.items()
+        for index, line in enumerate(wrap_line(text, room))
+    ]
 
 
 def _node(node: dict[str, Any]) -> Row:

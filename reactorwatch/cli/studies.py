@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from reactorwatch.cli.display import json_line, print_lines, print_text
+from reactorwatch.cli.display import json_line, print_lines, print_report
 from reactorwatch.cli.option_groups import ProcessOption, new_group
 from reactorwatch.cli.options import Json, Site, parse_pace
 from reactorwatch.errors import InputError
@@ -25,7 +25,7 @@ def linearise(
     """Print the linear models at all steady states of constant inputs."""
     from reactorwatch.cli.linearise import describe
 
-    print_text(describe(chosen.choose().load().require_model(), levels, step, as_json=as_json))
+    print_report(describe(chosen.choose().load().require_model(), levels, step, as_json=as_json), as_json=as_json)
 
 
 Shift = Annotated[float, Option(help="Of the mean, in standard deviations; 0: the false alarms.")]
@@ -116,12 +116,12 @@ def list_charts() -> None:
     from reactorwatch.spc.charts.catalogue import CHARTS
 
     for kind in CHARTS:
-        print_text(f"{kind.name:<11} {(kind.__doc__ or '').partition(chr(10))[0]}")
+        print_lines(f"{kind.name:<11} {(kind.__doc__ or '').partition(chr(10))[0]}")
         for item in kind.settings:
             if isinstance(item, Setting):
-                print_text(f"{'':<11} {item.key} = {item.default:g}, in [{item.lower:g}, {item.upper:g}]")
+                print_lines(f"{'':<11} {item.key} = {item.default:g}, in [{item.lower:g}, {item.upper:g}]")
             else:
-                print_text(f"{'':<11} {item.key}: at most {item.most} of the signals")
+                print_lines(f"{'':<11} {item.key}: at most {item.most} of the signals")
 
 
 def design(

@@ -3,6 +3,7 @@
 from google.protobuf.message import Message
 
 from reactorwatch.cli.alarm import _alarm_line as alarm_line
+from reactorwatch.cli.display import Screen
 from reactorwatch.cli.status import StatusBoard
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Priority, Quality, Sample, Suspect
@@ -152,7 +153,7 @@ def test_alarms_are_sorted_by_priority_and_incident_and_each_line_fits() -> None
         item = alarm(name, AlarmState.ALARM_STATE_UNACKNOWLEDGED, Priority.Name(priority))  # type: ignore[arg-type]
         item.incident, item.text = incident, "a sentence that is much longer than a terminal is wide " * 3
         board.on_message(encoded(f"p/alarm/{name}", item))
-    lines = board.text(START_NS, width=80).splitlines()
+    lines = board.text(START_NS, Screen(80)).splitlines()
     shown = [line for line in lines if "…" in line]
     assert [line.split()[2] for line in shown] == ["a/3", "a/2", "a/1"]
     assert max(map(len, lines)) <= 80

@@ -16,7 +16,7 @@ from rich.text import Text
 from reactorwatch.axis import axis
 from reactorwatch.cli.backtest import RowsOfFile, write_rows
 from reactorwatch.cli.batch import write_summary
-from reactorwatch.cli.display import _escape_markup, format_report, format_rows
+from reactorwatch.cli.display import Screen, _escape_markup, format_rows, wrap_line
 from reactorwatch.cli.recordings import _report_text
 from reactorwatch.diagnosis.report import mathml, svg
 from reactorwatch.errors import InputError
@@ -145,8 +145,8 @@ def test_a_name_on_a_terminal_is_shown_and_not_acted_on(name: str) -> None:
     shown = printable(name)
     assert Text.from_markup(_escape_markup(name)).plain == shown
     for colour in (False, True):
-        rows = format_rows([[name, "2"], ["T", name]], width=80, colour=colour)
-        report = format_report([printable(f"  {name}   2")], 80, colour=colour)
+        rows = format_rows([[name, "2"], ["T", name]], to=Screen(80, colour))
+        report = "\n".join(wrap_line(printable(f"  {name}   2"), 80))
         for text in (rows, report):
             plain = re.sub(r"\x1b\[[\d;]*m", "", text)
             assert shown in plain
