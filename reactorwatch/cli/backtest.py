@@ -49,49 +49,29 @@ LOG_COLUMNS = ("file", "row", "time_min", "in_alarm", "raised")
 
 @dataclass(frozen=True, kw_only=True)
 class BacktestOptions(FileOptions):
-    """Options of a back-test.
+    """Options of a back-test."""
 
-    Attributes:
-        settings: settings of the monitor, except the plant, which the file may name.
-        log_rows: return the rows with their alarms.
-        is_one_of_many: name the file in the result, because there are others.
-        trained: result of a training on another file; None: each file begins with a training.
-    """
-
-    settings: MonitorConfig
+    settings: MonitorConfig  # but for the plant, which the file may name
     log_rows: bool = False
-    is_one_of_many: bool = False
-    trained: TrainedPlant | None = None
+    is_one_of_many: bool = False  # it is then named in its result
+    trained: TrainedPlant | None = None  # on another file; else each begins with a training
 
 
 class RowsOfFile(NamedTuple):
-    """The rows of a file with their alarms.
-
-    Attributes:
-        file: the file as named.
-        rows: the rows.
-        zero_ns: time from which their minutes are counted.
-    """
+    """The rows of a file with their alarms."""
 
     file: Path
     rows: list[LoggedRow]
-    zero_ns: int
+    zero_ns: int  # from which their minutes are counted
 
 
 class _Opened(NamedTuple):
-    """A file that is open, and the settings to watch it by.
-
-    Attributes:
-        source: messages of the file.
-        watched: settings and equations.
-        process: process that was named, recorded or described by its columns; None: as the settings say.
-        still: inputs that never move, with the reason why they explain nothing.
-    """
+    """A file that is open, and the settings to watch it by."""
 
     source: MessageSource
     watched: WatchedProcess
-    process: Process | None
-    still: dict[str, str]
+    process: Process | None  # named, recorded or described by its columns
+    still: dict[str, str]  # inputs that never move, and why they explain nothing
 
 
 def choose_settings(settings: MonitorConfig, choice: ProcessChoice) -> ProcessChoice:

@@ -41,17 +41,9 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class FileOptions:
-    """Options of a command, the same for all files.
+    """Options of a command, the same for all files."""
 
-    Attributes:
-        plant: plant in recordings; None: the only one.
-        columns: names of columns by signal.
-        process: the process; the default: as recorded, or as the settings of the command say.
-        stated: statements about the form of a table.
-        as_json: format the results as JSON.
-    """
-
-    plant: str | None = None
+    plant: str | None = None  # in recordings; None: the only one
     columns: dict[str, str] = field(default_factory=dict)
     process: ProcessChoice = DEFAULT_CHOICE
     stated: FileFormat = GUESS
@@ -59,55 +51,35 @@ class FileOptions:
 
 
 class Job(NamedTuple, Generic[Options]):
-    """A file and what is done with it.
+    """A file and what is done with it."""
 
-    Attributes:
-        file: the file as named.
-        at: path of the file for the worker.
-        asked: options of the command.
-        folder: folder for what is written about the file; None: nothing is.
-    """
-
-    file: Path
-    at: Path
+    file: Path  # as named
+    at: Path  # for the worker
     asked: Options
-    folder: Path | None = None
+    folder: Path | None = None  # for what is written about the file
 
 
 @dataclass(frozen=True)
 class JobResult:
-    """Result of a file.
-
-    Attributes:
-        text: output.
-        row: row of the summary.
-        remark: remark on the file for standard error; empty: none.
-        not_written: error of writing the result's files; empty: none.
-        not_watched: reason why no row could be judged; empty: one was.
-        extra: what else the command needs of the file.
-    """
+    """Result of a file."""
 
     text: str
     row: Row
-    remark: str = ""
-    not_written: str = ""
-    not_watched: str = ""
-    extra: Any = None
+    remark: str = ""  # for standard error
+    not_written: str = ""  # why the files of the result are not
+    not_watched: str = ""  # why no row could be judged
+    extra: Any = None  # what else the command needs
 
 
 @dataclass(frozen=True)
 class JobKind(Generic[Options]):
     """A kind of job.
 
-    Attributes:
-        doing: name of the work, for the progress display.
-        work: runs a job.
-        columns: names of a row's results, between `watched` and `error`; null for a file that could not be used.
-            `watched` is false for one that holds too little, and null for one that cannot be read.
-        summary: formats rows as a table.
+    The columns are the names of a row's results, between `watched` and `error`. `watched` is false for a file that
+    holds too little, and null for one that cannot be read.
     """
 
-    doing: str
+    doing: str  # for the progress display
     work: Callable[[Job[Options]], JobResult]
     columns: tuple[str, ...]
     summary: Callable[[Sequence[Row]], str]

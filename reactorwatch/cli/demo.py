@@ -17,6 +17,7 @@ from plant_node.config import PlantConfig
 from reactorwatch.api.files import open_messages
 from reactorwatch.cli.display import bar, format_age, print_lines, print_report, task
 from reactorwatch.cli.kernels import compile_at_first_start
+from reactorwatch.cli.plant_settings import WAIT_FOR, complete_plant_settings
 from reactorwatch.cli.processes import (
     POLL_S,
     Processes,
@@ -26,7 +27,6 @@ from reactorwatch.cli.processes import (
     restrict_to_plant,
     write_node_settings,
 )
-from reactorwatch.cli.up import WAIT_FOR, complete_plant_settings
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.contract.codec import Encoded, decode

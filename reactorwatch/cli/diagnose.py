@@ -51,18 +51,11 @@ REPORT = (PAGE, OBJECT, MODEL, DRAWING, EXPERIMENT)
 
 @dataclass(frozen=True, kw_only=True)
 class DiagnosisOptions(FileOptions):
-    """Options of a diagnosis.
-
-    Attributes:
-        uncertain: parameters with a standard deviation, as text; None: none.
-        tolerance: differences that do not matter, by output.
-        limits: lowest and highest values of an experiment, by signal.
-        without: causes that are left out, by name.
-    """
+    """Options of a diagnosis."""
 
     uncertain: str | None = None
-    tolerance: dict[str, float] = field(default_factory=dict)
-    limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    tolerance: dict[str, float] = field(default_factory=dict)  # differences that do not matter, by output
+    limits: dict[str, tuple[float, float]] = field(default_factory=dict)  # of an experiment, by signal
     without: tuple[str, ...] = ()
 
 

@@ -35,17 +35,11 @@ MB = 1_000_000
 
 
 class Finding(NamedTuple):
-    """Result of one check.
-
-    Attributes:
-        check: name of the check.
-        found: the result.
-        cure: the action to take; empty if nothing is wrong.
-    """
+    """Result of one check."""
 
     check: str
     found: str
-    cure: str = ""
+    cure: str = ""  # empty if nothing is wrong
 
 
 def run_checks(

@@ -47,7 +47,8 @@ def up(
 
     With --record a record is played in place of the simulated plant; the run ends with it.
     """
-    from reactorwatch.cli.up import PlayedRecord, run_until_stopped
+    from reactorwatch.cli.plant_settings import PlayedRecord
+    from reactorwatch.cli.up import run_until_stopped
 
     flags = {
         "name": target.name,
@@ -101,7 +102,7 @@ def plant(
     """Simulate a process with equations and publish its sensors' samples."""
     from plant_node.__main__ import run
     from reactorwatch.cli.bus_client import metrics_settings, node_settings
-    from reactorwatch.cli.up import load_plant_settings
+    from reactorwatch.cli.plant_settings import load_plant_settings
 
     tables, bus = node_settings(target)
     flags = {

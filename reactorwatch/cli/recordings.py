@@ -95,7 +95,8 @@ def replay(
         _refuse(given, "--verify publishes nothing and takes the whole recording")
         raise typer.Exit(run(check_recording(file), target.config, target.name, chosen.process, as_json=as_json))
     if up:
-        from reactorwatch.cli.up import PlayedRecord, run_until_stopped
+        from reactorwatch.cli.plant_settings import PlayedRecord
+        from reactorwatch.cli.up import run_until_stopped
 
         _refuse(
             {**part, "--input": chosen.inputs, "--output": chosen.outputs},

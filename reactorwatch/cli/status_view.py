@@ -41,15 +41,10 @@ def sort_alarms(alarms: Iterable[Alarm]) -> list[Alarm]:
 
 
 class Now(NamedTuple):
-    """Present times, in ns: an alarm's age is in that of the node that raises it.
+    """Present times, in ns: an alarm's age is in that of the node that raises it."""
 
-    Attributes:
-        plant: plant time, of the monitor's alarms.
-        clock: clock time, of the recorder's alarms.
-    """
-
-    plant: int
-    clock: int
+    plant: int  # of the monitor's alarms
+    clock: int  # of the recorder's alarms
 
 
 def age_s(alarm: Alarm, now: Now) -> float | None:

@@ -9,8 +9,8 @@ import pytest
 
 from reactorwatch.api.records import read_record
 from reactorwatch.cli.main import main
+from reactorwatch.cli.plant_settings import PlayedRecord, load_source
 from reactorwatch.cli.processes import Processes
-from reactorwatch.cli.up import PlayedRecord, load_source
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Health, Sample

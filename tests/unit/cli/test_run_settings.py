@@ -10,7 +10,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.cli.bus_client import observed_process
 from reactorwatch.cli.demo import choose_fault
-from reactorwatch.cli.up import PlayedRecord, load_source
+from reactorwatch.cli.plant_settings import PlayedRecord, load_source
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
