@@ -29,7 +29,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Sample
-from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.library.cstr.model import cstr
 from recorder.tools.player import samples_of
 

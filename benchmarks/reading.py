@@ -19,7 +19,7 @@ import numpy as np
 from reactorwatch.description.find import find_process
 from reactorwatch.description.read import read_process_table
 from reactorwatch.records.record import Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 
 ROWS = 1_000_000
 REPETITIONS = 5

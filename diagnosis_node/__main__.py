@@ -19,7 +19,7 @@ from diagnosis_node.trigger import DiagnosisConfig, DiagnosisTrigger
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.errors import InputError
-from reactorwatch.records.folder import make_folder
+from reactorwatch.records.write import make_folder
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, stop_on_signals
 from reactorwatch.runtime.node_main import main

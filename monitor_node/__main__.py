@@ -22,7 +22,7 @@ from monitor_node.health import NODE
 from monitor_node.node import MonitorNode, instance_token
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
-from reactorwatch.records.folder import make_folder
+from reactorwatch.records.write import make_folder
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals

@@ -21,7 +21,7 @@ from reactorwatch.contract.alarm_text import state_word
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, Baseline, CommandReply, Health, Incident
 from reactorwatch.errors import InputError
-from reactorwatch.records.folder import make_folder
+from reactorwatch.records.write import make_folder
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.metrics import Metrics
 from reactorwatch.runtime.security.audit import is_query

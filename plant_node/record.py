@@ -15,7 +15,7 @@ from reactorwatch.description.process import Process
 from reactorwatch.description.read import convert_to_process
 from reactorwatch.process.effect import TIMING
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.read_table import SignalColumn, read_table
+from reactorwatch.records.read import SignalColumn, read_table
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import read_extended_model
 

@@ -22,7 +22,7 @@ import tomli_w
 from reactorwatch.contract import keys
 from reactorwatch.description.plants import PlantProcesses
 from reactorwatch.errors import InputError
-from reactorwatch.records.folder import make_folder
+from reactorwatch.records.write import make_folder
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder import RecordedMessage, StoredMessage
 from recorder.config import MB, RecorderConfig

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.write import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,10 +12,8 @@ from benchmarks.study_figures.page import FOLDER, page
 from benchmarks.study_figures.study import Study
 from reactorwatch.cli.batch import results_in_order
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.folder import fill_folder, make_folder
-from reactorwatch.records.output import check_output_folder
 from reactorwatch.records.record import Record
+from reactorwatch.records.write import atomic_write, check_output_folder, fill_folder, make_folder
 from reactorwatch.runtime.parallel.jobs import Failed
 from reactorwatch.terminal import printable_lines
 

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.folder import make_folder
+from reactorwatch.records.write import atomic_write, make_folder
 from reactorwatch.runtime.loopback import free_port
 from recorder.view.viewer import describe_exit, viewer
 

@@ -39,9 +39,8 @@ from reactorwatch.diagnosis.fitting.fault_filter import HUBER, FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import EndedRamp, FittedProfile, Ramp, Step
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.innovations import FilterResult
-from reactorwatch.kalman.step_budget import StepBudget
+from reactorwatch.kalman.batch import FilterResult, StepBudget
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import ProcessModel
 

@@ -33,12 +33,12 @@ from monitor_node.causes.fit import Fitter, log_evidence_of_residual
 from monitor_node.causes.scan import Candidate, GlrScan
 from monitor_node.causes.window import Row, newest_rows, window_of
 from reactorwatch.diagnosis.fitting.profiles import Ramp, Step
-from reactorwatch.kalman.ekf import Filter, NoiseLevels
-from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
-from reactorwatch.kalman.step_budget import BudgetExceededError, StepBudget
+from reactorwatch.kalman.batch import BudgetExceededError, StepBudget
+from reactorwatch.kalman.ekf import Filter
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process import own_effects
 from reactorwatch.process.effect import Effect, SensorEffect
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 
 UNKNOWN = "unknown"

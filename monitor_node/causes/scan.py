@@ -23,7 +23,7 @@ from reactorwatch.diagnosis.fitting.augmented_model import augment_model
 from reactorwatch.diagnosis.fitting.hypothesis import Fit
 from reactorwatch.diagnosis.fitting.profiles import EndedRamp, FittedProfile, Ramp, Signal, Step
 from reactorwatch.diagnosis.run import input_uncertainty_of
-from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import ProcessModel

@@ -29,8 +29,9 @@ from monitor_node.learn.references import PlantEquations
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Reconstruction as ReconstructionMessage
-from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
-from reactorwatch.kalman.step_budget import STEPS_PER_PREDICTION, STEPS_PER_ROW, BudgetExceededError, StepBudget
+from reactorwatch.kalman.batch import STEPS_PER_PREDICTION, STEPS_PER_ROW, BudgetExceededError, StepBudget
+from reactorwatch.kalman.ekf import Filter, FilterState
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.effect import SensorEffect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS

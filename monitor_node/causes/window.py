@@ -6,7 +6,7 @@ every cause, if it stands out, alone or with its neighbour, from those before an
 is the newest one if it is far off and the one before was not: nothing confirms it yet.
 
 Where rows are missing and the input after them differs, the time of the change is unknown (see
-`kalman.input_uncertainty`): no cause may be inferred from a lost row.
+`kalman.batch.InputUncertainty`): no cause may be inferred from a lost row.
 """
 
 from array import array
@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 from monitor_node.ingest.rows import missing_rows
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.ekf import LONGEST_GAP_MIN, Filter, FilterState
-from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN, FilterRecord
-from reactorwatch.kalman.input_uncertainty import InputUncertainty
+from reactorwatch.kalman.batch import GATE, LONGEST_GAP_MIN, LONGEST_ROW_MIN, FilterRecord, InputUncertainty
+from reactorwatch.kalman.ekf import Filter, FilterState
 from reactorwatch.stored_state import Memory
 
 Row: TypeAlias = tuple[float, Sequence[float], Sequence[float]]
@@ -33,9 +32,6 @@ Row: TypeAlias = tuple[float, Sequence[float], Sequence[float]]
 
 BURN_IN_ROWS = 20
 """Number of rows at the start in which the filter settles: no onset is sought there."""
-
-GATE = 6.0
-"""Standard deviations beyond which a value has to be confirmed."""
 
 _OF_THREE = 1.5**0.5  # standard deviation of a value minus the mean of its neighbours, for white noise
 

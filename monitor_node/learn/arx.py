@@ -30,11 +30,12 @@ from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import MeasuredRow
-from monitor_node.learn.references import GATE, Reference, RowPrediction
+from monitor_node.learn.references import Reference, RowPrediction
 from reactorwatch.arrays import Array
 from reactorwatch.identification.regressor import Rows
 from reactorwatch.identification.rls import RecursiveLeastSquares, RlsMemory
 from reactorwatch.identification.structure import Scaling, Structure
+from reactorwatch.kalman.batch import GATE
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.parameters import ParameterT2

@@ -35,7 +35,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.errors import InputError
 from reactorwatch.identification.structure import Structure
-from reactorwatch.kalman.resolution import resolution_sd
+from reactorwatch.kalman.noise_estimation import resolution_sd
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc.prewhitening import Prewhitening, learn
 from reactorwatch.spc.step_test import ROWS as STEP_ROWS

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from monitor_node.ingest.rows import TOLERANCE, MeasuredRow, regular_intervals
-from monitor_node.learn.references import GATE, FilterReference, Reference, RowFilter, RowPrediction
+from monitor_node.learn.references import FilterReference, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
@@ -19,6 +19,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.identification.black_box.filter import MEMORY, BlackBoxFilter, BlackBoxFilterMemory
 from reactorwatch.identification.black_box.fit import fit_black_box
 from reactorwatch.identification.black_box.model import BlackBoxModel
+from reactorwatch.kalman.batch import GATE
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory, copy_of

@@ -10,18 +10,18 @@ import msgspec
 import numpy as np
 
 from monitor_node.ingest.rows import NO_INTERVAL, MeasuredRow, missing_in_intervals
-from monitor_node.learn.references import GATE, FilterReference, PlantEquations, Reference, RowFilter, RowPrediction
+from monitor_node.learn.references import FilterReference, PlantEquations, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
-from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
-from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, row_function
-from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN, FilterRecord
-from reactorwatch.kalman.noise_estimation import NoiseFit, fit_noise
-from reactorwatch.kalman.uncertain_model import is_disturbance, learned_parameters, noise_starts, widen_model
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.kalman.batch import GATE, LONGEST_ROW_MIN, FilterRecord
+from reactorwatch.kalman.ekf import Filter, FilterState
+from reactorwatch.kalman.ekf_step import NoiseLevels, row_function
+from reactorwatch.kalman.filter_states import is_disturbance, learned_parameters, widen_model
+from reactorwatch.kalman.noise_estimation import NoiseFit, fit_noise, noise_starts
+from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory, copy_of
 
@@ -35,7 +35,7 @@ class ProcessMemory(Memory, tag="process"):
     Attributes:
         noise: noise of the plant and its sensors, of all states of the filter.
         learned: values of the parameters of what the filter estimates beside the states of the model
-            (`kalman.uncertain_model.learned_parameters`).
+            (`kalman.filter_states.learned_parameters`).
         alone: noise with which the equations alone, without disturbances, are likeliest; None: `noise`.
         filter: state of the filter; None before the first row.
         last_inputs: the newest value of each input that was not missing; NaN before the first.
@@ -221,7 +221,7 @@ class ProcessReference(FilterReference):
     @property
     def numbers(self) -> tuple[Array, Array]:
         """Belief of the filter, and its variances: its own numbers, see `Filter`."""
-        return self._filter.belief, self._filter.variances
+        return self._filter.numbers
 
     def accept_row(self, time_min: float, inputs: tuple[float, ...]) -> None:
         """Note a row that a kernel has filtered in `numbers`."""
@@ -361,7 +361,7 @@ def fit_training_noise(
         outputs: names of the monitored outputs.
         rows: rows of the training.
         smallest_sd: least standard deviation of each sensor.
-        uncertain: what the filter estimates beside the states of the model, see `kalman.uncertain_model`.
+        uncertain: what the filter estimates beside the states of the model, see `kalman.filter_states`.
     """
     columns, smallest = model_outputs(model, outputs, rows.outputs), [1e-6] * len(model.outputs)
     for i, sd in zip(output_indices(model, outputs), smallest_sd, strict=True):

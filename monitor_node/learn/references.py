@@ -14,11 +14,8 @@ from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.contract.messages_pb2 import ModelSnapshot
-from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.model import ProcessModel
-
-GATE = 6.0
-"""Standard deviations beyond which a residual does not correct the filter until the next one confirms it."""
 
 
 class RowPrediction(NamedTuple):

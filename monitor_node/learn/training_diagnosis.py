@@ -8,7 +8,7 @@ them.
 `find_uncertain` finds what a filter should estimate beside the states of the equations:
 
 - Where the rows say that the plant is not quite the equations, or leave open how it follows a move of an input, its
-  constants are uncertain (`kalman.uncertain_model`), and so are predictions until rows have taught them.
+  constants are uncertain (`kalman.filter_states`), and so are predictions until rows have taught them.
 - Where the innovations are coloured even so, the plant has disturbances that wander, or its sensors noise with memory.
 
 A plant that equals the equations, and that the training has moved enough, needs neither.
@@ -24,7 +24,6 @@ import msgspec
 import numpy as np
 
 from monitor_node.learn.process_reference import fit_training_noise, model_outputs, output_indices
-from monitor_node.learn.references import GATE
 from monitor_node.learn.training_rows import RowArrays, TrainingRows, screen_baseline
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Baseline
@@ -32,12 +31,9 @@ from reactorwatch.diagnosis.extended import extended_model
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
 from reactorwatch.diagnosis.whiteness import minus_log10_p
 from reactorwatch.errors import InputError
-from reactorwatch.kalman.ekf import LONGEST_GAP_MIN, Filter, FilterState
-from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
-from reactorwatch.kalman.filter_record import FilterRecord
-from reactorwatch.kalman.innovations import FilterResult
-from reactorwatch.kalman.noise_estimation import NoiseFit
-from reactorwatch.kalman.uncertain_model import (
+from reactorwatch.kalman.batch import GATE, LONGEST_GAP_MIN, FilterRecord, FilterResult
+from reactorwatch.kalman.ekf import Filter, FilterState
+from reactorwatch.kalman.filter_states import (
     CONSTANT,
     NOISE,
     WANDER,
@@ -46,9 +42,10 @@ from reactorwatch.kalman.uncertain_model import (
     select_effects,
     widen_model,
 )
+from reactorwatch.kalman.noise_estimation import NoiseFit
 from reactorwatch.process import EFFECTS_OF, effects_of
 from reactorwatch.process.extended_model import ExtendedModel, extended_model_of, is_complete, parse_extended_model
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.process.profiles import FREE_NAME
 from reactorwatch.records.record import GAP_ROWS, MINUTE_NS, Record
 
@@ -63,7 +60,7 @@ class Uncertain(NamedTuple):
     """Additional states of a filter.
 
     Attributes:
-        names: texts of the states, see `kalman.uncertain_model`.
+        names: texts of the states, see `kalman.filter_states`.
         learned: values of their `learned_parameters`.
     """
 

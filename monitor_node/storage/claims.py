@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.input_file import read_regular
+from reactorwatch.records.decode import read_regular
 
 TOKEN_BYTES = 16
 

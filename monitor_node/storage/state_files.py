@@ -17,8 +17,8 @@ from monitor_node.core import Monitor
 from monitor_node.monitor_state import ForeignFileError, OtherSettingsError
 from monitor_node.storage.claims import Claim
 from reactorwatch.errors import InputError, is_passing
-from reactorwatch.records.atomic import atomic_write, write_durably
-from reactorwatch.records.input_file import read_regular
+from reactorwatch.records.decode import read_regular
+from reactorwatch.records.write import atomic_write, write_durably
 
 DAMAGED, OTHER_SETTINGS = ".damaged", ".other-settings"
 

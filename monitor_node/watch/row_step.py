@@ -20,7 +20,7 @@ from monitor_node.charts.chart_design import alarm_names
 from monitor_node.checks.stage import CHECKS
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import WHOLE
-from monitor_node.learn.references import GATE, FilterReference, Reference
+from monitor_node.learn.references import FilterReference, Reference
 from monitor_node.learn.signal_range import SignalRange
 from monitor_node.watch.row_frame import (
     CHARTS,
@@ -40,7 +40,8 @@ from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.codegen.numba_kernel import Entry, borrow, call_at, inline, jit
 from reactorwatch.identification.black_box.filter import JUDGED, filter_row
-from reactorwatch.kalman.ekf import fill_row
+from reactorwatch.kalman.batch import GATE
+from reactorwatch.kalman.ekf_step import fill_row
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.charts.base import LARGEST_VALUE
 from reactorwatch.spc.charts.cusum import _judge as judge_cusum

@@ -24,8 +24,8 @@ from reactorwatch.notebook.frames import frame_of_rows
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.record import Record
+from reactorwatch.records.write import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

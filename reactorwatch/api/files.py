@@ -13,10 +13,9 @@ from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
+from reactorwatch.records.decode import TABLE_SUFFIXES, is_table, list_files
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.input_file import list_files
 from reactorwatch.records.record import Record, format_utc
-from reactorwatch.records.source_text import TABLE_SUFFIXES, is_table
 
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from reactorwatch.api.report_origin import report_origin
 from reactorwatch.notebook import html
 from reactorwatch.notebook.figures import figure_html
-from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.write import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

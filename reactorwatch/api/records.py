@@ -20,10 +20,9 @@ from reactorwatch.process import MODELS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.record import LONGEST_MIN
+from reactorwatch.records.record import LONGEST_MIN, join_files
 from reactorwatch.records.record import Record as MeasuredRecord
-from reactorwatch.records.several_files import join_files
-from reactorwatch.records.write_table import write_frame
+from reactorwatch.records.write import write_frame
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

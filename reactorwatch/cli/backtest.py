@@ -37,9 +37,9 @@ from reactorwatch.description.find import DEFAULT_PROCESS
 from reactorwatch.description.process import Process
 from reactorwatch.errors import prefix_errors
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.cells import quote_formula
+from reactorwatch.records.decode import quote_formula
 from reactorwatch.records.record import to_minutes, to_time_ns
+from reactorwatch.records.write import atomic_write
 
 ROWS_FOR_TRAINING = 3 * DEFAULT_TRAINING_ROWS
 """Rows that are counted to find a third of a record; of a longer one the training is not limited."""

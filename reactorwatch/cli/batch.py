@@ -23,11 +23,9 @@ from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.cells import quote_formula
+from reactorwatch.records.decode import list_files, quote_formula
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.folder import fill_folder
-from reactorwatch.records.input_file import list_files
+from reactorwatch.records.write import atomic_write, fill_folder
 from reactorwatch.runtime.parallel import choose_executor
 from reactorwatch.runtime.parallel.jobs import Failed, in_job_order
 

@@ -37,9 +37,8 @@ from reactorwatch.diagnosis.result import NAMED, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
+from reactorwatch.records.write import atomic_write, make_folder
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import section
 from reactorwatch.runtime.crash import INTERRUPTED

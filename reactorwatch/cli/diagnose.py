@@ -30,12 +30,9 @@ from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import SD_95, Cause, Curves, Diagnosis, Experiment
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.folder import fill_folder
-from reactorwatch.records.output import check_output_folder
+from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import Record, to_time_ns
-from reactorwatch.records.source_text import is_table
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import atomic_write, check_output_folder, fill_folder, write_table
 from reactorwatch.runtime.model_file import write_extended_model
 from recorder.panels.base import ALARM, INPUT, LIMIT, MEASURED, PREDICTED, Colour, Series, TimePlot
 

@@ -36,7 +36,7 @@ from reactorwatch.cli.options import (
     split_names,
 )
 from reactorwatch.errors import InputError
-from reactorwatch.records.output import check_output_file
+from reactorwatch.records.write import check_output_file
 
 
 def info(
@@ -49,8 +49,8 @@ def info(
     """Show the contents of a recording, and missing messages; or how a table is read, and what is in it."""
     from reactorwatch.cli.info import info_object, info_text, table_object, table_text
     from reactorwatch.description.read import read_signals
-    from reactorwatch.records.read_table import read_table
-    from reactorwatch.records.source_text import is_table
+    from reactorwatch.records.decode import is_table
+    from reactorwatch.records.read import read_table
     from recorder.tools.inspect import inspect
 
     choice = chosen.choose()
@@ -103,7 +103,7 @@ def backtest(
     from reactorwatch.cli.backtest import BACKTEST, BacktestOptions, train_on, write_rows
     from reactorwatch.cli.batch import SUMMARY, expand_files, make_jobs, run_jobs, unfit_lines
     from reactorwatch.contract.keys import DEFAULT_PLANT
-    from reactorwatch.records.output import check_output_folder
+    from reactorwatch.records.write import check_output_folder
     from reactorwatch.runtime.config import read_settings, section
 
     named, choice = expand_files(files), chosen.choose(modes)
@@ -317,7 +317,7 @@ def simulate(
     """
     from reactorwatch.api.files import record_of_process
     from reactorwatch.api.simulation import report, simulate_along
-    from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
+    from reactorwatch.records.write import WRITTEN_SUFFIXES, write_table
 
     choice = chosen.choose()
     out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
@@ -349,8 +349,7 @@ def example(
     import msgspec
 
     from reactorwatch.cli.example import make_example
-    from reactorwatch.records.atomic import atomic_write
-    from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
+    from reactorwatch.records.write import WRITTEN_SUFFIXES, atomic_write, write_table
 
     out = check_output(out, WRITTEN_SUFFIXES, (), force=force)
     beside = check_output_file(out.with_name(f"{out.name}.truth.json"), force=force)

@@ -141,7 +141,7 @@ def monitor(
     from reactorwatch.cli.bus_client import metrics_settings, node_settings
     from reactorwatch.cli.kernels import compile_at_first_start
     from reactorwatch.cli.up import diagnosis_settings, run_diagnosis_node
-    from reactorwatch.records.output import check_folder_name
+    from reactorwatch.records.write import check_folder_name
     from reactorwatch.runtime.config import LogConfig, section
 
     tables, bus = node_settings(target)

@@ -10,7 +10,7 @@ import typer
 from typer import Argument, Option
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.output import check_output_file
+from reactorwatch.records.write import check_output_file
 
 Value = TypeVar("Value")
 MAX_WAIT_S = 86_400.0

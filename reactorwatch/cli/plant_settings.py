@@ -11,8 +11,8 @@ from reactorwatch.cli.option_groups import stated_settings
 from reactorwatch.cli.options import check_recording
 from reactorwatch.description.find import DEFAULT_PROCESS, find_in_catalogue, find_process
 from reactorwatch.errors import InputError
+from reactorwatch.records.decode import is_table
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import section
 from recorder.config import ReplayConfig
 from recorder.files.recording import Recording

@@ -25,8 +25,8 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Estimate, Sample
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.records.write import atomic_write
 from reactorwatch.runtime.bus_zenoh import ZenohBus, log_refusals, router, router_from_file
 from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.node_main import SUPERVISED

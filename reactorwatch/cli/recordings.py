@@ -45,7 +45,7 @@ def record(
 ) -> None:
     """Record everything on the bus into an MCAP file."""
     from reactorwatch.cli.bus_client import metrics_settings, node_settings
-    from reactorwatch.records.output import check_folder_name
+    from reactorwatch.records.write import check_folder_name
     from reactorwatch.runtime.config import section
     from recorder.__main__ import run
     from recorder.config import RecorderConfig
@@ -105,8 +105,8 @@ def replay(
         pace = {"name": target.name, "speed": parse_pace(rate, "--rate"), "process": chosen.process}
         played = PlayedRecord(check_recording(file), table.stated)
         raise typer.Exit(run_until_stopped(target, None, pace, None, None, played))
+    from reactorwatch.records.decode import is_table
     from reactorwatch.records.record import MINUTE_NS
-    from reactorwatch.records.source_text import is_table
     from reactorwatch.runtime.config import section
     from recorder.config import ReplayConfig
     from recorder.tools.replay import run_replay
@@ -211,7 +211,7 @@ def export_csv(
     table: PlantTableOptions,
 ) -> None:
     """Turn a recording (.mcap) into a record (.csv, .csv.gz, .xlsx or .parquet), with all its signals."""
-    from reactorwatch.records.write_table import WRITTEN_SUFFIXES
+    from reactorwatch.records.write import WRITTEN_SUFFIXES
     from recorder.tools.convert import export_csv as convert
 
     choice = chosen.choose()
@@ -222,7 +222,7 @@ def export_csv(
 
 
 def _report_text(out: Path, record: "Record") -> str:
-    from reactorwatch.records.cells import quote_formula
+    from reactorwatch.records.decode import quote_formula
 
     remarks, quoted = list(record.remarks), [name for name in record.columns if quote_formula(name) != name]
     if quoted and out.suffix.lower() in (".csv", ".gz"):

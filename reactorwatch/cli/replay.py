@@ -14,8 +14,8 @@ from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import find_in_catalogue, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
+from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import format_utc, to_minutes
-from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import parse_tables, read_settings, section
 from reactorwatch.version import UNKNOWN, describe_build, this_build
 from recorder.files.metadata import gaps_of

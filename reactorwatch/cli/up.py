@@ -32,8 +32,7 @@ from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
 from reactorwatch.limits import limits
-from reactorwatch.records.folder import make_folder
-from reactorwatch.records.output import check_folder_name
+from reactorwatch.records.write import check_folder_name, make_folder
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import stop_on_signals
 from reactorwatch.runtime.logs import configure

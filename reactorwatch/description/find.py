@@ -14,7 +14,7 @@ from reactorwatch.description.toml_file import parse_process, parse_tables
 from reactorwatch.errors import InputError, describe_exception, describe_unknown, prefix_errors
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.input_file import read_regular, wrap_read_errors
+from reactorwatch.records.decode import read_regular, wrap_read_errors
 
 FUNCTION = "process"
 """Function of a `.py` file that returns the process."""

@@ -12,9 +12,9 @@ from reactorwatch.description.find import DEFAULT_PROCESS
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.read_table import MissingColumnError, SignalColumn, read_table
+from reactorwatch.records.read import MissingColumnError, SignalColumn, read_table
 from reactorwatch.records.record import LARGEST_VALUE, Record
-from reactorwatch.records.time_column import STANDARD
+from reactorwatch.records.times import STANDARD
 from reactorwatch.units import conversion
 
 

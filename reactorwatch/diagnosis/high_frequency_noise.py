@@ -12,7 +12,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.colored_noise import LOW, Noise, power_spectrum
-from reactorwatch.kalman.resolution import resolution_sd
+from reactorwatch.kalman.noise_estimation import resolution_sd
 
 ROUNDS = 100
 """Number of multiplicative steps, after which the levels change by less than a thousandth."""

@@ -20,7 +20,7 @@ from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.parameter_priors import offset_changes
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
-from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.batch import FilterResult
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.simulate import Simulator
 

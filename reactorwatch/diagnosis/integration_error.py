@@ -13,7 +13,7 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.batch import FilterResult
 from reactorwatch.process.model import ProcessModel
 
 LEAST_CORRELATION = 0.15

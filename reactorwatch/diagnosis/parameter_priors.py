@@ -18,7 +18,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.batch import FilterResult
 from reactorwatch.process.model import Parameter, ProcessModel, parameter, variable
 from reactorwatch.units import absolute
 

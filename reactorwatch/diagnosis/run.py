@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.input_uncertainty import InputUncertainty
+from reactorwatch.kalman.batch import InputUncertainty
 
 
 @dataclass(frozen=True, eq=False)

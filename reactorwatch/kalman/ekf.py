@@ -22,10 +22,10 @@ Exceptions:
 - An interval of more than `LONGEST_STEP_MIN` takes several steps. After a gap of more than `LONGEST_GAP_MIN`, or a step
   back in time, the filter restarts: near an unstable state the uncertainty grows without bound, and the model does not
   know how the plant was operated meanwhile.
-- Where an input changed at an unknown time, the state is predicted for each possible time (see `input_uncertainty`).
+- Where an input changed at an unknown time, the state is predicted for each possible time (see `InputUncertainty`).
 - The filter restarts where the equations leave the bounds of the states or are not finite. A correction that leads out
   of the bounds is clipped.
-- It starts at the first measurements (see `initial_state`), without an innovation for that row, and waits for them.
+- It starts at the first measurements (see `filter_states`), without an innovation for that row, and waits for them.
 - Estimates of constant states (`ProcessModel.constant_states`) survive a restart.
 """
 
@@ -34,7 +34,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from math import ceil, inf, isfinite, nan
-from typing import Any, cast
+from typing import cast
 
 import msgspec
 import numpy as np
@@ -42,57 +42,25 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.codegen.compiled_function import CompiledFunction
-from reactorwatch.kalman.batch_runner import BatchedRun, RowBatch, run_together
-from reactorwatch.kalman.ekf_step import compiled_row, predict_function, row_function
-from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN, FilterRecord
-from reactorwatch.kalman.initial_state import InitialState
-from reactorwatch.kalman.innovations import FilterResult, Innovation
-from reactorwatch.kalman.step_budget import (
+from reactorwatch.kalman.batch import (
+    LONGEST_GAP_MIN,
+    LONGEST_ROW_MIN,
     STEPS_PER_PREDICTION,
     STEPS_PER_ROW,
     STEPS_PER_RUN,
     STEPS_PER_SEARCH,
     STEPS_PER_START,
+    BatchedRun,
+    FilterRecord,
+    FilterResult,
+    Innovation,
+    RowBatch,
     StepBudget,
+    run_together,
 )
+from reactorwatch.kalman.ekf_step import NoiseLevels, compiled_row, fill_row, predict_function, row_function, variances
+from reactorwatch.kalman.filter_states import InitialState
 from reactorwatch.process.model import ProcessModel
-
-LONGEST_GAP_MIN = 30.0
-
-LEAST_PROCESS_SD = 1e-6
-"""Relative to the scale of a state. Without any process noise its covariance would underflow."""
-
-
-def fill_row(
-    new: Any,
-    before: Sequence[float] | Array,
-    inputs: Sequence[float] | Array,
-    time_min: float,
-    first_min: float,
-    second_min: float,
-    measured: Sequence[float] | Array,
-    limit: float,
-) -> None:
-    """Fill the `new` values of `ekf_step.row_function` in place, with one limit for all outputs; kernels compile it."""
-    n_u, n_y = len(inputs), len(measured)
-    for i in range(n_u):
-        new[i], new[n_u + i] = before[i], inputs[i]
-    row = 2 * n_u
-    new[row], new[row + 1], new[row + 2] = time_min, first_min, second_min
-    for i in range(n_y):
-        new[row + 3 + i], new[row + 3 + n_y + i] = measured[i], limit
-
-
-class NoiseLevels(msgspec.Struct, frozen=True):
-    """Noise of a process and of its sensors.
-
-    Attributes:
-        measurement_sd: standard deviation of each output's noise, in its unit.
-        process_sd: one a state, in its unit per square root of a minute: dx = f(x) dt + sd dW.
-    """
-
-    measurement_sd: tuple[float, ...]
-    process_sd: tuple[float, ...]
 
 
 class FilterState(msgspec.Struct, frozen=True):
@@ -111,12 +79,6 @@ class FilterState(msgspec.Struct, frozen=True):
     x: tuple[float, ...]
     P: tuple[float, ...]
     learned: bool = False
-
-
-def variances(model: ProcessModel, noise: NoiseLevels) -> Array:
-    """Variances of the sensors and of the process per minute, as `ekf_step` takes them."""
-    least = [LEAST_PROCESS_SD * state.scale for state in model.states]
-    return np.asarray(np.square(np.concatenate([noise.measurement_sd, np.maximum(noise.process_sd, least)])))
 
 
 class Filter:
@@ -214,16 +176,9 @@ class Filter:
         self._belief[:] = [*state.x, *state.P]
 
     @property
-    def belief(self) -> Array:
-        """Filtered state and its covariance, shape (n_x + n_x^2,): the filter's own numbers, for kernels."""
-        belief: Array = self._belief
-        return belief
-
-    @property
-    def variances(self) -> Array:
-        """Variances of the sensors and of the process per minute, shape (n_y + n_x,): the filter's own numbers."""
-        noise: Array = self._constants[len(self.model.parameters) :]
-        return noise
+    def numbers(self) -> tuple[Array, Array]:
+        """State with its covariance, and variances of sensors and process per minute: the filter's own, for kernels."""
+        return self._belief, self._constants[len(self.model.parameters) :]
 
     def accept_row(self, time_min: float, inputs: Sequence[float]) -> None:
         """Note a row that was filtered in `belief`; restart after it if its inputs are unknown."""
@@ -248,14 +203,13 @@ class Filter:
             gate: standard deviations beyond which a measurement does not correct the state.
             accept: outputs whose measurement corrects the state whatever the gate; empty: none.
             changes: possible changes of the inputs since the row before, each as likely: a time, not decreasing, and
-                the inputs from then until this row (see `input_uncertainty`); empty: the inputs of the row before held.
+                the inputs from then until this row (see `InputUncertainty`); empty: the inputs of the row before held.
 
         Raises:
             BudgetExceededError: the budget is spent; also raised by `run` and `run_batched`.
         """
         n, before = self._n_y, self._time_min
-        if self.budget is not None:
-            self.budget.spend(STEPS_PER_ROW)
+        self._spend(STEPS_PER_ROW)
         if before is None or not 0.0 < time_min - before <= LONGEST_GAP_MIN:
             return self._start(time_min, inputs, measured)
         step = 0.5 * (time_min - before)
@@ -306,9 +260,8 @@ class Filter:
             if self._time_min is not None and near[row]:
                 part = slice(row, ends[bisect_left(ends, row)])
                 self._spend(part.stop - row)
-                done = yield RowBatch(
-                    self.code, self._belief, rows[part], self._constants, beliefs[part], outputs[part]
-                )
+                arguments = [self._belief, rows[part], self._constants]
+                done = yield RowBatch(self.code, part.stop - row, arguments, [beliefs[part], outputs[part]])
                 divergences += not done
             if done:
                 self._belief[:] = beliefs[row + done - 1]
@@ -349,13 +302,9 @@ class Filter:
     def _prediction(self) -> ArrayFunction:
         return ArrayFunction(predict_function(self.model))
 
-    def _breaks_between(self, before: float, time_min: float) -> list[float]:
-        """Breakpoints between two times."""
-        return [point for point in self._breaks if before < point < time_min]
-
     def _steps(self, before: float, time_min: float, half: float) -> tuple[float, float]:
         """Lengths of the last two steps of an interval; predicts up to their start."""
-        within = self._breaks_between(before, time_min)
+        within = [point for point in self._breaks if before < point < time_min]
         if 2.0 * half > LONGEST_ROW_MIN or len(within) > 1:
             *edges, middle, end = self._edges(before, time_min)
             self._belief[:] = self._predict(self._belief, self._inputs, edges)
@@ -365,7 +314,7 @@ class Filter:
     def _edges(self, before: float, time_min: float) -> list[float]:
         """Edges of an even number of steps over an interval."""
         edges = [before]
-        for end in (*self._breaks_between(before, time_min), time_min):
+        for end in (*(point for point in self._breaks if before < point < time_min), time_min):
             count, begin = ceil((end - edges[-1]) / (0.5 * LONGEST_ROW_MIN)), edges[-1]
             edges += [begin + (end - begin) * i / count for i in range(1, count)]
             edges.append(end)
@@ -435,17 +384,13 @@ class Filter:
         if found is not None:
             self._spend(STEPS_PER_START)
             x, P = found
-            if self._lasting and self._learned:
-                self._restore_constant_states(x, P)
+            if self._lasting and self._learned:  # estimates of constant states are kept
+                kept, n = self._lasting, self._n_x
+                P[kept], P[:, kept] = 0.0, 0.0
+                x[kept] = self._belief[kept]
+                P[np.ix_(kept, kept)] = self._belief[n:].reshape(n, n)[np.ix_(kept, kept)]
             self._learned = True
             self._belief[:] = [*x, *P.ravel()]
             self.accept_row(time_min, inputs)
             self._started = True
         return self._nothing
-
-    def _restore_constant_states(self, x: Array, P: Array) -> None:
-        """Copy the estimates of constant states into an initial state."""
-        kept, n_x = self._lasting, self._n_x
-        P[kept], P[:, kept] = 0.0, 0.0
-        x[kept] = self._belief[kept]
-        P[np.ix_(kept, kept)] = self._belief[n_x:].reshape(n_x, n_x)[np.ix_(kept, kept)]

@@ -11,17 +11,57 @@ as well: parameters, variances of the sensors, variances of the process per minu
 from collections.abc import Sequence
 from functools import lru_cache
 from math import inf, nan
+from typing import Any
 
 import casadi as ca
+import msgspec
 import numpy as np
 
+from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.process.effect_states import reset_function
 from reactorwatch.process.integrate import state_time_step, symbolic_step
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 
-MODEL_CACHE_SIZE = 64
-"""Number of models whose functions are cached: making one takes some ten milliseconds and a megabyte."""
+LEAST_PROCESS_SD = 1e-6  # in scales of the state; without any process noise its covariance would underflow
+
+
+class NoiseLevels(msgspec.Struct, frozen=True):
+    """Noise of a process and of its sensors.
+
+    Attributes:
+        measurement_sd: standard deviation of each output's noise, in its unit.
+        process_sd: one a state, in its unit per square root of a minute: dx = f(x) dt + sd dW.
+    """
+
+    measurement_sd: tuple[float, ...]
+    process_sd: tuple[float, ...]
+
+
+def variances(model: ProcessModel, noise: NoiseLevels) -> Array:
+    """Variances of the sensors and of the process per minute, as the constants of `row_function`."""
+    least = [LEAST_PROCESS_SD * state.scale for state in model.states]
+    return np.asarray(np.square(np.concatenate([noise.measurement_sd, np.maximum(noise.process_sd, least)])))
+
+
+def fill_row(
+    new: Any,
+    before: Sequence[float] | Array,
+    inputs: Sequence[float] | Array,
+    time_min: float,
+    first_min: float,
+    second_min: float,
+    measured: Sequence[float] | Array,
+    limit: float,
+) -> None:
+    """Fill the `new` values of `row_function` in place, with one limit for all outputs; kernels compile it."""
+    n_u, n_y = len(inputs), len(measured)
+    for i in range(n_u):
+        new[i], new[n_u + i] = before[i], inputs[i]
+    row = 2 * n_u
+    new[row], new[row + 1], new[row + 2] = time_min, first_min, second_min
+    for i in range(n_y):
+        new[row + 3 + i], new[row + 3 + n_y + i] = measured[i], limit
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
@@ -31,7 +71,7 @@ def row_function(model: ProcessModel) -> ca.Function:
     new: [inputs of the row before, inputs, time of the row, first step, second step, measured, limits]; NaN is a
     missing value, and a limit is the number of standard deviations beyond which a value does not correct the state.
     outputs: [prediction, innovation, its standard deviation, normalised innovation, its scale, ok flag]; see
-    `innovations.FilterResult`.
+    `batch.FilterResult`.
     """
     n_u, n_y = len(model.inputs), len(model.outputs)
     belief, new, constants = _symbols(model, 2 * n_u + 3 + 2 * n_y)

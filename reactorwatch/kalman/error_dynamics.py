@@ -23,14 +23,12 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES, CompiledFunction
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.ekf_step import transition
-from reactorwatch.kalman.input_uncertainty import InputUncertainty
+from reactorwatch.kalman.batch import LONGEST_ROW_MIN, InputUncertainty
+from reactorwatch.kalman.ekf_step import NoiseLevels, transition
 from reactorwatch.process.integrate import LONGEST_STEP_MIN
 from reactorwatch.process.model import ProcessModel
 
 _LEAST_PIVOT = 1e-12
-_LONGEST_PIECE_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a piece is two steps; times are rounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +217,7 @@ class ErrorLinearization:
         return predicted, F, G
 
     def _predict_rows(self, x: Array, u: Array, t: Array, step: Array, p: Array) -> tuple[Array, Array, Array]:
-        pieces = np.maximum(np.ceil(step / _LONGEST_PIECE_MIN), 1.0)
+        pieces = np.maximum(np.ceil(step / LONGEST_ROW_MIN), 1.0)
         predicted, F, G = self._code.piece.map(x, u, p, t, step / pieces)
         predicted = predicted[:, :, 0]
         for i in range(1, ceil(pieces.max())):

@@ -30,48 +30,27 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
-from reactorwatch.kalman.batch_runner import run_together
-from reactorwatch.kalman.ekf import Filter, NoiseLevels
-from reactorwatch.kalman.filter_record import FilterRecord
-from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.batch import GATE, FilterRecord, FilterResult, run_together
+from reactorwatch.kalman.ekf import Filter
+from reactorwatch.kalman.ekf_step import NoiseLevels
+from reactorwatch.kalman.filter_states import NOISE, widen_model
 from reactorwatch.process.model import ProcessModel
 
 INITIAL_SHARES = (0.3, 0.03, 0.003)
 """Initial process noise, in scales of the state per square root of a minute; the noisiest converges best."""
 
-LEAST_RELATIVE_SD = 1e-9
-"""Smallest noise of a sensor relative to its largest value: the logarithm of zero is undefined."""
-
-NO_NOISE, NEGLIGIBLE_NOISE = 1e-5, 3e-4
-"""Process noise below which there is none, and one that is negligible but from which steps can start; in scales."""
-
-CLIP = 4.0
-"""Standard deviations beyond which the loss of a value is constant."""
-
-GATE = 6.0
-FIRST_ROWS = 300
-"""Rows that the first steps of the search use."""
-
+LEAST_RELATIVE_SD = 1e-9  # of a sensor, of its largest value: the logarithm of zero is undefined
+NO_NOISE, NEGLIGIBLE_NOISE = 1e-5, 3e-4  # in scales: as good as none, and one that is but from which steps can start
+CLIP = 4.0  # standard deviations beyond which the loss of a value is constant
+FIRST_ROWS = 300  # that the first steps of the search use
 MAX_STEPS, MAX_CUTS = 8, 4
-LONGEST_STEP = 1.2
-"""Longest step of a logarithm."""
-
-DIFFERENCE = 0.01
-"""Difference of a logarithm, for derivatives."""
-
-CONVERGED_GAIN = 0.2
-"""A smaller gain of log likelihood ends the search."""
-
-LEAST_PREDICTED_GAIN = 0.02
-"""A step with a smaller predicted gain of log likelihood is not tried."""
-
-LEAST_GAIN = 2.0
-"""Gain of log likelihood below which a noise is removed."""
-
-BURN_IN = 20
-"""Rows at the start in which the filter converges."""
-
-_CUT, _RIDGE = 0.4, 1e-3
+LONGEST_STEP = 1.2  # of a logarithm: sizes change by at most a factor of 3.3
+DIFFERENCE = 0.01  # of a logarithm, for derivatives
+CONVERGED_GAIN = 0.2  # of log likelihood: less ends the search
+LEAST_PREDICTED_GAIN = 0.02  # of log likelihood: a step with less is not tried
+LEAST_GAIN = 2.0  # of log likelihood: a noise with less is removed, as by Akaike's criterion
+BURN_IN = 20  # rows at the start in which the filter converges
+_WHITE_SHARE, _DRIVING_SHARES = 0.3, (2.0, 6.0, 20.0)  # of the noise by third differences, which see little of it
 _MEDIAN_THIRD_DIFFERENCE = 0.6745 * sqrt(20.0)  # their median size, for white noise of unit variance
 _CUT_MEAN_SQUARE = erf(CLIP / sqrt(2)) - CLIP * sqrt(2 / pi) * exp(-(CLIP**2) / 2)  # of w where |w| < CLIP, else 0
 
@@ -126,6 +105,28 @@ def fit_noise(
     """
     smallest = np.asarray(smallest_sd, dtype=float)
     return _NoiseSearch(model, record, smallest, learned, first_sd or {}).run(nearby, lacking)
+
+
+def noise_starts(
+    model: ProcessModel, added: tuple[str, ...], measured: Array, smallest_sd: Sequence[float]
+) -> list[NoiseLevels]:
+    """Noise levels from which a search should start, too: all noise is coloured noise where there is such.
+
+    Args:
+        model: the model without what is added to it.
+        added: see `widen_model`.
+        measured: measurements, shape (rows, n_y); NaN where missing.
+        smallest_sd: lower bounds of the sensors' noise.
+    """
+    coloured = [item.split(" ", 1)[1] for item in added if item.startswith(f"{NOISE} ")]
+    if not coloured:
+        return []
+    sds = np.maximum([initial_sensor_sd(column) for column in measured.T], smallest_sd)
+    by_name = dict(zip(model.output_names, sds.tolist(), strict=True))
+    names = widen_model(model, added).state_names
+    driving = np.array([by_name.get(name.removesuffix(".memory"), 0.0) * name.endswith(".memory") for name in names])
+    sensors = tuple(_WHITE_SHARE * sd if name in coloured else sd for name, sd in by_name.items())
+    return [NoiseLevels(sensors, tuple((share * driving).tolist())) for share in _DRIVING_SHARES]
 
 
 class _NoiseSearch:
@@ -249,7 +250,7 @@ class _NoiseSearch:
         free = (best.theta[chosen] > self._lowest[chosen]) | (gradient < 0.0)
         gradient[~free], information[~free], information[:, ~free] = 0.0, 0.0, 0.0
         step = np.zeros(best.theta.size)
-        step[chosen] = -np.linalg.solve(information + np.diag(_RIDGE * np.diag(information) + 1.0), gradient)
+        step[chosen] = -np.linalg.solve(information + np.diag(1e-3 * np.diag(information) + 1.0), gradient)
         longest = float(np.max(np.abs(step)))
         full = longest <= LONGEST_STEP
         step *= min(1.0, LONGEST_STEP / max(longest, LONGEST_STEP))
@@ -260,7 +261,7 @@ class _NoiseSearch:
             (trial,) = self._evaluate([np.clip(best.theta + step, self._lowest, self._highest)])
             if trial.loss < best.loss:
                 return trial, predicted if full else -inf
-            step, full = _CUT * step, False
+            step, full = 0.4 * step, False
         return best, 0.0
 
     def _levels(self, theta: Array) -> NoiseLevels:
@@ -311,3 +312,34 @@ def initial_sensor_sd(column: Array) -> float:
     """
     third = np.abs(np.diff(column[np.isfinite(column)], n=3))
     return float(np.median(third)) / _MEDIAN_THIRD_DIFFERENCE if third.size else 0.0
+
+
+def resolution(values: Array) -> float:
+    """Smallest step between two values; 0 if there is none.
+
+    A signal of n values without steps has neighbours about 1 / n^2 of its range apart, which is as good as none.
+
+    >>> round(resolution(np.array([1.2, 0.9, 0.3, 0.3 + 1e-16])), 9)
+    0.3
+
+    Args:
+        values: values of the signal, shape (n,); NaN where missing.
+    """
+    levels = np.unique(values[np.isfinite(values)])
+    steps = np.diff(levels)
+    steps = steps[steps > 1e-12 * np.max(np.abs(levels), initial=0.0)]  # less is a rounding error
+    return float(steps.min()) if steps.size else 0.0
+
+
+def resolution_sd(values: Array, stated: float | None = None) -> float:
+    """Standard deviation of a signal's residual due to its steps alone.
+
+    A sensor with steps of q has an error of up to q / 2. If uniform in that range, it has the standard deviation
+    q / sqrt(12) (Sheppard 1898, On the calculation of the most probable values of frequency-constants for data arranged
+    according to equidistant divisions of a scale, Proc. London Math. Soc. 29). Residuals of the sensor are no smaller.
+
+    Args:
+        values: values of the signal, shape (n,); NaN where missing.
+        stated: resolution of the signal; None: it is learned.
+    """
+    return (resolution(values) if stated is None else stated) / sqrt(12.0)

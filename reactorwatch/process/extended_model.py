@@ -11,7 +11,7 @@
 An effect is stored as the text that injects it into the plant as a fault (`fault`), to full precision, so a model that
 is read equals the one that was written. `parameters` are those of the model that differ from its nominal values, in its
 units. Laws of what was unknown (`law`) are items of a list `laws`, and what a filter of the model estimates beside its
-states (`kalman.uncertain_model`) of a list `uncertain`; both are left out where they are empty. Times are
+states (`kalman.filter_states`) of a list `uncertain`; both are left out where they are empty. Times are
 minutes of the record in which the deviations were found, counted from `zero_ns`, nanoseconds since 1970-01-01 UTC; 0
 where that is unknown, as for a .csv.
 

@@ -175,7 +175,7 @@ class ProcessModel:
         places: where something unknown may act; empty: they follow from the equations (`process.places`).
         laws: laws of what was unknown, which are part of the equations already.
         effects: effects of its own; None: those of the catalogue under its name.
-        uncertain: what a filter of this model estimates beside the states, see `kalman.uncertain_model`; no part of
+        uncertain: what a filter of this model estimates beside the states, see `kalman.filter_states`; no part of
             the equations.
     """
 

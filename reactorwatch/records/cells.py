@@ -1,12 +1,13 @@
-"""Cells of a table: their kinds, and their conversion to numbers."""
+"""Cells of a table: their kinds, their conversion to numbers, decimal sign and codes that mean "not measured"."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.records.timestamps import guess_pattern
 
 _WORDS = """
@@ -19,8 +20,6 @@ _WORDS = """
 MISSING = tuple(word.strip() for word in _WORDS.split("|"))
 """Cells of historians and spreadsheets that mean: not measured."""
 
-_FORMULA = re.compile(r"(^|[;\t\r\n])('*)(?=[=+\-@\t\r\uff1d\uff0b\uff0d\uff20])")
-"""Start of what a spreadsheet takes for a formula, in a cell or behind a sign that may separate cells elsewhere."""
 
 NUMBER, TIME, EMPTY, TEXT = "number", "time", "empty", "text"
 _DIGITS = r"(?:\d+\.?\d*|\.\d+)"
@@ -38,24 +37,6 @@ _FORMS = (_POINT, _COMMA, *_GROUPS_OF.values(), _GAPS)
 _EXPONENT = r"(?:[eE][+-]?\d+)"
 MAX_CELL = 80
 """Bytes of a cell that holds a number; longer ones are text."""
-
-
-def quote_formula(text: str) -> str:
-    """Text that a spreadsheet does not take for a formula: a quote before what would be one.
-
-    >>> quote_formula("=1+2"), quote_formula("T-1"), quote_formula("'=1+2")
-    ("'=1+2", 'T-1', "''=1+2")
-    """
-    return _FORMULA.sub(r"\1'\2", text)
-
-
-def unquote_formula(text: str) -> str:
-    """Text before `quote_formula`; another text is unchanged, unless it has such a quote.
-
-    >>> unquote_formula("'=1+2"), unquote_formula("'a'")
-    ('=1+2', "'a'")
-    """
-    return _FORMULA.sub(lambda match: match[1] + match[2][1:], text)
 
 
 def kind_of(cell: str, missing: frozenset[str] = frozenset(MISSING)) -> str:
@@ -154,3 +135,42 @@ def find_sentinels(missing: frozenset[str]) -> list[float]:
     [-999.0]
     """
     return [float(cell.replace(",", ".")) for cell in missing if _POINT.fullmatch(cell) or _COMMA.fullmatch(cell)]
+
+
+_CODE = re.compile(r"-9+(\.9+)?|999+|-?(32767|32768|65535|2147483647|2147483648|4294967295|1e\+?\d\d|10{9,14})")
+"""Nines, limits of integers, large powers of ten; 99 and 99.9 are values of a saturated input, -9 is any number."""
+
+_FEWEST_OTHERS = 10
+"""Distinct other values; a signal with fewer may be one of modes, or of steps of an actuator."""
+
+
+def describe_sentinels(columns: Mapping[str, Array]) -> list[str]:
+    """Notes on the probable sentinels of signals, each with the option that excludes it.
+
+    A known code is so far from the other values as these are from each other. Any other value repeats at least three
+    times, is 20 times as far and 10 times as large, and none at which sound inputs stand, closed or fully open.
+
+    Args:
+        columns: values by signal, as the file has them; NaN: not measured.
+    """
+    rows: dict[str, list[str]] = {}
+    for name, values in columns.items():
+        finite = values[np.isfinite(values)]
+        if not finite.size or max(np.count_nonzero(finite == end) for end in (finite.min(), finite.max())) < 2:
+            continue  # as mostly; sorting takes longer
+        found, counts = np.unique(finite, return_counts=True)
+        repeated = np.flatnonzero((counts > 1) & (np.abs(found) > 1.0)).tolist()
+        codes = [i for i in repeated if found[i] != -9.0 and _CODE.fullmatch(f"{found[i]:.15g}")]
+        for i in repeated:
+            value, others = float(found[i]), np.delete(found, [i, *codes])
+            if others.size < _FEWEST_OTHERS:
+                continue
+            low, high = float(others[0]), float(others[-1])
+            distance, size = max(low - value, value - high), max(abs(low), abs(high))
+            is_far = distance > 20.0 * (high - low) and abs(value) > 10.0 * size and counts[i] > 2
+            if distance > high - low if i in codes else is_far and abs(value) != 100.0:
+                rows.setdefault(f"{value:.15g}", []).append(f"{counts[i]} rows of {name}")
+    return [
+        f"{value} is probably no measurement but a code, in {', '.join(of)} (--missing {value} excludes it)"
+        for value, of in rows.items()
+    ]

@@ -1,172 +1,382 @@
-"""Layout of a text table: separator, decimal sign, names, units, first row."""
+"""Layout of a text table, guessed from its first lines: separator, header, orientation, decimal sign."""
 
 import csv
+import io
 import re
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from reactorwatch.errors import InputError, hint_at_closest
-from reactorwatch.records.cells import EMPTY, TEXT, kind_of
-from reactorwatch.units import is_unit
+import numpy as np
 
-_SEPARATORS = {",": "comma separated", "\t": "tab separated", " ": "blank separated"}
-_WORD = re.compile(r"[^\W\d_]{2}")
-_BRACKETED = re.compile(r"\s*[\[(]([^\[\]()]+)[\])]\s*$")
-_LABELLED = re.compile(r"\s+(?:/|in)\s+([^\s\[\]]+)\s*$")
-"""A unit after a name, as ISO 80000-1 writes it in tables (`T / K`), and in words."""
+from reactorwatch.errors import InputError
+from reactorwatch.records.cells import EMPTY, MISSING, NUMBER, TEXT, TIME, find_decimal, kind_of, to_numbers
+from reactorwatch.records.decode import unquote_formula
+from reactorwatch.records.file_format import FileFormat
+from reactorwatch.records.table import (
+    COMMENT,
+    Layout,
+    TextTable,
+    describe_separator,
+    find_body,
+    split_line,
+    unit_of_name,
+)
 
-COMMENT = re.compile(rb"^[ \t]*(?:#(?!N/A|NV\b|DIV/0!|[A-Z]+[!?])|%|//)[^\n]*", re.MULTILINE)
-"""A comment without its line end: it is replaced by a blank line, so that line numbers stay."""
+HEAD_BYTES = 65_536
+HEAD_LINES = 200
+"""Lines from which the layout is guessed."""
+
+MIN_LINES = 12
+"""Fewer whole lines in the head are extended: lines of a transposed file are long."""
+
+MIN_TRANSPOSED = 10
+"""Fewest columns of a file without names that may be taken as rows."""
+
+MAX_CELL_LINES = 4
+"""Most lines of a quoted cell in the head."""
+
+_SEPARATORS = ";\t,| "
+_BLANKS = re.compile(rb"[ \t]+")
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Text of a table and its layout.
+def sniff(path: Path, text: bytes, stated: FileFormat) -> Layout:
+    """Guess the layout of a table.
 
-    Attributes:
+    Args:
         path: the file, for messages.
-        text: the whole text, UTF-8; comments are blank lines, runs of blanks are one if they separate.
+        text: text of the file, UTF-8.
+        stated: what need not be guessed.
+
+    Raises:
+        InputError: the decimal sign is ambiguous, or the rows have more cells than the header.
+    """
+    missing = frozenset((*MISSING, *stated.missing))
+    comments = [
+        (text.count(b"\n", 0, found.start()) + 1, found[0].decode()) for found in COMMENT.finditer(text, 0, HEAD_BYTES)
+    ]
+    if comments:
+        text = COMMENT.sub(b"", text)
+    numbered = [(row, line) for row, line in _head(text) if line.strip(" \t\n")]
+    if not numbered:
+        raise InputError(f"{path}: expected a header and rows, got only comments")
+    separator = stated.separator or _guess_separator([line for _, line in numbered], missing)
+    if separator == " ":
+        text = b"\n".join(_BLANKS.sub(b" ", line).strip() for line in text.split(b"\n"))
+    if separator == stated.decimal == "," and (pairs := _join_pairs(text)):
+        layout = sniff(path, pairs, replace(stated, separator=";"))
+        return replace(layout, notes=["each two cells are one number", *layout.notes])
+    table = [(row, split_line(line, separator)) for row, line in numbered]
+    if stated.transposed or (stated.transposed is None and _is_labelled_by_row([cells for _, cells in table], missing)):
+        return _transpose(path, text, separator, stated)
+    layout = HeaderSearch(path, text, table, separator, stated, missing).layout(comments)
+    if stated.transposed is None and _is_unlabelled_by_row(layout):
+        return _transpose(path, text, separator, stated)
+    return layout
+
+
+def _head(text: bytes) -> list[tuple[int, str]]:
+    """Whole lines at the start of a text, each with its number; lines of one quoted cell are one."""
+    size = HEAD_BYTES
+    while text.count(b"\n", 0, size) < MIN_LINES and size < len(text):
+        size *= 4
+    lines = text[:size].decode(errors="ignore").split("\n")
+    lines = lines[:HEAD_LINES] if size >= len(text) else lines[:-1][:HEAD_LINES]
+    found: list[tuple[int, str]] = []
+    row = 0
+    while row < len(lines):
+        ends = range(row + 1, min(row + 1 + MAX_CELL_LINES, len(lines)) + 1)
+        end = next((end for end in ends if not "\n".join(lines[row:end]).count('"') % 2), row + 1)
+        found.append((end, "\n".join(lines[row:end])))
+        row = end
+    return found
+
+
+def _join_pairs(text: bytes) -> bytes | None:
+    """Text with `;` between numbers, if each row has twice the header's cells; None if not."""
+    lines = [line.split(b",") for line in text.rstrip(b"\n").split(b"\n")]
+    if len(lines) < 2 or b'"' in text or any(len(cells) != 2 * len(lines[0]) for cells in lines[1:]):
+        return None
+    rows = ([b",".join(pair) for pair in zip(cells[::2], cells[1::2], strict=True)] for cells in lines[1:])
+    return b"\n".join(b";".join(cells) for cells in (lines[0], *rows))
+
+
+def _guess_separator(lines: list[str], missing: frozenset[str]) -> str:
+    """Separator that splits most of the last lines into as many cells, most of which are values."""
+    tail = lines[len(lines) // 4 :]
+    scores: list[tuple[bool, float, str]] = []
+    for separator in _SEPARATORS:
+        rows = [split_line(line, separator) for line in tail]
+        width = Counter(map(len, rows)).most_common(1)[0][0]
+        regular = [row for row in rows if len(row) == width]
+        cells = [cell for row in regular for cell in row] if width > 1 else []
+        cells = cells[:: max(1, len(cells) // 1000)]
+        values = sum(kind_of(cell, missing) != TEXT for cell in cells) / max(len(cells), 1)
+        scores.append((width > 1, round(values * len(regular) / len(rows), 2), separator))
+        has_blanks = [kind_of(cell, missing) for cell in cells if " " in cell.strip()]
+        if separator == "\t" and len(regular) == len(rows) and has_blanks and TEXT not in has_blanks:
+            return separator  # blanks in cells are those between a date and a time of day
+    best = max(scores, key=lambda score: score[:2])  # the first of the best
+    return best[2] if best[0] else ","
+
+
+def _is_labelled_by_row(table: list[list[str]], missing: frozenset[str]) -> bool:
+    """True if each row starts with a name, or with a name and a unit, and values follow."""
+    if len(table) < 2 or len({len(cells) for cells in table}) > 1 or len(table[0]) < 3:
+        return False
+    labels = [cells[0] for cells in table]
+    if len(set(labels)) < len(labels) or any(kind_of(label, missing) != TEXT for label in labels):
+        return False
+    return all(all(kind_of(cell, missing) != TEXT for cell in cells[2:50]) for cells in table) and any(
+        kind_of(cell, missing) in (NUMBER, TIME) for cell in table[0][1:]
+    )
+
+
+def _is_unlabelled_by_row(layout: Layout) -> bool:
+    """True if there is no header and the values of each row are more alike than those of each column."""
+    if layout.header_row is not None or not layout.sample:
+        return False
+    width = len(layout.sample[0])
+    if width < MIN_TRANSPOSED or layout.text.count(b"\n") >= width:
+        return False
+    rows = [[kind_of(cell, layout.missing) for cell in cells] for cells in layout.sample]
+    if any(kind not in (NUMBER, EMPTY) for kinds in rows for kind in kinds):
+        return False
+    import pyarrow as pa
+
+    cells = [to_numbers(pa.array(row), layout.decimal, layout.missing)[0] for row in layout.sample]
+    values = np.arcsinh(np.array(cells))
+    return bool(np.nanvar(np.nanmean(values, axis=1)) > np.nanvar(np.nanmean(values, axis=0)))
+
+
+def _transpose(path: Path, text: bytes, separator: str, stated: FileFormat) -> Layout:
+    """Layout of a table after its rows and columns were exchanged."""
+    rows = [split_line(line, separator) for line in text.decode().split("\n") if line.strip()]
+    if len({len(cells) for cells in rows}) > 1:
+        lengths = sorted({len(cells) for cells in rows})
+        raise InputError(f"{path}: expected as many cells in each row to exchange rows and columns, got {lengths}")
+    lines = io.StringIO()
+    csv.writer(lines, delimiter=separator, lineterminator="\n").writerows(zip(*rows, strict=True))
+    layout = sniff(path, lines.getvalue().encode(), replace(stated, transposed=False, separator=separator))
+    return replace(layout, transposed=True, notes=[*layout.notes, "rows and columns exchanged"])
+
+
+MIN_PLAIN = 3
+"""Fewest different integers below 1,000 beside grouped ones: one or two may stand for "off" or "out of range"."""
+
+LARGEST_STEP = 10.0
+"""Largest factor between neighbours of a column of integers; with a decimal sign, the step is 1,000 times as large."""
+
+_NUMBER = re.compile(rb"[+-]?\d[\d.,]*")
+
+
+class HeaderSearch:
+    """Search for the header and the first row of data.
+
+    Args:
+        path: the file, for messages.
+        text: the whole text.
+        table: lines of its head as cells, each with the number of its line.
         separator: the character between cells.
-        decimal: the decimal sign.
-        names: name of each column, without blanks around it; without a header its number.
-        units: unit of each column, from a row of units or in brackets in the name; empty: unknown.
-        header_row: number of the line with the names, as a text editor counts; None: no header.
-        first_row: number of the first line of data.
-        sample: cells of the first rows, each of the table's width.
+        stated: what need not be guessed.
         missing: cells that mean "not measured".
-        notes: what is unusual, for people.
-        transposed: the file's rows and columns were exchanged.
     """
 
-    path: Path
-    text: bytes
-    separator: str
-    decimal: str
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    header_row: int | None
-    first_row: int
-    sample: list[list[str]]
-    missing: frozenset[str]
-    notes: list[str] = field(default_factory=list)
-    transposed: bool = False
+    def __init__(
+        self,
+        path: Path,
+        text: bytes,
+        table: list[tuple[int, list[str]]],
+        separator: str,
+        stated: FileFormat,
+        missing: frozenset[str],
+    ) -> None:
+        self._path, self._text, self._table = path, text, table
+        self._separator, self._stated, self._missing = separator, stated, missing
+        tail = [cells for _, cells in table[len(table) // 4 :]]
+        self._width = Counter(map(len, tail)).most_common(1)[0][0]
+        columns = zip(*(self._kinds(cells) for cells in tail if len(cells) == self._width), strict=True)
+        self._holds_values = [sum(kind in (NUMBER, TIME) for kind in kinds) > len(kinds) / 2 for kinds in columns]
 
-    def find(self, name: str, *, by_number: bool = True) -> int | None:
-        """Index of a column by its header, its name without unit or its number from 1; None: none, or several."""
-        for positions in self._positions:
-            if len(found := positions.get(name, [])) == 1:
-                return found[0]
-        is_number = by_number and name.isdecimal() and 1 <= int(name) <= len(self.names)
-        return int(name) - 1 if is_number else None
+    def _kinds(self, cells: Sequence[str]) -> list[str]:
+        return [kind_of(cell, self._missing) for cell in cells]
 
-    @cached_property
-    def _positions(self) -> tuple[dict[str, list[int]], ...]:
-        """Indices of the columns of each header, and of each name without unit."""
-        headers: dict[str, list[int]] = {}
-        bare: dict[str, list[int]] = {}
-        for index, name in enumerate(self.names):
-            headers.setdefault(name, []).append(index)
-            bare.setdefault(bare_name(name), []).append(index)
-        return headers, bare
+    def _is_data(self, cells: list[str]) -> bool:
+        kinds = self._kinds(cells)
+        text = sum(kind == TEXT for kind, values in zip(kinds, self._holds_values, strict=False) if values)
+        return len(cells) == self._width and sum(kind in (NUMBER, TIME) for kind in kinds) > text
 
-    def describe_names(self, name: str) -> str:
-        """Names of the columns, with a hint at that which is closest to a name that was not found."""
-        return ", ".join(map(repr, self.names)) + hint_at_closest(name, map(bare_name, self.names))
+    def _is_names(self, cells: list[str]) -> bool:
+        kinds = self._kinds(cells)
+        return TEXT in kinds and NUMBER not in kinds and TIME not in kinds
 
-    def cells(self, column: int) -> list[str]:
-        """Cells of a column in the sample."""
-        return [row[column] for row in self.sample]
+    def layout(self, comments: list[tuple[int, str]]) -> Layout:
+        """Layout of the table.
 
-    @cached_property
-    def kinds(self) -> tuple[str, ...]:
-        """Kind of most cells of each column in the sample."""
-        found = []
-        for column in range(len(self.names)):
-            kinds = Counter(kind_of(cell, self.missing) for cell in self.cells(column))
-            kinds.pop(EMPTY, None)
-            found.append(kinds.most_common(1)[0][0] if kinds else EMPTY)
-        return tuple(found)
+        Args:
+            comments: numbers and texts of the comment lines.
+        """
+        table, stated = self._table, self._stated
+        has_numbers = self._is_numbered_header(0)
+        data = (index for index, (_, cells) in enumerate(table) if self._is_data(cells))
+        first = next((index for index in data if index or not has_numbers), None)
+        if first is None:  # nothing but a header
+            return self._make([] if stated.header is False else table[:1], 1)
+        while first and len(table[first - 1][1]) == self._width and not self._is_names(table[first - 1][1]):
+            if set(self._kinds(table[first - 1][1])) <= {EMPTY} or self._is_numbered_header(first - 1):
+                break
+            first -= 1  # a row of data with bad cells
+        heads: list[tuple[int, list[str]]] = []
+        while first - len(heads) and len(table[first - len(heads) - 1][1]) == self._width:
+            cells = table[first - len(heads) - 1][1]
+            if not (self._is_names(cells) or self._is_numbered_header(first - len(heads) - 1)):
+                break
+            heads.insert(0, table[first - len(heads) - 1])
+        if stated.header is False:
+            heads, first = [], first - len(heads)
+        elif stated.header and not heads:
+            heads, first = [table[first]], first + 1
+        elif not heads:
+            heads = self._unequal_header(first) or self._commented_header(comments)
+        return self._make(heads, first)
 
-    def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield rows of data, each with the number of its last line; for messages.
+    def _is_numbered_header(self, index: int) -> bool:
+        """True for a first line with names of which some are whole numbers."""
+        cells = self._table[index][1]
+        kinds = self._kinds(cells)
+        numbers = all(cell.strip().isdigit() for cell, kind in zip(cells, kinds, strict=True) if kind == NUMBER)
+        text = any(kind == TEXT and values for kind, values in zip(kinds, self._holds_values, strict=False))
+        return (
+            index == 0 and len(self._table) > 1 and len(cells) == self._width and text and numbers and TIME not in kinds
+        )
+
+    def _unequal_header(self, first: int) -> list[tuple[int, list[str]]]:
+        """Header with another number of cells than the rows."""
+        if not first or len(self._table[first - 1][1]) == 1 or not self._is_names(self._table[first - 1][1]):
+            return []
+        row, names = self._table[first - 1]
+        rows = [cells for _, cells in self._table[first:] if len(cells) == self._width]
+        surplus = self._width - len(names)
+        if surplus < 0 and not any(name.strip() for name in names[self._width :]):
+            return [(row, names[: self._width])]
+        if surplus > 0 and not any(cell.strip() for cells in rows for cell in cells[len(names) :]):
+            return [(row, [*names, *[""] * surplus])]
+        cure = "; if the comma is the decimal sign as well, state --decimal ," if len(names) * 2 == self._width else ""
+        raise InputError(
+            f"{self._path}, row {self._table[first][0]}: expected {len(names)} cells as in the header, "
+            f"got {self._width}{cure}"
+        )
+
+    def _commented_header(self, comments: list[tuple[int, str]]) -> list[tuple[int, list[str]]]:
+        """Header in the last comment, as NumPy and MATLAB write it."""
+        for row, comment in comments[::-1]:
+            cells = split_line(comment.strip().lstrip("#%/").strip(), self._separator)
+            if len(cells) == self._width and self._is_names(cells):
+                return [(row, cells)]
+        return []
+
+    def _make(self, heads: list[tuple[int, list[str]]], first: int) -> Layout:
+        filled = [sum(bool(cell.strip()) for cell in cells) for _, cells in heads]
+        names_index = filled.index(max(filled)) if heads else 0
+        heading = map(unquote_formula, heads[names_index][1]) if heads else [""] * self._width
+        names = [" ".join(cell.split()) for cell in heading]
+        below = heads[names_index + 1 :]
+        units_row = min(below, key=lambda head: sum(map(len, head[1]))) if below else None
+        units = (
+            [cell.strip().strip("[]()") for cell in units_row[1]]
+            if units_row
+            else [unit_of_name(name) for name in names]
+        )
+        sample = [cells for _, cells in self._table[first:] if len(cells) == len(names)]
+        notes = []
+        if self._separator != ",":
+            notes.append(describe_separator(self._separator))
+        if not heads:
+            notes.append("no header")
+        elif heads[names_index][0] != self._table[0][0]:
+            notes.append(f"header in row {heads[names_index][0]}")
+        if units_row:
+            notes.append(f"units in row {units_row[0]}")
+        layout = Layout(
+            path=self._path,
+            text=self._text,
+            separator=self._separator,
+            decimal=self._stated.decimal or ".",
+            names=tuple(name or str(number) for number, name in enumerate(names, start=1)),
+            units=tuple(units),
+            header_row=heads[names_index][0] if heads else None,
+            first_row=self._first_line(first),
+            sample=sample,
+            missing=self._missing,
+            notes=notes,
+        )
+        if self._stated.decimal is None:
+            layout = replace(layout, decimal=self._guess_decimal(layout))
+        if layout.decimal == ",":
+            notes.insert(0 if self._separator == "," else 1, "decimal comma")
+        return layout
+
+    def _first_line(self, index: int) -> int:
+        """Number of the first line of a row of the head; cells may hold line ends."""
+        if index >= len(self._table):
+            return self._table[-1][0] + 1
+        row, cells = self._table[index]
+        return row - sum(cell.count("\n") for cell in cells)
+
+    def _guess_decimal(self, layout: Layout) -> str:
+        """Decimal sign, by all rows.
 
         Raises:
-            InputError: a quoted cell has no end.
+            InputError: each sign may be a decimal sign or group thousands.
         """
-        lines = self.text.decode().rstrip("\n").split("\n")[self.first_row - 1 :]
-        reader = csv.reader((f"{line}\n" for line in lines), delimiter=self.separator, strict=True)
-        while True:
-            try:
-                cells = next(reader, None)
-            except csv.Error as error:
-                row = self.first_row - 1 + reader.line_num
-                kind = describe_separator(self.separator)
-                raise InputError(f"{self.path}, row {row}: expected {kind} cells: {error}") from error
-            if cells is None:
-                return
-            if len(cells) > 1 or (cells and cells[0].strip() and not (len(self.names) > 1 and is_remark(cells[0]))):
-                yield self.first_row - 1 + reader.line_num, cells
+        body = find_body(layout)
+        sign, at = find_decimal(body, layout.separator)
+        if sign is None and (group := _find_group_sign(layout)) is not None:
+            layout.notes.append(f"thousands grouped by `{group}`")
+            sign = "," if group == "." else "."
+        if sign is None:
+            row = layout.first_row + body.slice(0, at + 1).to_pybytes().count(b"\n")
+            cell = _NUMBER.search(body.slice(at).to_pybytes())[0].decode()  # type: ignore[index] # it starts a number
+            own, other, name = (".", ",", "point") if "." in cell else (",", ".", "comma")
+            raise InputError(
+                f"{self._path}, row {row}: {cell!r} may have a decimal {name} (--decimal {own}) or group its thousands "
+                f"(--decimal {other}); state one of them, or decimal in [file] of the process's description"
+            )
+        return sign
 
 
-def is_remark(line: str) -> bool:
-    """True for a line without separators that is a text, such as the number of rows below them.
+def _find_group_sign(layout: Layout) -> str | None:
+    """Sign that groups thousands in columns of integers; None: there is no evidence.
 
-    >>> is_remark("240 rows selected"), is_remark("2026-03-01T08:0")
-    (True, False)
+    A column that passes from 963 to 1.007 holds integers: its neighbouring cells with and without the sign are within a
+    factor of `LARGEST_STEP`, and those without it are below 1,000 and differ.
     """
-    return _WORD.search(line) is not None and kind_of(line) == TEXT
+    import pyarrow.compute as pc
 
-
-def blank_repeats(layout: Layout) -> tuple[bytes, int]:
-    """Text with blank lines in place of repeats of the header, as in files put together, and their number."""
-    lines = layout.text.split(b"\n", layout.first_row - 1)
-    head, rest = lines[:-1], b"\n" + lines[-1]
-    row = layout.header_row or 0  # in a comment, a header may stand below the rows
-    header = head[row - 1] if 0 < row <= len(head) else b""
-    repeats = rest.count(b"\n" + header + b"\n") if header.strip() else 0
-    if not repeats:
-        return layout.text, 0
-    return b"\n".join(head) + rest.replace(b"\n" + header + b"\n", b"\n\n"), repeats
-
-
-def bare_name(name: str) -> str:
-    """Name without the unit at its end.
-
-    >>> [bare_name(name) for name in ("T [K]", "T / K", "T in degC", "Flow in pipe")]
-    ['T', 'T', 'T', 'Flow in pipe']
-    """
-    match = _unit_in(name)
-    return name if match is None else name[: match.start()].strip() or name
-
-
-def unit_of_name(name: str) -> str:
-    """Unit at the end of a name, in brackets or after `/` or `in`; empty if there is none."""
-    match = _unit_in(name)
-    return match[1].strip() if match else ""
-
-
-def _unit_in(name: str) -> "re.Match[str] | None":
-    match = _BRACKETED.search(name)
-    if match is None:
-        match = _LABELLED.search(name)
-        if match is not None and not is_unit(match[1]):
-            return None
-    return match
-
-
-def describe_separator(separator: str) -> str:
-    """Separator for people.
-
-    >>> describe_separator(";")
-    '; separated'
-    """
-    return _SEPARATORS.get(separator, f"{separator} separated")
-
-
-def split_line(line: str, separator: str) -> list[str]:
-    """Cells of a line; runs of blanks separate once."""
-    lines = [" ".join(line.split())] if separator == " " else line.splitlines(keepends=True)
-    return next(csv.reader(lines, delimiter=separator), [""])
+    numbers, texts = (
+        [column for column, kind in enumerate(layout.kinds) if kind == wanted] for wanted in (NUMBER, TEXT)
+    )
+    table = TextTable(layout, [], [*numbers, *texts])
+    labels = np.zeros(table.rows, dtype=np.intp)
+    for column in texts:  # cells are neighbours if the texts of their rows are the same, such as the tag
+        codes = np.asarray(table.texts(column).dictionary_encode().indices)
+        labels = np.unique(labels * (codes.max() + 1) + codes, return_inverse=True)[1]
+    order, found = np.argsort(labels, kind="stable"), set()
+    for column in numbers:
+        cells = table.texts(column)
+        with_sign = pc.sum(pc.match_substring_regex(cells, "[.,]")).as_py() or 0
+        if not 0 < with_sign < table.rows:
+            continue
+        cells = cells.take(order)
+        readings = {sign: to_numbers(cells, sign, layout.missing)[0] for sign in ".,"}
+        filled = np.flatnonzero(np.isfinite(readings["."]) & np.isfinite(readings[","]))
+        point, comma = readings["."][filled], readings[","][filled]
+        group, values = (".", comma) if np.abs(comma).sum() > np.abs(point).sum() else (",", point)
+        is_plain = point == comma
+        plain = np.unique(values[is_plain & (values != 0.0)])
+        near = (is_plain[1:] != is_plain[:-1]) & (np.diff(labels[order][filled]) == 0) & (values[1:] * values[:-1] > 0)
+        if plain.size >= MIN_PLAIN and np.abs(plain).max() < 1000 and near.any():
+            steps = np.abs(np.diff(np.log10(np.where(values == 0.0, 1.0, np.abs(values)))))[near]
+            found |= {group} if np.median(steps) < np.log10(LARGEST_STEP) else set()
+    return found.pop() if len(found) == 1 else None

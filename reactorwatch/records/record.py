@@ -4,14 +4,18 @@ A record has several runs if the plant's clock stepped back or the plant was res
 and times increase within each run.
 """
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from math import ceil
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from reactorwatch.errors import InputError
 
 MINUTE_NS = 60_000_000_000
 
@@ -208,3 +212,107 @@ def join_runs(runs: list[Record]) -> Record:
     }
     times = np.concatenate([run.time_min for run in runs])
     return replace(runs[0], time_min=times, columns=columns, runs=numbers, excluded=excluded)
+
+
+EXCLUDED = "\0"
+"""Begins the names of excluded values while rows are joined; no signal has it."""
+
+
+def join_files(records: Sequence[Record]) -> Record:
+    """Join records of files that follow each other.
+
+    A file continues the last run of the file before it; if it starts before that run's end with other rows than those,
+    it starts a new one.
+
+    Raises:
+        InputError: they have different signals or units, or not all have clock time.
+    """
+    first = records[0]
+    if len(records) == 1:
+        return first
+    parts: list[Record] = []
+    repeats: Counter[str] = Counter()
+    for record in records:
+        _check_alike(record, first)
+        shift_min = (record.zero_ns - first.zero_ns) / MINUTE_NS
+        for number, run in enumerate(record.split_runs()):
+            part = replace(run, time_min=run.time_min + shift_min)
+            if parts and not number:
+                both = replace(join_runs([parts[-1], part]), runs=None)
+                excluded = {EXCLUDED + name: values for name, values in both.excluded.items()}
+                stay, columns, found = join_repeats(both.time_min, {**both.columns, **excluded})
+                if (np.diff(both.time_min[stay]) > 0).all():
+                    excluded = {name: columns.pop(EXCLUDED + name) for name in both.excluded}
+                    part = replace(both, time_min=both.time_min[stay], columns=columns, excluded=excluded)
+                    repeats += found
+                    parts.pop()
+            parts.append(part)
+    strays = sum(record.strays for record in records)
+    notes = dict.fromkeys(record.read_as for record in records if record.read_as)
+    read_as = "; ".join([*notes, *(f"{text}: {count}" for text, count in repeats.items())])
+    return replace(join_runs(parts), zero_ns=first.zero_ns, first_row=None, strays=strays, read_as=read_as)
+
+
+def _check_alike(record: Record, first: Record) -> None:
+    if record.columns.keys() != first.columns.keys():
+        got, expected = ", ".join(record.columns), ", ".join(first.columns)
+        raise InputError(f"{record.name}: expected the signals of {first.name}, {expected}, got {got}")
+    if dict(record.units) != dict(first.units):
+        raise InputError(f"{record.name}: expected the units of {first.name}, {first.units}, got {record.units}")
+    if bool(record.zero_ns) != bool(first.zero_ns):
+        raise InputError(f"{record.name}: expected {'' if first.zero_ns else 'no '}clock time, as {first.name} has")
+
+
+DUPLICATES, MERGED = "duplicate rows left out", "rows merged into a later one of the same time, whose values count"
+
+
+def join_repeats(
+    times: NDArray[Any],
+    columns: dict[str, NDArray[np.float64]],
+    runs: NDArray[np.intp] | None = None,
+    most: float = 1.0,
+) -> tuple[NDArray[np.intp], dict[str, NDArray[np.float64]], Counter[str]]:
+    """Leave out copies of earlier rows, and join different rows of one time: the last value of each signal counts.
+
+    Copies stand below their originals, or are a block that was written again, as where exports overlap. A step back in
+    time with other values starts another run, and stays.
+
+    Args:
+        times: times of the rows, shape (rows,).
+        columns: values by signal, each of shape (rows,).
+        runs: number of each row's run, shape (rows,); None: one run.
+        most: largest share of rows whose values may give way to those of a later one; with more, all stay.
+
+    Returns:
+        Indices of the rows that stay, their values, and the numbers of other rows by what became of them.
+    """
+    every = np.arange(times.size)
+    if (times[1:] > times[:-1]).all():
+        return every, columns, Counter()
+    run = np.zeros_like(every) if runs is None else runs
+    order = np.lexsort((every, times, run))
+    one, other = order[:-1], order[1:]
+    is_copy, back = np.zeros((2, times.size), dtype=bool)
+    is_copy[other] = (times[one] == times[other]) & (run[one] == run[other])
+    for values in columns.values():
+        is_copy[other] &= (values[one] == values[other]) | (np.isnan(values[one]) & np.isnan(values[other]))
+    for rows in np.split(every, np.flatnonzero(np.diff(run)) + 1):
+        back[rows] = times[rows] < np.fmax.accumulate(times[rows])
+    block = np.cumsum(np.diff(back, prepend=False))
+    block_is_copy = np.bincount(block[~is_copy], minlength=block[-1] + 1) == 0
+    rest = np.flatnonzero(~(back & block_is_copy[block]))
+    index = np.arange(rest.size)
+    same = np.zeros(rest.size, dtype=bool)
+    same[1:] = (times[rest][1:] == times[rest][:-1]) & (run[rest][1:] == run[rest][:-1])
+    first, stays = np.maximum.accumulate(np.where(same, 0, index)), ~np.append(same[1:], False)
+    joined, loses = {}, np.zeros(rest.size, dtype=bool)
+    for name, values in columns.items():
+        own = values[rest]
+        loses[1:] |= same[1:] & (own[1:] != own[:-1]) & ~np.isnan(own[1:] + own[:-1])
+        last = np.maximum.accumulate(np.where(np.isnan(own), 0, index))
+        joined[name] = own[np.maximum(last, first)][stays]
+    if np.count_nonzero(loses) > most * times.size:
+        return every, columns, Counter()
+    merged = int(np.count_nonzero(same & ~is_copy[rest]))
+    copies = times.size - int(np.count_nonzero(stays)) - merged
+    return rest[stays], joined, +Counter({DUPLICATES: copies, MERGED: merged})

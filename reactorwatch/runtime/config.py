@@ -17,7 +17,7 @@ import msgspec
 
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.limits import Limits, parse_toml, set_limits
-from reactorwatch.records.input_file import read_regular
+from reactorwatch.records.decode import read_regular
 from reactorwatch.runtime.setting_rules import (
     LAST_PORT,
     check_bounds,

@@ -6,8 +6,8 @@ from typing import Any
 
 from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.input_file import read_regular
+from reactorwatch.records.decode import read_regular
+from reactorwatch.records.write import atomic_write
 
 
 def read_extended_model(path: Path) -> ExtendedModel:

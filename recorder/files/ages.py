@@ -16,7 +16,7 @@ import structlog
 
 from reactorwatch.errors import InputError
 from reactorwatch.limits import parse_json
-from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.write import atomic_write
 
 log = structlog.get_logger()
 

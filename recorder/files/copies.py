@@ -17,8 +17,7 @@ import structlog
 
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.output import refuse_source
+from reactorwatch.records.write import atomic_write, refuse_source
 from recorder import RecordedMessage, StoredMessage
 from recorder.files.index import LATEST_NS
 from recorder.files.metadata import METADATA, own_metadata, parse_gap

@@ -31,7 +31,7 @@ from mcap.writer import MCAP0_MAGIC
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import PREFIX
 from reactorwatch.errors import InputError
-from reactorwatch.records.input_file import wrap_read_errors
+from reactorwatch.records.decode import wrap_read_errors
 from recorder import Channel, StoredMessage
 from recorder.files.index import (
     DAMAGE,

@@ -22,7 +22,7 @@ from mcap.summary import Summary
 from reactorwatch.contract import keys
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
-from reactorwatch.records.input_file import list_files
+from reactorwatch.records.decode import list_files
 from recorder import RecordedMessage, StoredMessage
 from recorder.files.index import LATEST_NS, span_ns
 from recorder.files.metadata import CLOCK, NO_CLOCK, ZERO_NS, own_metadata, processes_in

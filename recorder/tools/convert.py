@@ -15,13 +15,10 @@ from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import convert_to_process, read_signals
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.decode import is_table
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.output import refuse_source
-from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, join_runs, to_time_ns
-from reactorwatch.records.several_files import join_files
-from reactorwatch.records.source_text import is_table
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, join_files, join_runs, to_time_ns
+from reactorwatch.records.write import atomic_write, refuse_source, write_table
 from recorder import RecordedMessage
 from recorder.columns import signal_roles
 from recorder.files.metadata import CLOCK, NO_CLOCK, PROCESS, ZERO_NS, process_metadata

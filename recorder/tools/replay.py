@@ -22,8 +22,8 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.read import read_signals
 from reactorwatch.errors import InputError
+from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import NEVER_NS, to_time_ns
-from reactorwatch.records.source_text import is_table
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.liveliness import wait_alive

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.write import atomic_write
 from recorder.columns import RunColumns
 from recorder.panels import PANELS
 from recorder.panels.base import Colour, Panel, Series, TimePlot, View

@@ -17,7 +17,7 @@ from reactorwatch.process.library.three_tanks.effects import THREE_TANKS_EFFECTS
 from reactorwatch.process.library.three_tanks.model import three_tanks
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from tests.integration.watched_hour import record_hour
 
 LEAK = "coolant_flow:step:-0.15@120min"

@@ -15,7 +15,7 @@ from reactorwatch.diagnosis.result import Diagnosis
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from tests.tables import read_csv
 
 from .conftest import Command

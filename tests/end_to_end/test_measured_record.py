@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from tests.tables import read_csv
 

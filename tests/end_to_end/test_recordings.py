@@ -7,7 +7,7 @@ import pytest
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from recorder.files.writer import RecordingWriter
 from tests.tables import read_csv
 

@@ -15,7 +15,7 @@ import pytest
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from reactorwatch.runtime.config import BusConfig
 
 PATIENCE_S = 60.0

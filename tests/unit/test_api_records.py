@@ -10,7 +10,7 @@ import pytest
 import reactorwatch as rw
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.records.record import Record as MeasuredRecord
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from recorder.tools.convert import import_csv
 
 ROWS = 300

@@ -19,7 +19,7 @@ from reactorwatch.api.monitor import monitor_settings
 from reactorwatch.cli.main import app
 from reactorwatch.contract.codec import encode
 from reactorwatch.description.choice import ProcessChoice
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from recorder.config import ReplayConfig
 from recorder.tools.convert import export_csv, import_csv
 from recorder.tools.replay import open_tape

@@ -10,11 +10,10 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import input_timing
 from reactorwatch.diagnosis.fitting.profiles import Signal
-from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorLinearization
 from reactorwatch.process.effect import Effect, EffectConstant
-from reactorwatch.process.model import ProcessModel, Variable, variable
+from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel, Variable, variable
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,8 @@ import msgspec
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.batch import FilterRecord
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.process.model import ProcessModel, parameter, variable
 

@@ -17,13 +17,20 @@ from reactorwatch.diagnosis.fitting.colored_noise import Noise, add_colored_nois
 from reactorwatch.diagnosis.fitting.measurement_delay import ShiftedRun, restore_rows, shift_measurements
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.run import Run, input_uncertainty_of
-from reactorwatch.kalman.batch_runner import run_together
-from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
+from reactorwatch.kalman.batch import (
+    STEPS_PER_EVALUATION,
+    STEPS_PER_LINEARISATION,
+    FilterRecord,
+    FilterResult,
+    ResampledRecord,
+    StepBudget,
+    count_pieces,
+    insert_rows,
+    run_together,
+)
+from reactorwatch.kalman.ekf import Filter, FilterState
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
-from reactorwatch.kalman.filter_record import FilterRecord
-from reactorwatch.kalman.innovations import FilterResult
-from reactorwatch.kalman.resampling import ResampledRecord, count_pieces, insert_rows
-from reactorwatch.kalman.step_budget import STEPS_PER_EVALUATION, STEPS_PER_LINEARISATION, StepBudget
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 

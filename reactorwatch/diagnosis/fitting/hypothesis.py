@@ -21,9 +21,8 @@ from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, SharedPrefi
 from reactorwatch.diagnosis.fitting.profiles import FittedProfile, Signal
 from reactorwatch.diagnosis.parameter_priors import last_finite_row, offsets
 from reactorwatch.diagnosis.run import Run
+from reactorwatch.kalman.batch import STEPS_PER_COVARIANCE, FilterResult
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
-from reactorwatch.kalman.innovations import FilterResult
-from reactorwatch.kalman.step_budget import STEPS_PER_COVARIANCE
 
 CONVERGED, WELL_CONVERGED = 0.05, 0.005
 """Thresholds in log likelihood: a rough fit stops after a step that gains less than the first, a full fit when the

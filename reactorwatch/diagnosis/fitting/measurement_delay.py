@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run, input_uncertainty_of
-from reactorwatch.kalman.innovations import FilterResult
-from reactorwatch.kalman.input_uncertainty import InputUncertainty
+from reactorwatch.kalman.batch import FilterResult, InputUncertainty
 
 
 class ShiftedRun(NamedTuple):

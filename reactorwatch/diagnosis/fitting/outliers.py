@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.noise_estimation import initial_sensor_sd
-from reactorwatch.kalman.resolution import resolution
+from reactorwatch.kalman.noise_estimation import initial_sensor_sd, resolution
 
 FAR = 5.0
 """Required deviation in standard deviations of the sensor's noise ..."""

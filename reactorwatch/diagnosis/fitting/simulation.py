@@ -19,7 +19,7 @@ from reactorwatch.diagnosis.fitting.fault_filter import (
     huber_weights,
 )
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.process.model import ProcessModel
 

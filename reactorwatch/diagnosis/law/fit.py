@@ -17,9 +17,8 @@ from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvalu
 from reactorwatch.diagnosis.fitting.simulation import FittedSimulation, linearize
 from reactorwatch.diagnosis.law.shapes import LARGEST, Shape
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
-from reactorwatch.process.model import Place
+from reactorwatch.process.model import MODEL_CACHE_SIZE, Place
 
 MOST_TERMS = 6
 """Largest number of functions of a correction."""

@@ -17,10 +17,9 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.law.feedback import Answers
 from reactorwatch.diagnosis.law.path import Scale, evaluate_along
-from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.process.effect import Effect, ParameterShift
 from reactorwatch.process.law import add_lag_states
-from reactorwatch.process.model import Parameter, Place, ProcessModel
+from reactorwatch.process.model import MODEL_CACHE_SIZE, Parameter, Place, ProcessModel
 from reactorwatch.process.places import CAPACITY, FACTOR, SENSOR, correct, find_place, variable_expression
 
 HINGES = (-0.7, 0.0, 0.7)

@@ -11,9 +11,8 @@ from itertools import product
 
 import casadi as ca
 
-from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 
 
 class ConstantVariant(Effect):

@@ -34,10 +34,9 @@ from reactorwatch.diagnosis.fitting.profiles import (
 )
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.constant_variants import ConstantVariant, variants_of
-from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 
 KNOTS = 12
 DECAYS = (0.02, 0.1, 0.4)

@@ -27,7 +27,7 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.cause_prior import prior_cost
 from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
 from reactorwatch.diagnosis.search.screen import Candidate, Part, Screen, first_of_each
-from reactorwatch.kalman.resolution import resolution_sd
+from reactorwatch.kalman.noise_estimation import resolution_sd
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 

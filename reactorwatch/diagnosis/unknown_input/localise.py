@@ -30,7 +30,7 @@ from reactorwatch.diagnosis.unknown_input.forcing import (
     LinearisedForcing,
     ReferenceTrajectory,
 )
-from reactorwatch.kalman.ekf import LEAST_PROCESS_SD, NoiseLevels
+from reactorwatch.kalman.ekf_step import LEAST_PROCESS_SD, NoiseLevels
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel, Variable
 

@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives import serialization
 
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.write import atomic_write
 from reactorwatch.runtime.security.acl import ROLES, SERIAL_BYTES, access_control, common_name
 from reactorwatch.runtime.security.certificates import (
     Identity,

@@ -7,8 +7,8 @@ import msgspec
 
 from reactorwatch.errors import InputError
 from reactorwatch.limits import parse_json
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.input_file import read_regular
+from reactorwatch.records.decode import read_regular
+from reactorwatch.records.write import atomic_write
 from reactorwatch.runtime.security.acl import SERIAL_BYTES, common_name
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import reading
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from tests.tables import read_csv
 
 

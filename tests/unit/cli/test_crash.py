@@ -20,7 +20,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from reactorwatch.runtime import crash
 from reactorwatch.runtime.config import read_settings
 from recorder import RecordedMessage

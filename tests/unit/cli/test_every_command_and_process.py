@@ -21,7 +21,7 @@ from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 
 DESCRIPTION = """
 name = "rig"

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from reactorwatch.cli.main import app, main
 from reactorwatch.errors import InputError
-from reactorwatch.records.output import check_folder_name
+from reactorwatch.records.write import check_folder_name
 from recorder.tools.convert import import_csv
 
 NO_ROUTER = "--endpoint tcp/127.0.0.1:1"

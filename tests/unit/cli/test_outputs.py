@@ -14,7 +14,7 @@ import typer
 from reactorwatch.cli.batch import SUMMARY
 from reactorwatch.cli.diagnose import REPORT
 from reactorwatch.cli.main import app, main
-from reactorwatch.records import output
+from reactorwatch.records import write
 from recorder import RecordedMessage
 from recorder.files.writer import RecordingWriter
 from tests.unit.recorder import golden
@@ -226,9 +226,9 @@ def test_only_regular_files_are_replaced(
         out.mkdir()
     elif kind == "device":  # a file that the system calls a device, as none may be touched here
         out.touch()
-        real = output.file_mode
+        real = write.file_mode
         monkeypatch.setattr(
-            output, "file_mode", lambda path: stat.S_IFCHR | 0o666 if path.name == case.out else real(path)
+            write, "file_mode", lambda path: stat.S_IFCHR | 0o666 if path.name == case.out else real(path)
         )
     else:
         pipe = out if kind == "pipe" else folder / "pipe"
@@ -299,7 +299,7 @@ def test_a_file_of_another_kind_than_its_name_implies_is_kept_unless_force_is_gi
         else:
             existing.write_bytes(content)
         assert "replace it with --force" in refuse(line(case, case.out), monkeypatch, capsys)
-        assert output.check_output_file(existing, force=True) == existing
+        assert write.check_output_file(existing, force=True) == existing
         existing.unlink()
 
 

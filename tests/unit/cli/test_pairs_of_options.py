@@ -18,7 +18,7 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.library.three_tanks.model import three_tanks
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from tests.covering import Row, covering_array, pairs_of
 from tests.unit.cli.test_crash import run
 

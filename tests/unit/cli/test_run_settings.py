@@ -17,7 +17,7 @@ from reactorwatch.description.process import Process, Signal
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from recorder.config import RecorderConfig, ReplayConfig
 from recorder.tools.convert import import_csv
 from tests.unit.plant_node.test_plant_of_any_process import RIG

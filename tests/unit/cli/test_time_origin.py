@@ -22,7 +22,7 @@ from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from reactorwatch.runtime.model_file import write_extended_model
 from recorder.columns import read_run
 from recorder.tools.convert import import_csv, read_record

@@ -18,7 +18,7 @@ from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from tests.unit.diagnosis.runs import record_of
 
 SOUND = record_of(rows=300)

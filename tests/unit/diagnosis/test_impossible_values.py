@@ -15,7 +15,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from tests.tables import read_csv
 from tests.unit.diagnosis.rig import Rig
 from tests.unit.diagnosis.rig import record_of as rig_record

@@ -14,7 +14,7 @@ from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.unknown_input.forcing import Forcing
 from reactorwatch.diagnosis.unknown_input.localise import UnknownInput, has_feedback, locate
-from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.batch import FilterRecord
 from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS

@@ -12,8 +12,9 @@ from reactorwatch.diagnosis.identifiability import identifiability
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.page import as_page
 from reactorwatch.diagnosis.result import NAMED, NOMINAL, Diagnosis
-from reactorwatch.kalman.ekf import Filter, NoiseLevels
-from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.batch import FilterRecord
+from reactorwatch.kalman.ekf import Filter
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process import effects_of
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.generic_effects import generic_effects

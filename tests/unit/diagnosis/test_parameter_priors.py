@@ -13,8 +13,8 @@ from reactorwatch.diagnosis.parameter_priors import add_priors, offsets, parse_p
 from reactorwatch.diagnosis.result import NAMED, NOMINAL
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.errors import InputError
+from reactorwatch.kalman.batch import FilterRecord
 from reactorwatch.kalman.ekf import Filter
-from reactorwatch.kalman.filter_record import FilterRecord
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import make_run, record_of

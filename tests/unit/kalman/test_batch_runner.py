@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.batch_runner import LEAST_ROWS, run_together
-from reactorwatch.kalman.ekf import Filter, NoiseLevels
-from reactorwatch.kalman.filter_record import FilterRecord
-from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.batch import LEAST_ROWS, FilterRecord, FilterResult, run_together
+from reactorwatch.kalman.ekf import Filter
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.library.cstr.model import cstr
 
 ROWS = 2 * LEAST_ROWS

@@ -14,9 +14,9 @@ from scipy.stats import chi2, multivariate_normal
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
-from reactorwatch.kalman.filter_record import FilterRecord
-from reactorwatch.kalman.innovations import Innovation
+from reactorwatch.kalman.batch import FilterRecord, Innovation
+from reactorwatch.kalman.ekf import Filter, FilterState
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, OPERATING_STATE, cstr
 from reactorwatch.process.model import Output, ProcessModel, new_clock, variable

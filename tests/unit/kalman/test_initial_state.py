@@ -8,8 +8,9 @@ import pytest
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.kalman.ekf import Filter, NoiseLevels
-from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.batch import FilterRecord
+from reactorwatch.kalman.ekf import Filter
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.batch import FilterRecord, FilterResult, InputUncertainty, insert_rows
+from reactorwatch.kalman.ekf import Filter
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorLinearization
-from reactorwatch.kalman.filter_record import FilterRecord
-from reactorwatch.kalman.innovations import FilterResult
-from reactorwatch.kalman.input_uncertainty import InputUncertainty
 from reactorwatch.kalman.noise_estimation import fit_noise
-from reactorwatch.kalman.resampling import insert_rows
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel

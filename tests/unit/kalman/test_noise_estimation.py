@@ -6,8 +6,8 @@ import pytest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.batch import FilterRecord
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.process.library.cstr.model import cstr
 

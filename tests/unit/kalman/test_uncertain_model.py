@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.ekf import Filter, NoiseLevels
-from reactorwatch.kalman.filter_record import FilterRecord
-from reactorwatch.kalman.uncertain_model import learned_parameters, select_effects, widen_model
+from reactorwatch.kalman.batch import FilterRecord
+from reactorwatch.kalman.ekf import Filter
+from reactorwatch.kalman.ekf_step import NoiseLevels
+from reactorwatch.kalman.filter_states import learned_parameters, select_effects, widen_model
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.library.three_tanks.model import three_tanks

@@ -6,7 +6,7 @@ from typing import Any
 from monitor_node.causes.window import Row
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import NoiseLevels
 
 SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
 """The plant's default noise."""

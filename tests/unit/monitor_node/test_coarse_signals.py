@@ -6,7 +6,7 @@ import pytest
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.learn.training_rows import screen_baseline
-from reactorwatch.kalman.resolution import resolution
+from reactorwatch.kalman.noise_estimation import resolution
 
 from .samples import Rows
 from .test_many_outputs import config_of, plant, raised, watch

@@ -20,9 +20,9 @@ from plant_node.record import simulate_record
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.kalman import error_dynamics
+from reactorwatch.kalman.batch import STEPS_PER_SEARCH
 from reactorwatch.kalman.ekf_step import compiled_row, predict_function, row_function
-from reactorwatch.kalman.initial_state import correction_function
-from reactorwatch.kalman.step_budget import STEPS_PER_SEARCH
+from reactorwatch.kalman.filter_states import correction_function
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
-from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.batch import FilterRecord
+from reactorwatch.kalman.ekf import Filter, FilterState
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr

@@ -19,7 +19,7 @@ from reactorwatch.description.process import ROLES, Process, Signal
 from reactorwatch.description.read import read_process_table
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, join_runs
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from recorder.config import ReplayConfig
 from recorder.files.copies import Window, cut
 from recorder.files.recording import Recording

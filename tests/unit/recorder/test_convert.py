@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from reactorwatch.cli.info import info_object
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, join_runs
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from recorder.files.recording import Recording
 from recorder.tools.convert import export_csv, import_csv, read_record
 from recorder.tools.inspect import inspect

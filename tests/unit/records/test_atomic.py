@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError, is_passing
-from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.write import atomic_write
 
 
 def test_the_new_file_takes_the_place_of_the_old_when_the_block_ends(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ from hypothesis.extra.numpy import arrays
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import SignalColumn, read_table
+from reactorwatch.records.read import SignalColumn, read_table
 from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN, Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from tests.tables import read_csv
 
 PLAIN = "time_min,qc,C,T\n0.1,100,0.1,438\n0.2,101,0.2,439\n0.5,102,0.3,440\n"

@@ -8,7 +8,7 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import SignalColumn, read_table
+from reactorwatch.records.read import SignalColumn, read_table
 from tests.unit.records.variants import UNITS, VARIANTS
 
 DAMAGES_OF_A_FILE = 8

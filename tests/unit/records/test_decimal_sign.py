@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import read_table
-from reactorwatch.records.sniff import HEAD_LINES
+from reactorwatch.records.layout import HEAD_LINES
+from reactorwatch.records.read import read_table
 
 LATE = 6 * HEAD_LINES
 """Rows before the first cell with a sign: many more than those by which the separator and the header are guessed."""

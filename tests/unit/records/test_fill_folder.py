@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.folder import fill_folder
+from reactorwatch.records.write import fill_folder
 
 
 def tree(folder: Path) -> dict[str, str]:

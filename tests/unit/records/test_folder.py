@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.folder import make_folder
+from reactorwatch.records.write import make_folder
 
 
 def test_a_folder_is_made_with_those_above_it_and_may_be_there_already(tmp_path: Path) -> None:

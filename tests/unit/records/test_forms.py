@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import read_table
+from reactorwatch.records.read import read_table
 
 START = datetime(2026, 10, 24, 22, 30, tzinfo=UTC)
 

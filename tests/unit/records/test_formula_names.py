@@ -20,11 +20,11 @@ from reactorwatch.cli.display import Screen, _escape_markup, format_rows, wrap_l
 from reactorwatch.cli.recordings import _report_text
 from reactorwatch.diagnosis.report import mathml, svg
 from reactorwatch.errors import InputError
-from reactorwatch.records.cells import quote_formula, unquote_formula
-from reactorwatch.records.layout import bare_name
-from reactorwatch.records.read_table import read_table
+from reactorwatch.records.decode import quote_formula, unquote_formula
+from reactorwatch.records.read import read_table
 from reactorwatch.records.record import Record
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.table import bare_name
+from reactorwatch.records.write import write_table
 from reactorwatch.terminal import printable
 
 FORMULAS = [

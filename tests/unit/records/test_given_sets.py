@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import SignalColumn, read_table
+from reactorwatch.records.read import SignalColumn, read_table
 
 TEP = FileFormat(period="3 min")
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.input_file import wrap_read_errors
+from reactorwatch.records.decode import wrap_read_errors
 
 
 def test_a_missing_file_is_reported(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import SignalColumn, read_table
+from reactorwatch.records.read import SignalColumn, read_table
 from reactorwatch.records.record import Record
 
 START = datetime(2026, 5, 8, 20)

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from reactorwatch.description.toml_file import parse_process, to_tables
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.quality import judge
-from reactorwatch.records.read_table import SignalColumn, read_table
+from reactorwatch.records.historian import judge
+from reactorwatch.records.read import SignalColumn, read_table
 from reactorwatch.records.record import Record
 
 ROWS = 40

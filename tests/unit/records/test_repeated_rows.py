@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import read_table
-from reactorwatch.records.record import Record
-from reactorwatch.records.several_files import join_files
+from reactorwatch.records.read import read_table
+from reactorwatch.records.record import Record, join_files
 
 ROWS = [f"{10 * row},{20 + row * 37 % 11 / 10},{row % 3}" for row in range(60)]
 HOURS = [f"2026-10-{1 + row // 24:02d} {row % 24:02d}:00:00,{20 + row * 37 % 11 / 10},{row % 3}" for row in range(60)]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import GAP_ROWS, Record, join_runs
-from reactorwatch.records.write_table import write_table
+from reactorwatch.records.write import write_table
 from tests.tables import read_csv
 
 

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 import reactorwatch as rw
 from reactorwatch.cli.main import app
-from reactorwatch.records.read_table import read_table
-from reactorwatch.records.sentinels import describe_sentinels
+from reactorwatch.records.cells import describe_sentinels
+from reactorwatch.records.read import read_table
 
 CODES = [-99, -999, -9999, -999.9, -99.99, 9999, 99999, 32767, -32768, 65535, -2147483648, 1e10, 1e14, -1e12]
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import SignalColumn, read_table
+from reactorwatch.records.read import SignalColumn, read_table
 from reactorwatch.records.record import Record
 
 START = datetime(2026, 3, 4, 8, tzinfo=UTC)

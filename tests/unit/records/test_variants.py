@@ -8,9 +8,8 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import SignalColumn, read_table
-from reactorwatch.records.record import Record, join_runs
-from reactorwatch.records.several_files import join_files
+from reactorwatch.records.read import SignalColumn, read_table
+from reactorwatch.records.record import Record, join_files, join_runs
 from tests.unit.records.variants import (
     BERLIN,
     HOLES,

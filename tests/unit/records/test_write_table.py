@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.records import source_text
+from reactorwatch.records import decode
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import read_table
+from reactorwatch.records.read import read_table
 from reactorwatch.records.record import Record, join_runs
-from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
+from reactorwatch.records.write import WRITTEN_SUFFIXES, write_table
 from tests.tables import read_csv
 from tests.unit.records.test_csv_file import assert_same
 
@@ -90,7 +90,7 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, name: str, conten
 
 
 def test_a_small_file_that_expands_to_gigabytes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(source_text, "LARGEST_TEXT", 1000)
+    monkeypatch.setattr(decode, "LARGEST_TEXT", 1000)
     for rows, fits in ((100, True), (300, False)):
         path = tmp_path / f"{rows}.csv.gz"
         path.write_bytes(gzip.compress(b"time_min,qc\n" + b"".join(b"%d,1\n" % row for row in range(rows))))

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import read_table
-from reactorwatch.records.zones import to_utc
+from reactorwatch.records.read import read_table
+from reactorwatch.records.timestamps import to_utc
 
 CHANGES = {
     "Europe/Berlin": (datetime(2026, 3, 29, 1, tzinfo=UTC), datetime(2026, 10, 25, 1, tzinfo=UTC)),

@@ -17,8 +17,7 @@ from monitor_node.storage.state_files import StateStore
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError, UnavailableError, is_passing
-from reactorwatch.records.atomic import atomic_write
-from reactorwatch.records.folder import make_folder
+from reactorwatch.records.write import atomic_write, make_folder
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal

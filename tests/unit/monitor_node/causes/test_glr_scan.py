@@ -10,7 +10,8 @@ from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import FittedProfile, Ramp, Step
-from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.ekf import Filter
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of

@@ -11,7 +11,7 @@ import pytest
 from monitor_node.alarms.alarms import SuspectedCause
 from monitor_node.causes.isolation import PROCESS, SENSOR, UNKNOWN, Isolation, causes_of
 from monitor_node.causes.window import Row
-from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel, variable

@@ -17,8 +17,8 @@ from monitor_node.core import Monitor
 from monitor_node.learn.signal_range import signal_ranges
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Sample
+from reactorwatch.kalman.batch import STEPS_PER_RUN, STEPS_PER_SEARCH, BudgetExceededError, StepBudget
 from reactorwatch.kalman.ekf import Filter
-from reactorwatch.kalman.step_budget import STEPS_PER_RUN, STEPS_PER_SEARCH, BudgetExceededError, StepBudget
 from reactorwatch.process.library.cstr.model import cstr
 
 from ..faulty import SENSORS, rows_of

@@ -10,8 +10,8 @@ from monitor_node.causes.isolation import causes_of
 from monitor_node.causes.scan import Candidate, GlrScan, scan_candidates
 from monitor_node.causes.window import Window, window_of
 from reactorwatch.diagnosis.fitting.profiles import EndedRamp, FittedProfile, Ramp, Step
+from reactorwatch.kalman.batch import BudgetExceededError, StepBudget
 from reactorwatch.kalman.ekf import Filter
-from reactorwatch.kalman.step_budget import BudgetExceededError, StepBudget
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
 

@@ -7,7 +7,8 @@ import pytest
 
 from monitor_node.causes.isolation import causes_of
 from monitor_node.causes.scan import GlrScan
-from monitor_node.causes.window import BURN_IN_ROWS, GATE, Row, Window, window_of
+from monitor_node.causes.window import BURN_IN_ROWS, Row, Window, window_of
+from reactorwatch.kalman.batch import GATE
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of

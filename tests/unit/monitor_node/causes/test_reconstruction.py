@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from monitor_node.causes.stage import Reconstruction, ReconstructionMemory
 from monitor_node.causes.window import Row
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
 

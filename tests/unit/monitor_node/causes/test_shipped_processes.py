@@ -8,7 +8,8 @@ from monitor_node.causes.isolation import causes_of
 from monitor_node.causes.scan import GlrScan
 from monitor_node.causes.window import window_of
 from reactorwatch.cli.example import make_example
-from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.ekf import Filter
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.library.cascaded_tanks.model import tanks
 
 

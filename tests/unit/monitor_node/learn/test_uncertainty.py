@@ -18,8 +18,8 @@ from monitor_node.learn.training_rows import RowArrays
 from monitor_node.replay import backtest
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.diagnosis.result import NOMINAL
-from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.uncertain_model import is_disturbance
+from reactorwatch.kalman.ekf_step import NoiseLevels
+from reactorwatch.kalman.filter_states import is_disturbance
 from reactorwatch.process.extended_model import ExtendedModel
 from reactorwatch.process.library.cstr.model import cstr
 

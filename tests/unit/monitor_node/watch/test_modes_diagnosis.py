@@ -13,7 +13,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
 from reactorwatch.contract.messages_pb2 import BaselineCommand, Quality, Sample
 from reactorwatch.diagnosis.result import NOMINAL
-from reactorwatch.kalman.uncertain_model import WANDER
+from reactorwatch.kalman.filter_states import WANDER
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.records.record import to_time_ns
 

@@ -1,7 +1,14 @@
-"""A model with uncertain constants, disturbances that wander and coloured noise as further states of its filter.
+"""States of a filter: their initial estimate, and further states for what is uncertain about the plant.
 
-A plant is never quite its model. What is not known about it is a state of the filter, so that its covariance is in the
-variance of every prediction, and every row narrows it:
+The initial state explains the first measurements, with a wide covariance. If the measurements determine all states,
+Newton's method on the outputs finds them, in one step where the outputs are the states themselves. If not, because a
+value is missing or a state has no sensor, the search starts at the steady state whose outputs are nearest to the
+measurements, so that the unmeasured state fits the others: of the reactor's three steady states, that of the right
+branch. The states that effects add (`ProcessModel.at_rest`) are at rest at first, with a standard deviation of their
+scale.
+
+A plant is never quite its model. What is not known about it is a further state, so that its covariance is in the
+variance of every prediction, and every row narrows it (`widen_model`):
 
 - A constant: the size of an effect of the catalogue, which never changes. Its standard deviation at first is a size of
   practical significance (`Effect.typical`). A move of the input to a point that the plant has not been at is then
@@ -15,40 +22,158 @@ The effects of a catalogue are many, and most act nearly alike. `select_effects`
 come close to all others.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from math import inf
 
 import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
-from reactorwatch.kalman.noise_estimation import initial_sensor_sd
+from reactorwatch.kalman.ekf_step import output_function
 from reactorwatch.process import effects_of, named_effects
 from reactorwatch.process.effect import TIMING, Effect
+from reactorwatch.process.effect_states import reset_function, rest_function, with_derivatives
 from reactorwatch.process.input_effects import InputLag
-from reactorwatch.process.model import Parameter, ProcessModel, parameter, variable
+from reactorwatch.process.model import MODEL_CACHE_SIZE, Parameter, ProcessModel, parameter, variable
+from reactorwatch.process.steady_state import SteadyState, SteadyStates
+
+START_SD = 3.0  # of a state that no sensor shows, in its scales
+START_SDS = 10.0  # of a measured state, in standard deviations of the sensor: the value may be an outlier
+MAX_ITERATIONS = 5  # Newton's method doubles its digits in each
 
 CONSTANT, WANDER, NOISE = "constant", "wander", "noise"
 """Kinds of additional states: `constant feed_temperature`, `wander T`, `noise T`."""
 
-MOST_CONSTANTS = 6
-"""Number of effects without states that are uncertain at most; the lags of the inputs come on top."""
+MOST_CONSTANTS = 6  # of effects without states; the lags of the inputs come on top
+LEAST_RATE = 0.04  # rms rate that an effect must add to those selected before, in scales of the states a minute
+WANDER_MIN = 200.0  # time constant of a disturbance: its variance stays finite where nothing is measured
+LONGEST_NOISE_MIN = 60.0  # a longer time constant is a drift
+_LAG_SHARE, _LEAST_LAG_SHARE = 0.3, 0.02  # of the typical size: at 0 a lag has no derivative
+_POINTS, _SEED = 24, 7  # at which effects are compared
 
-LEAST_RATE = 0.04
-"""Rate that an effect must add to those selected before, root mean square, in scales of the states a minute."""
 
-WANDER_MIN = 200.0
-"""Time constant of a disturbance that wanders, in minutes: its variance stays finite where nothing is measured."""
+class InitialState:
+    """Estimates the initial state of a filter.
 
-LONGEST_NOISE_MIN = 60.0
+    Args:
+        model: model of the plant.
 
-_LAG_SHARE, _LEAST_LAG_SHARE = 0.3, 0.02
-_WHITE_SHARE, _DRIVING_SHARES = 0.3, (2.0, 6.0, 20.0)  # of the noise by third differences, which see little of it
-_POINTS, _SEED = 24, 7
+    Attributes:
+        searches: number of searches for steady states so far; each costs as much as thousands of rows.
+    """
+
+    def __init__(self, model: ProcessModel) -> None:
+        self.searches = 0
+        core = model.without_effect_states
+        self._model = core
+        self._outputs = ArrayFunction(output_function(core))
+        self._correct = ArrayFunction(correction_function(core))
+        self._lower = np.array([state.lower for state in core.states])
+        self._upper = np.array([state.upper for state in core.states])
+        outputs = core.output_names
+        self._measured_states = [(i, outputs.index(name)) for i, name in enumerate(core.state_names) if name in outputs]
+        self._point: tuple[object, ...] = ()
+        self._steady: list[SteadyState] = []
+        self._wide = np.diag(np.square([START_SD * state.scale for state in core.states]))
+        self._rest_sd = np.array([state.scale * (state.name in model.at_rest) for state in model.states])
+        self._complete, self._reset = (ArrayFunction(item) for item in _memory_functions(model))
+
+    def estimate(
+        self,
+        time_min: float,
+        inputs: Sequence[float],
+        measured: Sequence[float],
+        measurement_sd: Sequence[float],
+        changes: Mapping[str, float],
+    ) -> tuple[Array, Array] | None:
+        """Estimate the state and its covariance; None if nothing is measured.
+
+        Args:
+            time_min: time of the row.
+            inputs: inputs that hold from this row on.
+            measured: one value an output; NaN: missing.
+            measurement_sd: standard deviations of the sensors' noise.
+            changes: parameters that differ from the model's values.
+        """
+        y, u = np.asarray(measured, dtype=float), np.asarray(inputs, dtype=float)
+        present = np.isfinite(y)
+        if not present.any() or not np.all(np.isfinite(u)):
+            return None
+        p = self._model.values(changes)
+        x = self._guess(y)
+        slope = self._outputs.call(x, u, p, time_min)[1].T[present]
+        # far from the operating range a model may have no finite derivatives
+        if not np.all(np.isfinite(slope)) or np.linalg.matrix_rank(slope) < slope.shape[1]:
+            points = self._steady_states(u, time_min, changes)
+            distances = [float(np.nansum(((point.outputs - y) / measurement_sd) ** 2)) for point in points]
+            x = points[int(np.argmin(distances))].state if points else x
+        noise, wide = np.square(measurement_sd), self._wide
+        for _ in range(MAX_ITERATIONS):
+            before, x = x, self._correct.call(x, u, p, time_min, y, noise, wide)[0][0]
+            if np.array_equal(before, x):
+                break
+        P = self._correct.call(x, u, p, time_min, y, START_SDS**2 * noise, wide)[1]
+        after, J = self._complete.call(x, u, p, time_min)
+        return self.reset(after[0], J.T @ P @ J + np.diag(np.square(self._rest_sd)), u, p, time_min)
+
+    def reset(self, x: Array, P: Array, u: Array, p: Array, time_min: float) -> tuple[Array, Array]:
+        """State and covariance after the jumps (`ProcessModel.resets`) at a row from which on inputs u hold."""
+        after, J = self._reset.call(x, u, p, time_min)
+        return after[0], J.T @ P @ J
+
+    def _guess(self, y: Array) -> Array:
+        """Take a state from the sensor of its name; others are in the middle of their range."""
+        x: Array = 0.5 * (self._lower + self._upper)
+        for state, output in self._measured_states:
+            if np.isfinite(y[output]):
+                x[state] = min(max(y[output], self._lower[state]), self._upper[state])
+        return x
+
+    def _steady_states(self, u: Array, time_min: float, changes: Mapping[str, float]) -> list[SteadyState]:
+        """Steady states at this point; cached, as one record is often started many times."""
+        point = (time_min, *u, *changes.items())
+        if point != self._point:
+            self.searches += 1
+            self._point, self._steady = point, self._search.at(u, time_min, changes)
+        return self._steady
+
+    @cached_property
+    def _search(self) -> SteadyStates:
+        return SteadyStates(self._model)
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def correction_function(model: ProcessModel) -> ca.Function:
+    """(x, u, p, t, y, r, P) -> a state that explains y better than x does, and its covariance.
+
+    y has NaN for missing values, r holds the variances of the sensors, and P is the covariance of an unknown state. Far
+    from the operating range a model's outputs may grow without bound; they are then left out.
+    """
+    x, u, p = model.arguments()
+    t, n_x, n_y = ca.SX.sym("t"), x.numel(), len(model.outputs)
+    y, r, wide = ca.SX.sym("y", n_y), ca.SX.sym("r", n_y), ca.SX.sym("P", n_x, n_x)
+    lower, upper = (ca.DM([getattr(state, name) for state in model.states]) for name in ("lower", "upper"))
+    expected, H = output_function(model)(x, u, p, t)
+    change, P = ca.SX.zeros(n_x), wide
+    for i in range(n_y):
+        h = H[i, :]
+        variance = h @ P @ h.T + r[i]
+        informative = ca.logic_and(ca.fabs(y[i]) < inf, ca.fabs(variance) < inf)
+        K = ca.if_else(informative, P @ h.T / variance, 0)
+        change += ca.if_else(informative, K * (y[i] - expected[i] - h @ change), 0)
+        I_KH = ca.SX.eye(n_x) - K @ ca.if_else(informative, h, 0)
+        P = I_KH @ P @ I_KH.T + K @ K.T * r[i]
+    after = ca.fmin(ca.fmax(x + change, lower), upper)
+    return ca.Function("corrected", [x, u, p, t, y, r, wide], [after, ca.densify(P)])
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def _memory_functions(model: ProcessModel) -> tuple[ca.Function, ca.Function]:
+    """`rest_function` and `reset_function`, with their derivatives."""
+    return with_derivatives(rest_function(model), 0), with_derivatives(reset_function(model), 0)
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
@@ -81,28 +206,6 @@ def learned_parameters(added: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{name}.memory_min" for kind, name in (item.split(" ", 1) for item in added) if kind == NOISE)
 
 
-def noise_starts(
-    model: ProcessModel, added: tuple[str, ...], measured: Array, smallest_sd: Sequence[float]
-) -> list[NoiseLevels]:
-    """Noise levels from which a search should start, too: all noise is coloured noise where there is such.
-
-    Args:
-        model: the model without what is added to it.
-        added: see `widen_model`.
-        measured: measurements, shape (rows, n_y); NaN where missing.
-        smallest_sd: lower bounds of the sensors' noise.
-    """
-    coloured = [item.split(" ", 1)[1] for item in added if item.startswith(f"{NOISE} ")]
-    if not coloured:
-        return []
-    sds = np.maximum([initial_sensor_sd(column) for column in measured.T], smallest_sd)
-    by_name = dict(zip(model.output_names, sds.tolist(), strict=True))
-    names = widen_model(model, added).state_names
-    driving = np.array([by_name.get(name.removesuffix(".memory"), 0.0) * name.endswith(".memory") for name in names])
-    sensors = tuple(_WHITE_SHARE * sd if name in coloured else sd for name, sd in by_name.items())
-    return [NoiseLevels(sensors, tuple((share * driving).tolist())) for share in _DRIVING_SHARES]
-
-
 def is_disturbance(text: str) -> bool:
     """True for a disturbance or coloured noise, False for an uncertain constant."""
     return not text.startswith(f"{CONSTANT} ")
@@ -114,7 +217,7 @@ def _add_constant(model: ProcessModel, effect: Effect) -> ProcessModel:
         return _add_offset(model, model.parameter(size), effect.typical)
     prefix, is_lag = effect.prefix(model), isinstance(effect, InputLag)
     lower, begin = effect.lower, effect.neutral
-    if is_lag:  # at 0 a lag has no derivative
+    if is_lag:
         lower, begin = _LEAST_LAG_SHARE * effect.typical, _LAG_SHARE * effect.typical
     bounds = (lower, effect.upper)
     state = variable(f"{prefix}.constant", effect.unit, bounds, effect.typical, f"size of: {effect.label}")

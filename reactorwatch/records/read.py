@@ -11,27 +11,35 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, hint_at_closest
-from reactorwatch.records.cells import EMPTY, NUMBER, TEXT
+from reactorwatch.records.cells import EMPTY, NUMBER, TEXT, describe_sentinels
+from reactorwatch.records.decode import read_text
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.historian import LongFormat, find_long_format, read_tags
-from reactorwatch.records.layout import Layout, bare_name, unit_of_name
-from reactorwatch.records.quality import QualityFilter, check_stated, find_qualities
-from reactorwatch.records.record import Record
-from reactorwatch.records.row_checks import (
-    check_times,
-    check_values,
-    filled_rows,
-    find_runs,
-    join_repeats,
-    numbered_runs,
+from reactorwatch.records.historian import (
+    LongFormat,
+    QualityFilter,
+    check_stated,
+    find_long_format,
+    find_qualities,
+    read_tags,
 )
-from reactorwatch.records.sentinels import describe_sentinels
-from reactorwatch.records.sniff import sniff
-from reactorwatch.records.source_text import read_text
-from reactorwatch.records.text_table import TextTable
-from reactorwatch.records.time_column import MAX_SHARE_BACK, TimeColumn, choose_time, counts_rows, may_be_time
-from reactorwatch.records.times import Times, find_written_zero_ns, is_newest_first, read_times
-from reactorwatch.records.write_table import RUN
+from reactorwatch.records.layout import sniff
+from reactorwatch.records.record import LARGEST_VALUE, Record, join_repeats
+from reactorwatch.records.table import Layout, TextTable, bare_name, unit_of_name
+from reactorwatch.records.times import (
+    MAX_SHARE_BACK,
+    TimeColumn,
+    Times,
+    check_times,
+    choose_time,
+    counts_rows,
+    find_runs,
+    find_written_zero_ns,
+    is_newest_first,
+    may_be_time,
+    numbered_runs,
+    read_times,
+)
+from reactorwatch.records.write import RUN_COLUMN
 from reactorwatch.units import UnknownUnitError, conversion
 
 
@@ -92,7 +100,7 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
     of = {column: values for column, values in of.items() if signals is None or taken.intersection(values)}
     sources = _sources(layout, signals, mapped, (*time.columns, *of))
     texts = [column for signal, column in sources if _is_coded(layout, signal, column)]
-    run = layout.names.index(RUN) if RUN in layout.names and RUN not in asked else None
+    run = layout.names.index(RUN_COLUMN) if RUN_COLUMN in layout.names and RUN_COLUMN not in asked else None
     stamps = time.columns if time.pattern is not None else ()
     table = TextTable(
         layout,
@@ -190,7 +198,7 @@ def _sources(
     for column, name in enumerate(layout.names):
         is_unnamed = layout.header_row is not None and name == str(column + 1)
         is_unnamed = is_unnamed and (layout.kinds[column] == EMPTY or counts_rows(layout, column))
-        if column in others or name == RUN or is_unnamed or layout.kinds[column] not in (NUMBER, EMPTY):
+        if column in others or name == RUN_COLUMN or is_unnamed or layout.kinds[column] not in (NUMBER, EMPTY):
             continue
         own = bare[column] if count[bare[column]] == 1 else name
         sources.append((SignalColumn(own), column))
@@ -323,3 +331,27 @@ def _read_long(
     known = {name: unit for name, unit in units.items() if unit}
     notes += [f"{text}: {count}" for text, count in repeats.items()]
     return Record(minutes, columns, layout.path.name, zero_ns, units=known, read_as=", ".join(notes))
+
+
+def filled_rows(times: Times, columns: dict[str, NDArray[np.float64]]) -> NDArray[np.intp]:
+    """Indices of the rows that have a time, or in which anything was measured."""
+    filled = times.valid.copy()
+    if not filled.all():
+        for values in columns.values():
+            filled |= ~np.isnan(values)
+    return np.flatnonzero(filled)
+
+
+def check_values(table: TextTable, column: int, values: NDArray[np.float64]) -> None:
+    """Check that the values of a column are possible measurements.
+
+    Raises:
+        InputError: one is not.
+    """
+    if max(np.fmax.reduce(values, initial=0.0), -np.fmin.reduce(values, initial=0.0)) < LARGEST_VALUE:
+        return
+    row = int(np.flatnonzero(np.abs(values) >= LARGEST_VALUE)[0])
+    if np.isinf(values[row]):
+        table.refuse(row, column, "expected a finite number or nothing")
+    rule = f"expected a number below {LARGEST_VALUE:g}, or nothing where nothing was measured"
+    table.refuse(row, column, rule)

@@ -3,15 +3,58 @@
 import csv
 import gzip
 import io
+import re
+import stat
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.cells import quote_formula
-from reactorwatch.records.input_file import wrap_read_errors
+from reactorwatch.limits import limits
+
+
+@contextmanager
+def wrap_read_errors(path: Path) -> Iterator[None]:
+    """Turn the system's errors about a file that is read into an `InputError` of one line.
+
+    Raises:
+        InputError: there is no such file, or it cannot be read.
+    """
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such file") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def read_regular(path: Path, *, bounded: bool = True) -> bytes:
+    """Read a regular file; a pipe may never begin, and a device may never end.
+
+    Args:
+        path: the file.
+        bounded: check its size before it is read, see `Limits.file_bytes`.
+
+    Raises:
+        InputError: something else is at the path, or it is too large; the text does not name it.
+        OSError: the file cannot be read.
+    """
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError("is not a regular file; name one")
+    if bounded:
+        limits().check("file_bytes", "size in bytes", status.st_size)
+    return path.read_bytes()
+
+
+def list_files(folder: Path, suffix: str) -> list[Path]:
+    """List the files in a folder with a suffix, in any case, in the order of their names."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() == suffix and path.is_file())
+
 
 TEXT_SUFFIXES = (".csv", ".tsv", ".tab", ".txt", ".dat", ".asc", ".prn", ".lvm", ".gz")
 WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
@@ -173,3 +216,25 @@ def _parquet(path: Path, data: bytes) -> bytes:
         reason = str(error).partition("\n")[0]
         raise InputError(f"{path}: expected a Parquet file with columns of plain values: {reason}") from error
     return bytes(text.getvalue())
+
+
+_FORMULA = re.compile(r"(^|[;\t\r\n])('*)(?=[=+\-@\t\r\uff1d\uff0b\uff0d\uff20])")
+"""Start of what a spreadsheet takes for a formula, in a cell or behind a sign that may separate cells elsewhere."""
+
+
+def quote_formula(text: str) -> str:
+    """Text that a spreadsheet does not take for a formula: a quote before what would be one.
+
+    >>> quote_formula("=1+2"), quote_formula("T-1"), quote_formula("'=1+2")
+    ("'=1+2", 'T-1', "''=1+2")
+    """
+    return _FORMULA.sub(r"\1'\2", text)
+
+
+def unquote_formula(text: str) -> str:
+    """Text before `quote_formula`; another text is unchanged, unless it has such a quote.
+
+    >>> unquote_formula("'=1+2"), unquote_formula("'a'")
+    ('=1+2', "'a'")
+    """
+    return _FORMULA.sub(lambda match: match[1] + match[2][1:], text)
