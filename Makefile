@@ -7,7 +7,7 @@ BIN := .venv/bin
 # keep bytecode: without it each process that tests start compiles every module again
 unexport PYTHONDONTWRITEBYTECODE
 # each has a target of its own
-LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py false_alarms.py)
+LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py)
 READY := .venv/.ready
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 DOCS_READY := .venv/.docs-ready
@@ -50,10 +50,10 @@ bench: $(READY) ## speed, as ratios measured in one run
 		echo "== $$file"; $(BIN)/python $$file || exit 1; done
 
 faults: $(READY) ## detection delays on a bank of faults, beside an oracle and the report's method: most of an hour
-	@$(BIN)/python benchmarks/fault_bank.py --write docs/fault_bank.md
+	@$(BIN)/python benchmarks/fault_bank.py --write docs/fault_bank.md $(if $(RESULTS),--results $(RESULTS))
 
 study: $(READY) ## the diagnosis of hidden causes; writes its tables into docs/diagnosis_study.md: hours
-	@$(BIN)/python benchmarks/diagnosis_study.py --write
+	@$(BIN)/python benchmarks/diagnosis_study.py --write $(if $(RESULTS),--results $(RESULTS))
 
 kills: $(READY) ## kill a recorder fifty times under load, and count what is missing: three minutes
 	@$(BIN)/python benchmarks/recorder_kills.py
@@ -67,8 +67,8 @@ fuzz: $(READY) ## 200,000 random messages, commands, states and settings: no fai
 soak: $(READY) ## a fleet for ten minutes of kills, cuts and garbage (MINUTES=10 PLANTS=200 SEED=): what is missing or repeated
 	@$(BIN)/python -m benchmarks.soak $(or $(MINUTES),10) $(or $(PLANTS),200) $(SEED)
 
-promise: $(READY) ## false alarms beside the number promised, with equations and without; delays, statements, costs: 20 minutes
-	@$(BIN)/python -m benchmarks.promise
+promise: $(READY) ## false alarms beside the number promised, with equations and without; delays, statements: 20 minutes (RESULTS= continues)
+	@$(BIN)/python -m benchmarks.promise $(if $(RESULTS),--results $(RESULTS))
 
 outside: $(READY) ## public benchmarks beside other methods (DATA=folder of their data, ONLY=words of titles); writes its tables into docs/outside.md
 	@$(BIN)/python -m benchmarks.outside --data $(DATA) $(if $(ONLY),--only "$(ONLY)") --write docs/outside.md

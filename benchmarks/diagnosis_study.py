@@ -3,41 +3,31 @@
 Records of every class (`benchmarks/hidden/classes.py`) are drawn from fresh seeds, with a solver and equations that the
 diagnosis does not use (`tests/hidden_effect/`), diagnosed in parallel, and held against the truth.
 
-    python benchmarks/diagnosis_study.py [--quick] [--records N] [--suspects N] [--jobs N] [--scheduler ADDRESS]
-                                         [--classes NAME ...] [--seed N] [--json FILE] [--from FILE ...] [--write]
+    python benchmarks/diagnosis_study.py [--quick] [--records N] [--suspects N] [--classes NAME ...] [--seed N]
+                                         [--results FILE] [--write] [--jobs N] [--scheduler ADDRESS]
 
-`--write` writes the tables into docs/diagnosis_study.md. All classes take hours; one after the other, each with
-`--json`, they can be put together by `--from`.
+`--write` writes the tables into docs/diagnosis_study.md. All classes take hours: with `--results` a study that was
+stopped continues, and classes can be run one after the other before all of them are written.
 """
 
 import argparse
-import json
 import time
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import msgspec
-from rich.console import Console
-from rich.progress import Progress
-
+from benchmarks.harness.pool import Pool, add_options
+from benchmarks.harness.tables import replace_between, stamp
 from benchmarks.hidden.classes import CLASSES, StudyClass, draw_record, find_class
-from benchmarks.hidden.reliability import reliability_table
+from benchmarks.hidden.score import confusion_table, failures, main_table, reliability_table
 from benchmarks.hidden.suspects import SuspectsJudged, judge_suspects
-from benchmarks.hidden.tables import confusion_table, failures, main_table
-from benchmarks.stamp import stamp
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.runtime.parallel import choose_executor
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.runtime.parallel.jobs import Failed
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.judge import Judged, failed, judge
 
 RECORDS, NOMINAL_RECORDS, QUICK_RECORDS = 96, 330, 13
 SUSPECTS, QUICK_SUSPECTS = 52, 13
-SUSPECTS_KEY = "suspects"
-"""Key of the monitor's suspects in a JSON file, beside the names of the classes."""
-
 FIRST_SEED = 10_000_000
 PAGE = Path(__file__).parents[1] / "docs" / "diagnosis_study.md"
 BEGIN, END = "<!-- made by make study: begin -->", "<!-- made by make study: end -->"
@@ -75,87 +65,36 @@ All classes with one hidden cause, or none.
 """
 
 _warm = False
+Job = tuple[str, int, int]
+"""Name of a class, number of the record, and first seed."""
 
 
 def main() -> None:
     """Run the study and print it."""
     chosen = arguments()
-    if chosen.earlier:
-        report(*earlier(chosen.earlier), chosen, 0.0)
-        return
-    classes = [find_class(name) for name in chosen.classes] if chosen.classes else list(CLASSES)
-    tasks = [(study, number) for study in classes for number in range(_records(study, chosen))]
-    began = time.perf_counter()
-    found: dict[str, list[Judged]] = {study.name: [] for study in classes}
-    with Progress(console=Console(stderr=True)) as progress:
-        bar = progress.add_task("diagnoses", total=len(tasks))
-        jobs = [(study.name, number, chosen.seed) for study, number in tasks]
-        executor = choose_executor(chosen.jobs, chosen.scheduler)
-        for number, outcome in executor.map_unordered(judge_one, jobs):
-            study, of_class = tasks[number]
-            found[study.name].append(
-                failed(draw_record(study, of_class, chosen.seed), outcome.reason, 0.0)
-                if isinstance(outcome, Failed)
-                else outcome
-            )
-            progress.advance(bar)
-        alarms = [(number, nearly, chosen.seed) for number in range(_suspects(chosen)) for nearly in (False, True)]
-        bar = progress.add_task("alarms", total=len(alarms))
-        suspects: list[SuspectsJudged] = []
-        for _, judged in executor.map_unordered(judge_alarm, alarms):
-            if isinstance(judged, SuspectsJudged):
-                suspects.append(judged)
-            progress.advance(bar)
-    for items in found.values():
-        items.sort(key=lambda item: item.seed)
-    report(found, suspects, chosen, time.perf_counter() - began)
-
-
-def report(
-    found: dict[str, list[Judged]], suspects: Sequence[SuspectsJudged], chosen: argparse.Namespace, seconds: float
-) -> None:
-    """Print what was found and write it where it was asked for."""
-    print(main_table(found))
-    print()
-    print(reliability_table(found, suspects))
-    print()
-    print(confusion_table(found))
-    print()
-    print("\n".join(failures(found)))
-    print(f"\n{sum(map(len, found.values()))} records, {seconds:.0f} s, seeds from {chosen.seed}")
-    if chosen.json is not None:
-        numbers = {name: [asdict(item) for item in items] for name, items in found.items()}
-        numbers[SUSPECTS_KEY] = [asdict(item) for item in suspects]
-        chosen.json.write_text(json.dumps(numbers, indent=1) + "\n")
-    if chosen.write:
-        PAGE.write_text(with_section(PAGE.read_text(), section(found, chosen.seed, suspects)))
-
-
-def earlier(files: Sequence[Path]) -> tuple[dict[str, list[Judged]], list[SuspectsJudged]]:
-    """Read earlier results, written by `--json`, in the order of the classes, and the suspects."""
+    pool, began = Pool.of(chosen), time.perf_counter()
     found: dict[str, list[Judged]] = {}
-    suspects: list[SuspectsJudged] = []
-    for file in files:
-        for name, items in json.loads(file.read_text()).items():
-            if name == SUSPECTS_KEY:
-                suspects += msgspec.convert(items, list[SuspectsJudged])
-            else:
-                found[name] = msgspec.convert(items, list[Judged])
-    return {study.name: found[study.name] for study in CLASSES if study.name in found}, suspects
+    for study in [find_class(name) for name in chosen.classes] if chosen.classes else CLASSES:
+        jobs = [(study.name, number, chosen.seed) for number in range(_records(study, chosen))]
+        found[study.name] = pool.run(study.name, judge_record, jobs, _judge_failure)
+    alarms = [(number, nearly, chosen.seed) for number in range(_suspects(chosen)) for nearly in (False, True)]
+    judged = pool.run("alarms", judge_suspects, alarms, lambda *_: None)
+    suspects = [item for item in judged if item is not None]
+    parts = main_table(found), reliability_table(found, suspects), confusion_table(found), "\n".join(failures(found))
+    print("\n\n".join(parts))
+    print(f"\n{sum(map(len, found.values()))} records, {time.perf_counter() - began:.0f} s, seeds from {chosen.seed}")
+    if chosen.write:
+        replace_between(PAGE, BEGIN, END, section(found, chosen.seed, suspects))
 
 
-def judge_one(job: tuple[str, int, int]) -> Judged:
-    """Call `judge_record` with class, number and first seed in one."""
-    return judge_record(*job)
+def _judge_failure(job: Job, outcome: Failed) -> Judged:
+    name, number, first_seed = job
+    return failed(draw_record(find_class(name), number, first_seed), outcome.reason, 0.0)
 
 
-def judge_alarm(job: tuple[int, bool, int]) -> SuspectsJudged | None:
-    """Call `judge_suspects` with number, kind of plant and first seed in one."""
-    return judge_suspects(*job)
-
-
-def judge_record(name: str, number: int, first_seed: int) -> Judged:
+def judge_record(job: Job) -> Judged:
     """Draw, diagnose and judge one record."""
+    name, number, first_seed = job
     warm_up()
     hidden = draw_record(find_class(name), number, first_seed)
     began = time.process_time()
@@ -174,7 +113,7 @@ def warm_up() -> None:
         _warm = True
 
 
-def section(found: dict[str, list[Judged]], seed: int, suspects: Sequence[SuspectsJudged] = ()) -> str:
+def section(found: Mapping[str, Sequence[Judged]], seed: int, suspects: Sequence[SuspectsJudged] = ()) -> str:
     """Section of the page on the study."""
     text = TEMPLATE.format(
         seed=seed,
@@ -189,14 +128,6 @@ def section(found: dict[str, list[Judged]], seed: int, suspects: Sequence[Suspec
         summary = f"Records whose cause was not named ({len(missed)})"
         text += f"\n<details><summary>{summary}</summary>\n\n{lines}\n\n</details>\n"
     return text
-
-
-def with_section(page: str, text: str) -> str:
-    """A page with what stands between the marks exchanged."""
-    if BEGIN not in page or END not in page:
-        raise ValueError(f"{PAGE.name} must hold the marks {BEGIN} and {END}")
-    before, after = page.split(BEGIN)[0], page.split(END)[1]
-    return f"{before}{BEGIN}\n{text}{END}{after}"
 
 
 def _records(study: StudyClass, chosen: argparse.Namespace) -> int:
@@ -221,13 +152,10 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--suspects", type=int, help=f"alarms of each kind of plant (default {SUSPECTS}, with --classes 0)"
     )
-    parser.add_argument("--jobs", type=int, help="processes (default: one a core)")
-    parser.add_argument("--scheduler", help="address of a Dask cluster that does it instead")
     parser.add_argument("--classes", nargs="+", metavar="NAME", help=", ".join(item.name for item in CLASSES))
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help="the first")
-    parser.add_argument("--json", type=Path, help="where the numbers are written, record by record")
-    parser.add_argument("--from", dest="earlier", nargs="+", type=Path, metavar="FILE", help="what --json has written")
     parser.add_argument("--write", action="store_true", help=f"write the tables into {PAGE.name}")
+    add_options(parser)
     return parser.parse_args()
 
 

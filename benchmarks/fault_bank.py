@@ -1,39 +1,38 @@
 """Detection delay and false alarms of the monitor, beside the report's method and an oracle.
 
-Every fault of the bank (`benchmarks/faults/bank.py`) in three sizes and for many seeds: 100 minutes of training, 200
+Every fault of the bank (`benchmarks/harness/bank.py`) in three sizes and for many seeds: 100 minutes of training, 200
 without a fault, then the fault for 150. All detectors watch the same records at the same promised rate of false alarms:
 
 - the oracle, which knows the fault (`benchmarks/faults/oracle.py`): no detector can be much faster;
 - the monitor, as it is configured by default;
-- the report's method (`benchmarks/faults/report_method.py`), with limits widened to that rate, and at its own 3 sigma.
+- the report's method (`benchmarks/faults/detectors.py`), with limits widened to that rate, and at its own 3 sigma.
 
 Then runs without a fault, with white and with autocorrelated noise: the realised rate of false alarms.
 
-    python benchmarks/fault_bank.py [--quick] [--jobs N] [--scheduler ADDRESS] [--json FILE] [--write FILE]
-                                    [--budgets 1 30]
+    python benchmarks/fault_bank.py [--quick] [--write FILE] [--budgets 1 30] [--results FILE] [--jobs N]
 
 Goals: the median delay at most half that of the report's method at an equal rate of false alarms; that rate kept.
 """
 
 import argparse
-import json
 import time
-from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
 
 from rich.console import Console
-from rich.progress import Progress
 
-from benchmarks.faults.bank import PERIOD_MIN, cases
-from benchmarks.faults.report_method import METHODS, calibrated_width
-from benchmarks.faults.score import rows_to_false_alarm
-from benchmarks.faults.study import Widths, fault_free_statistics, run_case, run_fault_free
-from benchmarks.faults.tables import as_json, print_fault_free, print_summary, print_table
-from benchmarks.stamp import stamp
-from reactorwatch.runtime.parallel import choose_executor
-from reactorwatch.runtime.parallel.jobs import Executor, Failed, in_job_order
+from benchmarks.faults.detectors import METHODS, calibrated_width
+from benchmarks.faults.study import (
+    Widths,
+    fault_free_statistics,
+    rows_to_false_alarm,
+    run_case,
+    run_fault_free,
+)
+from benchmarks.faults.tables import print_fault_free, print_summary, print_table
+from benchmarks.harness.bank import PERIOD_MIN, cases
+from benchmarks.harness.pool import Pool, add_options
+from benchmarks.harness.tables import stamp
 
 SEEDS, FAULT_FREE_RUNS, CALIBRATION_RUNS = 20, 200, 400
 QUICK_SEEDS, QUICK_FAULT_FREE_RUNS, QUICK_CALIBRATION_RUNS = 2, 6, 60
@@ -50,29 +49,41 @@ and with limits widened to the same rate of false alarms. `make faults` writes t
 explains it.
 """
 
-Result = TypeVar("Result")
-
 
 def main() -> None:
     """Run the benchmark and print it."""
-    chosen = arguments()
+    parser = argparse.ArgumentParser(description="The monitor against a bank of faults.")
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK_SEEDS} seeds, for a try")
+    parser.add_argument("--write", type=Path, help="where the tables are written too, as a page (.md)")
+    parser.add_argument(
+        "--budgets", type=float, nargs="+", default=[1.0, 30.0], help="false alarms in 30 days that are promised"
+    )
+    add_options(parser)
+    chosen = parser.parse_args()
     seeds, quiet_runs, calibration_runs = (
         (QUICK_SEEDS, QUICK_FAULT_FREE_RUNS, QUICK_CALIBRATION_RUNS)
         if chosen.quick
         else (SEEDS, FAULT_FREE_RUNS, CALIBRATION_RUNS)
     )
-    budgets = tuple(chosen.budgets)
-    began = time.perf_counter()
-    with Progress(console=Console(stderr=True)) as progress:
-        everywhere = Everywhere(choose_executor(chosen.jobs, chosen.scheduler), progress)
-        widths = report_widths(everywhere, calibration_runs, budgets)
-        found = everywhere.do("faults", partial(run_case, budgets=budgets, widths=widths), cases(seeds))
-        quiet = everywhere.do(
-            "fault-free runs",
-            partial(run_fault_free, rows=FAULT_FREE_ROWS, budgets=budgets, widths=widths),
-            [FAULT_FREE_SEED + number for _ in PHIS for number in range(quiet_runs)],
-            [phi for phi in PHIS for _ in range(quiet_runs)],
-        )
+    budgets, pool, began = tuple(chosen.budgets), Pool.of(chosen), time.perf_counter()
+    statistics = pool.run(
+        "limits of the report's method",
+        partial(fault_free_statistics, rows=CALIBRATION_ROWS),
+        [CALIBRATION_SEED + number for number in range(calibration_runs)],
+    )
+    widths: Widths = {
+        method.name: {
+            budget: calibrated_width([item[method.name] for item in statistics], rows_to_false_alarm(budget))
+            for budget in budgets
+        }
+        for method in METHODS
+    }
+    found = pool.run("faults", partial(run_case, budgets=budgets, widths=widths), cases(seeds))
+    quiet = pool.run(
+        "fault-free runs",
+        partial(run_fault_free, rows=FAULT_FREE_ROWS, budgets=budgets, widths=widths),
+        [(FAULT_FREE_SEED + number, phi) for phi in PHIS for number in range(quiet_runs)],
+    )
     console = Console(width=200, record=chosen.write is not None)
     for budget in budgets:
         print_table(console, found, budget)
@@ -81,61 +92,6 @@ def main() -> None:
     console.print(f"\n{len(found)} runs with a fault, {len(quiet)} without, {time.perf_counter() - began:.0f} s")
     if chosen.write is not None:
         chosen.write.write_text(f"{HEAD}\n{stamp()}\n\n```\n{console.export_text()}```\n")
-    if chosen.json is not None:
-        chosen.json.write_text(json.dumps(as_json(found, quiet, budgets, widths), indent=1) + "\n")
-
-
-def arguments() -> argparse.Namespace:
-    """Arguments of the command line."""
-    parser = argparse.ArgumentParser(description="The monitor against a bank of faults.")
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK_SEEDS} seeds, for a try")
-    parser.add_argument("--jobs", type=int, help="processes (default: one a core)")
-    parser.add_argument("--scheduler", help="address of a Dask cluster that does it instead")
-    parser.add_argument("--json", type=Path, help="where the numbers are written, run by run")
-    parser.add_argument("--write", type=Path, help="where the tables are written too, as a page (.md)")
-    parser.add_argument(
-        "--budgets", type=float, nargs="+", default=[1.0, 30.0], help="false alarms in 30 days that are promised"
-    )
-    return parser.parse_args()
-
-
-class Everywhere:
-    """Runs a function over many arguments, in order, under a bar."""
-
-    def __init__(self, executor: Executor, progress: Progress) -> None:
-        self._executor = executor
-        self._progress = progress
-
-    def do(self, title: str, work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
-        """The results, in order."""
-        jobs = list(zip(*arguments, strict=True))
-        outcomes = in_job_order(self._executor.map_unordered(partial(_spread, work), jobs))
-        found: list[Result] = []
-        for job, outcome in zip(jobs, self._progress.track(outcomes, total=len(jobs), description=title), strict=True):
-            if isinstance(outcome, Failed):
-                raise RuntimeError(f"{title}: {job}: {outcome.reason}")  # noqa: TRY004 (no wrong type: it failed)
-            found.append(outcome)
-        return found
-
-
-def _spread(work: Callable[..., Result], job: tuple[Any, ...]) -> Result:
-    return work(*job)
-
-
-def report_widths(everywhere: Everywhere, runs: int, budgets: Sequence[float]) -> Widths:
-    """The widths at which the report's limits keep the promised rates in runs without a fault."""
-    statistics = everywhere.do(
-        "limits of the report's method",
-        partial(fault_free_statistics, rows=CALIBRATION_ROWS),
-        [CALIBRATION_SEED + number for number in range(runs)],
-    )
-    return {
-        method.name: {
-            budget: calibrated_width([item[method.name] for item in statistics], rows_to_false_alarm(budget))
-            for budget in budgets
-        }
-        for method in METHODS
-    }
 
 
 if __name__ == "__main__":

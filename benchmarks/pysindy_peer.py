@@ -32,10 +32,9 @@ from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.holdout import holdout_rows
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.process.integrate import SimulationError
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.simulate import Simulator
+from reactorwatch.process.simulate import SimulationError, Simulator
 from tests.hidden_effect.draw import Hidden
 from tests.hidden_effect.judge import judge
 

@@ -22,7 +22,7 @@ from scipy.integrate import solve_ivp
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 
 REPEATS = 9
@@ -37,10 +37,8 @@ def main(rows: int) -> None:
     start = np.array([record.columns["C"][0], record.columns["T"][0]])
     simulator = Simulator(cstr())
     ours_s, trajectory = fastest(lambda: simulator.run(times, flows, start))
-    sensitive_s, _ = fastest(lambda: simulator.run_with_sensitivities(times, flows, start, ["K2", "K3", "Tf", "Cf"]))
     print(f"{rows} rows")
     print(f"  simulation                          {ours_s * 1e3:8.1f} ms")
-    print(f"  with sensitivities to 4 parameters  {sensitive_s * 1e3:8.1f} ms")
     changes = np.append(np.flatnonzero(np.diff(flows, prepend=np.nan)), rows - 1)
     for where, edges in (("at every row", np.arange(rows)), ("where qc changes", np.unique(changes))):
         began = time.perf_counter()

@@ -1,6 +1,6 @@
 """Rank of the true cause among the monitor's suspects, 150 minutes after the onset of a fault.
 
-Two sets: the medium faults of the bank (`benchmarks/faults/bank.py`), and steps of every cause from seeds and onsets
+Two sets: the medium faults of the bank (`benchmarks/harness/bank.py`), and steps of every cause from seeds and onsets
 that the bank does not have, of medium and of half of medium size.
 
     python benchmarks/suspects.py [seeds of the bank] [first seed of the steps] [processes]
@@ -9,16 +9,13 @@ Goals: first in 80 % of the bank's medium faults, among the first two in 92 %; f
 """
 
 import sys
-from collections.abc import Iterable
 
 import numpy as np
 
-from benchmarks.faults.bank import AFTER_MIN, BANK, Case, cases
-from benchmarks.faults.runs import record_of
-from benchmarks.faults.watch import newest_suspects, watch
-from benchmarks.promise.pool import share_interval
-from reactorwatch.runtime.parallel import choose_executor
-from reactorwatch.runtime.parallel.jobs import Failed
+from benchmarks.faults.detectors import newest_suspects, watch
+from benchmarks.harness.bank import AFTER_MIN, BANK, Case, cases, record_of
+from benchmarks.harness.pool import Pool
+from benchmarks.harness.tables import share_interval
 
 BUDGET_PER_30_DAYS = 30.0
 EARLIEST_MIN, SPAN_MIN = 200.0, 40.0
@@ -50,14 +47,9 @@ def fresh_steps(factor: float, first_seed: int) -> list[Case]:
     return found
 
 
-def print_ranks(name: str, runs: Iterable[Case], jobs: int | None) -> None:
+def print_ranks(name: str, runs: list[Case], pool: Pool) -> None:
     """Print how often the true cause came first, and among the first two."""
-    ranks = []
-    for _, found in choose_executor(jobs, None).map_unordered(rank, list(runs)):
-        if isinstance(found, Failed):
-            raise SystemExit(f"{name}: {found.reason}")
-        ranks.append(found)
-    texts = []
+    ranks, texts = pool.run(name, rank, runs), []
     for most in (1, 2):
         count = sum(0 < item <= most for item in ranks)
         low, high = share_interval(count, len(ranks))
@@ -67,10 +59,11 @@ def print_ranks(name: str, runs: Iterable[Case], jobs: int | None) -> None:
 
 def main(seeds: int = 1, first_seed: int = FIRST_SEED, jobs: int | None = None) -> None:
     """Print both tables."""
+    pool = Pool(jobs)
     medium = [case for case in cases(seeds) if case.grade == "medium"]
-    print_ranks(f"medium faults of the bank, {AFTER_MIN:g} min", medium, jobs)
+    print_ranks(f"medium faults of the bank, {AFTER_MIN:g} min", medium, pool)
     for factor in (1.0, 0.5):
-        print_ranks(f"fresh steps, {factor:g} of medium", fresh_steps(factor, first_seed), jobs)
+        print_ranks(f"fresh steps, {factor:g} of medium", fresh_steps(factor, first_seed), pool)
 
 
 if __name__ == "__main__":

@@ -2,18 +2,39 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.faults.bank import AFTER_MIN, PERIOD_MIN, Case
-from benchmarks.faults.oracle import log_likelihood_ratio, oracle_delay_min
-from benchmarks.faults.oracle_suspect import oracle_suspect
-from benchmarks.faults.report_method import METHODS, TRAINING_ROWS, alarms_of, count_alarms
-from benchmarks.faults.runs import NOISE_SD, fault_free, measurements_of, record_of, truth_of
-from benchmarks.faults.score import Outcome, Rate, outcome_of, rows_to_false_alarm
-from benchmarks.faults.watch import Suspicion, incidents_of, intervals_of, suspicion, watch
+from benchmarks.faults.detectors import (
+    METHODS,
+    TRAINING_ROWS,
+    Outcome,
+    Suspicion,
+    alarms_of,
+    count_alarms,
+    incidents_of,
+    intervals_of,
+    outcome_of,
+    suspicion,
+    watch,
+)
+from benchmarks.faults.oracle import log_likelihood_ratio, oracle_delay_min, oracle_suspect
+from benchmarks.harness.bank import (
+    AFTER_MIN,
+    NOISE_SD,
+    PERIOD_MIN,
+    Case,
+    fault_free,
+    measurements_of,
+    record_of,
+    truth_of,
+)
+from benchmarks.harness.tables import poisson_interval
 from benchmarks.study_figures.report_scheme import WIDTH
+
+DAYS_30_MIN = 30 * 24 * 60.0
 
 SOON_MIN = 10.0
 """Minutes from the first alarm to the first evaluation of the suspects."""
@@ -24,6 +45,37 @@ THREE_SIGMA = "3 sigma"
 
 Widths = dict[str, dict[float, float]]
 """Widths of the report's limits at equal rate, by method and promised false alarms in 30 days."""
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Rate of chance events."""
+
+    count: int  # number of events
+    watched_min: float  # watched time
+
+    @property
+    def per_30_days(self) -> float:
+        """The rate."""
+        return self.count / self.watched_min * DAYS_30_MIN if self.watched_min else 0.0
+
+    @property
+    def interval_per_30_days(self) -> tuple[float, float]:
+        """The 95 % interval of the rate, were the events independent."""
+        if not self.watched_min:
+            return 0.0, inf
+        lower, upper = poisson_interval(self.count)
+        return lower / self.watched_min * DAYS_30_MIN, upper / self.watched_min * DAYS_30_MIN
+
+
+def total(rates: list[Rate]) -> Rate:
+    """Rate of all together."""
+    return Rate(sum(item.count for item in rates), sum(item.watched_min for item in rates))
+
+
+def rows_to_false_alarm(false_alarms_per_30_days: float) -> float:
+    """Mean number of rows from one false alarm to the next."""
+    return DAYS_30_MIN / false_alarms_per_30_days / PERIOD_MIN
 
 
 @dataclass(frozen=True)
@@ -84,8 +136,11 @@ def run_case(case: Case, budgets: tuple[float, ...], widths: Widths) -> CaseResu
     return CaseResult(case, truth.left_branch, oracle_suspect(case, record, truth), outcomes, soon, late)
 
 
-def run_fault_free(seed: int, phi: float, rows: int, budgets: tuple[float, ...], widths: Widths) -> FaultFreeResult:
-    """Count the alarms of a run without a fault."""
+def run_fault_free(
+    seed_and_phi: tuple[int, float], rows: int, budgets: tuple[float, ...], widths: Widths
+) -> FaultFreeResult:
+    """Count the alarms of a run without a fault, of a seed and with an AR(1) coefficient of its noise."""
+    seed, phi = seed_and_phi
     record = fault_free(seed, rows, phi)
     statistics = {method.name: method.statistic(record)[TRAINING_ROWS:] for method in METHODS}
     report_min = (rows - TRAINING_ROWS) * PERIOD_MIN

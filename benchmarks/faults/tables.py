@@ -2,31 +2,37 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
-from math import exp, inf, isfinite
-from typing import Any
+from math import exp, isfinite
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.faults.bank import AFTER_MIN, BANK, GRADES
-from benchmarks.faults.report_method import METHODS
-from benchmarks.faults.score import DAYS_30_MIN, Delays, Rate
+from benchmarks.faults.detectors import LIKELY, METHODS, Suspicion
 from benchmarks.faults.study import (
+    DAYS_30_MIN,
     MONITOR,
     ORACLE,
     SOON_MIN,
     CaseResult,
     FaultFreeResult,
+    Rate,
     Widths,
     detectors,
+    total,
 )
-from benchmarks.faults.watch import LIKELY, Suspicion
+from benchmarks.harness.bank import AFTER_MIN, BANK, GRADES
 
 
-def delays(results: Sequence[CaseResult], budget: float, detector: str) -> Delays:
+def quantiles(delays_min: Sequence[float]) -> tuple[float, float]:
+    """Median and 90 % quantile of delays; those not detected count as infinite."""
+    median, slow = np.quantile(np.array(delays_min), [0.5, 0.9], method="inverted_cdf")
+    return float(median), float(slow)
+
+
+def delays(results: Sequence[CaseResult], budget: float, detector: str) -> list[float]:
     """Delays of a detector in some cases."""
-    return Delays.of([item.outcomes[budget][detector].delay_min for item in results])
+    return [item.outcomes[budget][detector].delay_min for item in results]
 
 
 def before_onset(results: Sequence[CaseResult], budget: float, detector: str) -> Rate:
@@ -102,57 +108,12 @@ def print_fault_free(console: Console, results: Sequence[FaultFreeResult], budge
         found = [item for item in results if item.phi == phi]
         console.print(f"  {'white noise' if phi == 0 else f'AR(1) noise, phi {phi:g}'}, {len(found)} runs")
         for detector in found[0].alarms[budget]:
-            console.print(f"    {detector:<15}{_rate(Rate.total([item.alarms[budget][detector] for item in found]))}")
-        console.print(
-            f"    {'incidents':<15}{_rate(Rate.total([item.incidents[budget] for item in found]))}  (monitor)"
-        )
+            console.print(f"    {detector:<15}{_rate(total([item.alarms[budget][detector] for item in found]))}")
+        console.print(f"    {'incidents':<15}{_rate(total([item.incidents[budget] for item in found]))}  (monitor)")
         names = Counter(name for item in found for name in item.names[budget])
         runs = sum(bool(item.names[budget]) for item in found)
         said = ", ".join(f"{name} {count}" for name, count in names.most_common())
         console.print(f"    the monitor's alarms came in {runs} runs: {said or 'none'}")
-
-
-def as_json(
-    results: Sequence[CaseResult], quiet: Sequence[FaultFreeResult], budgets: Sequence[float], widths: Widths
-) -> dict[str, Any]:
-    """The numbers behind it all, run by run; a delay is null where nothing was detected."""
-    return {
-        "widths": {name: {f"{budget:g}": value for budget, value in item.items()} for name, item in widths.items()},
-        "faults": [
-            {
-                "cause": item.case.fault.cause,
-                "profile": item.case.fault.profile,
-                "grade": item.case.grade,
-                "size": item.case.size,
-                "onset_min": item.case.onset_min,
-                "seed": item.case.seed,
-                "left_branch": item.left_branch,
-                "oracle_suspect": item.oracle_suspect,
-                "budget": budget,
-                "delay_min": {
-                    name: outcome.delay_min if isfinite(outcome.delay_min) else None
-                    for name, outcome in item.outcomes[budget].items()
-                },
-                "false_alarms": {name: outcome.false_alarms for name, outcome in item.outcomes[budget].items()},
-                "suspicion_soon": asdict(item.soon[budget]),
-                "suspicion_late": asdict(item.late[budget]),
-            }
-            for budget in budgets
-            for item in results
-        ],
-        "fault_free": [
-            {
-                "phi": item.phi,
-                "budget": budget,
-                "false_alarms": {name: rate.count for name, rate in item.alarms[budget].items()},
-                "incidents": item.incidents[budget].count,
-                "alarms": item.names[budget],
-                "watched_min": item.alarms[budget][MONITOR].watched_min,
-            }
-            for budget in budgets
-            for item in quiet
-        ],
-    }
 
 
 def _add_row(table: Table, name: str, size: str, found: Sequence[CaseResult], budget: float) -> None:
@@ -173,8 +134,9 @@ def _promise(budget: float) -> str:
     return f"{budget:g} false alarm{'' if budget == 1 else 's'} in 30 days"
 
 
-def _cell(found: Delays) -> str:
-    return f"{found.detected:.0%} {_minutes(found.median_min)} / {_minutes(found.slow_min)}"
+def _cell(delays_min: Sequence[float]) -> str:
+    median, slow = quantiles(delays_min)
+    return f"{sum(map(isfinite, delays_min)) / len(delays_min):.0%} {_minutes(median)} / {_minutes(slow)}"
 
 
 def _minutes(value: float) -> str:
@@ -187,31 +149,22 @@ def _share(values: Sequence[bool]) -> str:
     return f"{sum(values) / len(values):.0%}"
 
 
-def _quotient(ours_min: float, theirs_min: float) -> tuple[float, str]:
-    """A ratio of delays, and `<` if their delay is longer than the runs, so that the ratio is a bound."""
-    if not isfinite(ours_min):
-        return inf, ""
-    if not isfinite(theirs_min):
-        return ours_min / AFTER_MIN, "< "
-    return ours_min / theirs_min if theirs_min else inf, ""
-
-
 def _both(found: Sequence[CaseResult], budget: float, detector: str) -> str:
-    """The same over the runs in which both detect."""
-    pairs = [
-        (item.outcomes[budget][MONITOR].delay_min, item.outcomes[budget][detector].delay_min)
-        for item in found
-        if isfinite(item.outcomes[budget][MONITOR].delay_min) and isfinite(item.outcomes[budget][detector].delay_min)
-    ]
+    """Medians over the runs in which both detect."""
+    both = zip(delays(found, budget, MONITOR), delays(found, budget, detector), strict=True)
+    pairs = [pair for pair in both if all(map(isfinite, pair))]
     if not pairs:
         return "no run"
-    ours, theirs = (Delays.of(values).median_min for values in zip(*pairs, strict=True))
+    ours, theirs = (quantiles(values)[0] for values in zip(*pairs, strict=True))
     return f"{len(pairs)} runs, {_minutes(ours)} over {_minutes(theirs)}"
 
 
 def _ratio(found: Sequence[CaseResult], budget: float, detector: str) -> str:
-    value, bound = _quotient(delays(found, budget, MONITOR).median_min, delays(found, budget, detector).median_min)
-    return f"{bound}{value:.2f}" if isfinite(value) else "–"
+    """Ratio of the median delays; below it if the detector's is longer than the runs."""
+    (ours, _), (theirs, _) = (quantiles(delays(found, budget, name)) for name in (MONITOR, detector))
+    if not isfinite(ours) or not theirs:
+        return "–"
+    return f"{ours / theirs:.2f}" if isfinite(theirs) else f"< {ours / AFTER_MIN:.2f}"
 
 
 def _ceiling(found: Sequence[CaseResult]) -> str:

@@ -1,13 +1,28 @@
-"""Numbers of a class of records, from what was judged record by record."""
+"""Scores of judged records, and the tables of the study.
+
+Reliability is how often what is stated with a probability is right. Of sizes and onsets, an interval of a probability
+holds the truth in this share of the records. Of verdicts, the best explanation has the probability exp(0) over the sum
+of exp(-BIC difference / 2) of all listed ones. Of the monitor's suspects, the smallest set whose probabilities sum to
+90 % holds the truth in at least 90 % of the alarms.
+"""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import isnan, nan, sqrt
+from itertools import pairwise
+from math import isfinite, isnan, nan, sqrt
 
 import numpy as np
+from scipy.special import ndtri
 
+from benchmarks.harness.tables import markdown
+from benchmarks.hidden.classes import CLASSES, NEARLY
+from benchmarks.hidden.suspects import SET, SuspectsJudged
 from tests.hidden_effect.judge import NOMINAL, UNKNOWN, WIDTH, Judged
+
+Cell = Callable[["Score"], str]
+INTERVALS = (0.5, 0.8, 0.9, 0.95)
+BINS = (0.0, 0.5, 0.8, 0.95, 1.0)
 
 
 class Share(float):
@@ -109,3 +124,147 @@ def _two(values: Sequence[float], share: float) -> tuple[float, float]:
     sorted_up = np.sort(np.where(np.isfinite(values), values, np.inf))
     places = [max(int(np.ceil(item * sorted_up.size)) - 1, 0) for item in (0.5, share)]
     return float(sorted_up[places[0]]), float(sorted_up[places[1]])
+
+
+def percent(share: float) -> str:
+    """A share as a percentage, with its 95 % interval if the number is known; a dash if there is nothing."""
+    if isnan(share):
+        return "–"
+    low, high = share.interval if isinstance(share, Share) else (nan, nan)
+    return f"{100.0 * share:.1f}" + ("" if isnan(low) else f" ({100.0 * low:.0f}–{100.0 * high:.0f})")
+
+
+def number(value: float, digits: int = 2) -> str:
+    """A number; a dash if there is none."""
+    return "–" if isnan(value) else f"{value:.{digits}f}" if isfinite(value) else "inf"
+
+
+def both(values: tuple[float, float], digits: int = 2, factor: float = 1.0) -> str:
+    """Two numbers."""
+    return "–" if isnan(values[0]) else " / ".join(number(factor * value, digits) for value in values)
+
+
+COLUMNS: tuple[tuple[str, Cell], ...] = (
+    ("n", lambda score: str(score.records)),
+    ("first %", lambda score: percent(score.first)),
+    ("listed %", lambda score: percent(score.listed)),
+    ("list", lambda score: number(score.count)),
+    ("wrong %", lambda score: percent(score.wrong)),
+    ("unknown %", lambda score: percent(score.unknown)),
+    ("unknown, in place %", lambda score: percent(score.unknown_in_place)),
+    ("place %", lambda score: percent(score.right_place)),
+    ("profile %", lambda score: percent(score.same_profile)),
+    ("size error %, median / 90 %", lambda score: both(score.size, factor=100.0)),
+    ("in 95 % interval %", lambda score: percent(score.size_inside)),
+    ("curve error %", lambda score: both(score.curve, 1, factor=100.0)),
+    ("onset error min", lambda score: both(score.onset)),
+    ("in interval %", lambda score: percent(score.onset_inside)),
+    ("held-out T / noise drawn", lambda score: both(score.held_out, 3)),
+    ("/ its sd", lambda score: both(score.held_out_in_sd, 3)),
+    ("the truth's", lambda score: both(score.drawn_in_sd, 3)),
+    ("before", lambda score: both(score.before, 1)),
+    ("seconds of a core, median / most", lambda score: both(score.seconds, 1)),
+    ("errors", lambda score: str(score.errors)),
+)
+
+
+def rows_of(found: Mapping[str, Sequence[Judged]]) -> list[list[str]]:
+    """A row for each class, each group of classes of which all are there, and all in which causes are hidden."""
+    rows = [[name, *(cell(Score.of(judged)) for _, cell in COLUMNS)] for name, judged in found.items()]
+    for group in dict.fromkeys(item.group for item in CLASSES if item.group):
+        members = [item.name for item in CLASSES if item.group == group]
+        if all(name in found for name in members):
+            together = Score.of([item for name in members for item in found[name]])
+            rows.append([group, *(cell(together) for _, cell in COLUMNS)])
+    hidden = [item.name for item in CLASSES if item.kind in ("single", "pair") and item.name in found]
+    if len(hidden) > 1:
+        together = Score.of([item for name in hidden for item in found[name]])
+        rows.append(["all with one cause or two", *(cell(together) for _, cell in COLUMNS)])
+    return rows
+
+
+def main_table(found: Mapping[str, Sequence[Judged]]) -> str:
+    """Main table as Markdown."""
+    heading = ["records", *(title for title, _ in COLUMNS)]
+    return markdown(heading, rows_of(found))
+
+
+def confusion_table(found: Mapping[str, Sequence[Judged]], kinds: Sequence[str] = ("single", "nominal")) -> str:
+    """Names given to each cause, over all classes with single hidden causes, or none."""
+    judged = [item for study in CLASSES if study.kind in kinds for item in found.get(study.name, ())]
+    rows = []
+    for truth, called in confusion(judged):
+        total = sum(count for _, count in called)
+        right = dict(called).get(truth, 0)
+        others = ", ".join(f"{name} {count}" for name, count in called if name != truth)
+        rows.append([truth, str(total), str(right), others])
+    return markdown(["hidden", "n", "called so", "called otherwise"], rows)
+
+
+def failures(found: Mapping[str, Sequence[Judged]]) -> list[str]:
+    """A line for each record in which exactly what is hidden was not named; or, where it has no name, not its place."""
+    nameless = {study.name for study in CLASSES if study.kind == "outside"}
+    lines = []
+    for name, judged in found.items():
+        for item in judged:
+            if item.first or (name in nameless and item.verdict == UNKNOWN and item.right_place):
+                continue
+            truth = ", ".join(
+                f"{cause} {course} {size:.4g}"
+                for cause, course, size in zip(item.truth, item.courses, item.sizes, strict=True)
+            )
+            said = ", ".join(f"{cause} {profile}" for cause, profile in zip(item.said, item.profiles, strict=True))
+            rivals = f"; also {', '.join(item.alternatives)}" if item.alternatives else ""
+            place = f" ({item.location})" if item.location else ""
+            told = item.remark or f"{item.verdict} {said}{place}{rivals}"
+            lines.append(
+                f"{name}, seed {item.seed}: {truth or 'nothing'} (strength {item.strength:.3g}) -> {told}"
+                f"{' [listed]' if item.listed else ''}"
+            )
+    return lines
+
+
+def reliability_table(found: Mapping[str, Sequence[Judged]], suspects: Sequence[SuspectsJudged] = ()) -> str:
+    """Table of what was stated and how often it was right, as Markdown."""
+    rows = []
+    for title, judged in _groups(found).items():
+        scores = [score for item in judged for score in item.size_scores]
+        onsets = [score for item in judged for score in item.onset_scores]
+        for what, values in (("size", scores), ("onset of a step", onsets)):
+            for level in INTERVALS if values else ():
+                inside = Share.of(value <= float(ndtri(0.5 + 0.5 * level)) for value in values)
+                rows.append([title, f"{what} in its interval", f"{100 * level:.0f}", percent(inside)])
+        named = [item for item in judged if item.verdict not in (NOMINAL, UNKNOWN) and not item.remark]
+        rows += _bins(title, "verdict", [(item.probability, item.first) for item in named])
+        if named:
+            held = Share.of(set(item.truth) <= set(item.said) for item in named)
+            rows.append([title, "hidden cause among those named", "–", percent(held)])
+    for nearly in (False, True):
+        of_kind = [item for item in suspects if item.nearly is nearly]
+        name = NEARLY if nearly else "the model itself"
+        rows += _bins(name, "first suspect", [(item.first_probability, item.first) for item in of_kind])
+        if of_kind:
+            inside = Share.of(item.in_set for item in of_kind)
+            rows.append([name, "cause in the set of suspects", f"{100 * SET:.0f}", percent(inside)])
+    return markdown(["records", "stated", "with %", "right %"], rows)
+
+
+def _groups(found: Mapping[str, Sequence[Judged]]) -> dict[str, list[Judged]]:
+    """Records with one cause, of the model itself and of plants that are not quite it."""
+    groups: dict[str, list[Judged]] = {}
+    for study in CLASSES:
+        if study.kind == "single" and study.name in found:
+            name = NEARLY if study.name == NEARLY else "the model itself"
+            groups.setdefault(name, []).extend(found[study.name])
+    return groups
+
+
+def _bins(name: str, what: str, stated: Iterable[tuple[float, bool]]) -> list[list[str]]:
+    """A row for each range of stated probabilities."""
+    items, rows = list(stated), []
+    for low, high in pairwise(BINS):
+        inside = [(p, right) for p, right in items if low < p <= high]
+        if inside:
+            mean = float(np.mean([p for p, _ in inside]))
+            rows.append([name, what, f"{100 * mean:.0f}", percent(Share.of(right for _, right in inside))])
+    return rows

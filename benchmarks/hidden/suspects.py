@@ -29,8 +29,9 @@ class SuspectsJudged:
     in_set: bool  # whether the hidden cause is in the smallest set with 90 %
 
 
-def judge_suspects(number: int, nearly: bool, first_seed: int) -> SuspectsJudged | None:
-    """Draw a record, watch it, and judge the last suspects; None if no alarm has any."""
+def judge_suspects(job: tuple[int, bool, int]) -> SuspectsJudged | None:
+    """Draw a record of a number, watch it, and judge the last suspects; None if no alarm has any."""
+    number, nearly, first_seed = job
     hidden = _draw(number, nearly, first_seed)
     found = rw.backtest(hidden.record, "cstr", training_min=TRAINING_MIN)
     suspects = next((alarm.suspect for alarm in reversed(found.alarms) if alarm.suspect), None)

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.harness.tables import stamp
 from benchmarks.outside import free_run, tennessee, three_tanks, water_circuit
 from benchmarks.outside.table import Row, markdown
-from benchmarks.stamp import stamp
 
 SEED = 1
 

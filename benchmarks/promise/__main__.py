@@ -1,36 +1,46 @@
-"""`make promise`: false alarms on sound plants that are not quite the model, and faults seen on such plants."""
+"""`make promise`: false alarms on sound plants that are not quite the model, and faults seen on such plants.
+
+python -m benchmarks.promise [--only plants|black-box|faults|statements] [--results FILE] [--jobs N]
+"""
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
-from benchmarks import false_alarms
-from benchmarks.promise import black_box, costs, faults, statements
+from benchmarks.harness.plants import FLOWS, KINDS, NOISE_SD
+from benchmarks.harness.pool import Pool, add_options
+from benchmarks.promise import black_box, statements
 from benchmarks.promise.not_quite import print_plants
-from benchmarks.promise.plants import KINDS
-from reactorwatch.runtime.parallel import choose_executor
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", choices=("plants", "black-box", "faults", "statements"), help="one of the tables")
     parser.add_argument("--kinds", type=int, default=len(KINDS), help="number of kinds of plants")
-    parser.add_argument("--processes", type=int, help="processes that work side by side (default: one a core)")
-    parser.add_argument("--plants-only", action="store_true", help="without the tables of the other modules")
+    parser.add_argument("--seeds", type=int, help="records of each kind (default: 6), runs of each fault (default: 3)")
+    parser.add_argument("--noise", default=",".join(NOISE_SD), help="levels of noise of the records without equations")
+    parser.add_argument("--inputs", default=",".join(FLOWS), help="inputs of the records without equations")
+    parser.add_argument("--reference", choices=("auto", "black-box", "arx"), default="auto")
+    parser.add_argument("--plants", type=int, default=statements.PLANTS, help="plants for each length of the training")
+    parser.add_argument("--runs", type=int, default=statements.RUNS, help="faults injected for each size")
+    add_options(parser)
     options = parser.parse_args(arguments)
-    executor, start = choose_executor(options.processes), time.perf_counter()
-    print_plants(executor, options.kinds)
-    if not options.plants_only:
-        print("\n## Without equations\n")
-        black_box.print_table(executor, black_box.jobs_of(black_box.SEEDS))
-        print("\n## Medium faults, on a plant as the model\n")
-        faults.print_table(executor, faults.SEEDS)
-        print("\n## Statements held to simulation\n")
-        statements.print_tables(executor)
-        print("\n## Noise with memory\n")
-        false_alarms.print_table(executor)
-        print("\n## Costs\n")
-        costs.main()
+    pool, start = Pool.of(options), time.perf_counter()
+    jobs = black_box.jobs_of(options.seeds or 6, options.reference, options.noise.split(","), options.inputs.split(","))
+    tables: dict[str, tuple[str, Callable[[], None]]] = {
+        "plants": ("Plants that are not quite the model", lambda: print_plants(pool, options.kinds)),
+        "black-box": ("Without equations", lambda: black_box.print_table(pool, jobs)),
+        "faults": ("Medium faults, on a plant as the model", lambda: black_box.print_faults(pool, options.seeds or 3)),
+        "statements": (
+            "Statements held to simulation",
+            lambda: statements.print_tables(pool, options.plants, options.runs),
+        ),
+    }
+    for name, (title, print_table) in tables.items():
+        if options.only in (None, name):
+            print(f"\n## {title}\n")
+            print_table()
     print(f"\n{time.perf_counter() - start:.0f} s")
     return 0
 

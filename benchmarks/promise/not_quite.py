@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import reactorwatch as rw
-from benchmarks.promise.plants import INPUTS, KINDS, simulate
-from benchmarks.promise.pool import median_interval, poisson_interval, run_jobs, share_interval
-from reactorwatch.runtime.parallel.jobs import Executor
+from benchmarks.harness.plants import INPUTS, KINDS, simulate
+from benchmarks.harness.pool import Pool
+from benchmarks.harness.tables import head, line, median_interval, poisson_interval, share_interval
 
 SEED, SEED_STEP = 100, 1000
 """Seed of the first plant of the first set, and the difference to that of the next set."""
@@ -50,13 +50,13 @@ def watch(plant: Plant) -> Outcome:
     return Outcome([item.raised_min for item in found.alarms], found.expected_false_alarms, kept)
 
 
-def print_plants(executor: Executor, count: int) -> None:
+def print_plants(pool: Pool, count: int) -> None:
     """Watch sound plants and plants with a fault, and print the tables."""
     kinds, moves = range(count), range(len(INPUTS))
     sound = [Plant(kind, move) for kind in kinds for move in moves]
     often = [Plant(kind, move, number, HIGH_RATE) for number in (0, 1) for kind in kinds for move in moves]
     faulty = [item._replace(is_faulty=True) for item in sound if KINDS[item.kind].name not in NOT_WATCHED]
-    outcomes = run_jobs(executor, watch, [*sound, *often, *faulty])
+    outcomes = iter(pool.run("plants", watch, [*sound, *often, *faulty]))
     print_counts("the default promise", sound, outcomes)
     for number in (0, 1):
         own = [item for item in often if item.set == number]
@@ -65,19 +65,20 @@ def print_plants(executor: Executor, count: int) -> None:
 
 
 def print_counts(title: str, plants: Sequence[Plant], outcomes: Iterator[Outcome]) -> None:
-    """Print the table of false alarms."""
-    print(f"| sound plant, {title} | false alarms, by input | promised | not kept |\n|---|---|---|---|", flush=True)
+    """Print the table of false alarms of sound plants, by kind and input; takes their outcomes."""
+    print(head(f"sound plant, {title}", "false alarms, by input", "promised", "not kept"))
     found = [(plant, next(outcomes)) for plant in plants]
     for kind in dict.fromkeys(plant.kind for plant in plants):
         own = [(plant.moves, outcome) for plant, outcome in found if plant.kind == kind]
         counts = [sum(len(item.raised_min) for moves, item in own if moves == index) for index in range(len(INPUTS))]
         promised, broken = sum_up(item for _, item in own)
-        print(f"| {KINDS[kind].name} | {' + '.join(map(str, counts))} | {promised:.2g} | {broken} |")
+        print(line(KINDS[kind].name, " + ".join(map(str, counts)), f"{promised:.2g}", broken))
     raised = sum(len(item.raised_min) for _, item in found)
     promised, broken = sum_up(item for _, item in found)
     low, high = poisson_interval(raised)
-    interval = f"(95 %: {low:.1f} to {high:.1f})"
-    print(f"| all | {raised} {interval} | {promised:.2g} | {broken} of {len(found)} |\n", flush=True)
+    print(
+        line("all", f"{raised} (95 %: {low:.1f} to {high:.1f})", f"{promised:.2g}", f"{broken} of {len(found)}"), "\n"
+    )
 
 
 def sum_up(outcomes: Iterable[Outcome]) -> tuple[float, int]:

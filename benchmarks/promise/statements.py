@@ -1,11 +1,6 @@
-"""Statements of the monitor held to simulation: its bound on false alarms, and the deviations that it would see.
+"""Statements of the monitor held to simulation: its bound on false alarms, and the deviations that it would see."""
 
-python -m benchmarks.promise.statements
-"""
-
-import argparse
 from collections import Counter
-from collections.abc import Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -13,21 +8,19 @@ import numpy as np
 from scipy import special
 from scipy.signal import lfilter
 
-from benchmarks.promise.pool import run_jobs, share_interval
+from benchmarks.harness.plants import messages_of
+from benchmarks.harness.pool import Pool
+from benchmarks.harness.tables import head, line, percent, share_interval
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.contract.codec import Encoded, encode
-from reactorwatch.runtime.parallel import choose_executor
-from reactorwatch.runtime.parallel.jobs import Executor
-from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.ewma import Ewma, designed_limit
+from reactorwatch.contract.codec import Encoded
+from reactorwatch.spc.charts.base import Baseline
+from reactorwatch.spc.charts.ewma import Ewma, designed_limit, ewma_run_length
 from reactorwatch.spc.charts.shewhart import Shewhart, designed_width
+from reactorwatch.spc.false_alarm_budget import QUANTILE, TrainingErrors
 from reactorwatch.spc.prewhitening import Prewhitening, learn
-from reactorwatch.spc.run_length.ewma import ewma
-from reactorwatch.spc.training_errors import QUANTILE, TrainingErrors
-from recorder.tools.player import samples_of
 
 PLANTS, TRAININGS, COEFFICIENTS = 1000, (100, 1000, 5000), (0.0, 0.5)
 ARL0, WEIGHT = 20_000.0, 0.1
@@ -54,45 +47,29 @@ class Step(NamedTuple):
     seed: int  # seed of the record
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print both tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--plants", type=int, default=PLANTS, help="simulated plants for each length of the training")
-    parser.add_argument("--runs", type=int, default=RUNS, help="faults injected for each size")
-    parser.add_argument("--processes", type=int, help="processes (default: one a core)")
-    options = parser.parse_args(arguments)
-    print_tables(choose_executor(options.processes), options.plants, options.runs)
-    return 0
-
-
-def print_tables(executor: Executor, plants: int = PLANTS, runs: int = RUNS) -> None:
-    """Print both tables."""
-    print("| rows of the training | noise of the residual | plants worse than their bound at 90 % (95 %) |")
-    print("|---|---|---|", flush=True)
+def print_tables(pool: Pool, plants: int = PLANTS, runs: int = RUNS) -> None:
+    """Print both tables, from simulated plants for each length of the training and faults injected for each size."""
+    print(head("rows of the training", "noise of the residual", "plants worse than their bound at 90 % (95 %)"))
     groups = [Group(rows, coefficient, plants) for rows in TRAININGS for coefficient in COEFFICIENTS]
-    for group, share in zip(groups, run_jobs(executor, share_of, groups), strict=True):
+    for group, share in zip(groups, pool.run("trainings", share_of, groups), strict=True):
         low, high = share_interval(round(share * plants), plants)
-        interval = f"{100 * low:.1f} to {100 * high:.1f}"
-        print(f"| {group.rows:,} | AR {group.coefficient:g} | {100 * share:.1f} % ({interval}) |", flush=True)
-    print(f"\n| step, seen within {HORIZON_MIN:g} min (95 %) | size | at / {FACTOR:g} | at 1 | at x {FACTOR:g} |")
-    print("|---|---|---|---|---|", flush=True)
-    stated = stated_sizes()
+        worse = f"{100 * share:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+        print(line(f"{group.rows:,}", f"AR {group.coefficient:g}", worse))
+    seen_within = f"step, seen within {HORIZON_MIN:g} min (95 %)"
+    print(f"\n{head(seen_within, 'size', f'at / {FACTOR:g}', 'at 1', f'at x {FACTOR:g}')}")
+    stated, factors = stated_sizes(), (1.0 / FACTOR, 1.0, FACTOR)
     steps = [
         Step(cause, factor * stated[cause] * (1.0 if number % 2 else -1.0), factor, 1000 + number)
         for cause in CAUSES
-        for factor in (1.0 / FACTOR, 1.0, FACTOR)
+        for factor in factors
         for number in range(runs)
     ]
     seen = Counter[tuple[str, float]]()
-    for step, is_seen in zip(steps, run_jobs(executor, sees, steps), strict=True):
+    for step, is_seen in zip(steps, pool.run("steps", sees, steps), strict=True):
         seen[step.cause, step.factor] += is_seen
     for cause in CAUSES:
-        cells = []
-        for factor in (1.0 / FACTOR, 1.0, FACTOR):
-            count = seen[cause, factor]
-            low, high = share_interval(count, runs)
-            cells.append(f"{100 * count / runs:.0f} % ({100 * low:.0f} to {100 * high:.0f})")
-        print(f"| {cause} | {stated[cause]:.3g} | {' | '.join(cells)} |", flush=True)
+        shares = [percent(seen[cause, factor], runs) for factor in factors]
+        print(line(cause, f"{stated[cause]:.3g}", *shares), flush=True)
 
 
 def share_of(group: Group) -> float:
@@ -127,7 +104,7 @@ def _true_rates(learned: Prewhitening, coefficient: float) -> tuple[float, float
     averaged = lfilter([WEIGHT], [1.0, WEIGHT - 1.0], response)
     spread = float(np.sqrt(averaged @ averaged * (2.0 - WEIGHT) / WEIGHT))
     limit = min(designed_limit(ARL0, WEIGHT, learned) / spread, 6.0)  # beyond, the rate is nothing
-    return point * ARL0, ARL0 / ewma(abs(mean) / spread, WEIGHT, limit)
+    return point * ARL0, ARL0 / ewma_run_length(abs(mean) / spread, WEIGHT, limit)
 
 
 def stated_sizes() -> dict[str, float]:
@@ -152,9 +129,4 @@ def _training() -> Any:
 
 
 def _messages(rows: int, seed: int, *faults: str) -> list[Encoded]:
-    record = simulate_record(PlantConfig(seed=seed, faults=faults), rows)
-    return [encode(item) for item in samples_of(record, "cstr")]
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    return messages_of(simulate_record(PlantConfig(seed=seed, faults=faults), rows))

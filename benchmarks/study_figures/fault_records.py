@@ -20,8 +20,8 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import encode
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.library.cstr.operation import NOISE_SD, ONSET_MIN, OPERATION
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.cstr_operation import NOISE_SD, ONSET_MIN, OPERATION
 from reactorwatch.process.operation import Preset
 from reactorwatch.records.record import Record, to_minutes
 from reactorwatch.spc.charts.shewhart import probability_out

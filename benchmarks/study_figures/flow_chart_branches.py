@@ -15,7 +15,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps
 from reactorwatch.identification.structure import Structure
-from reactorwatch.process.library.cstr.operation import OPERATION
+from reactorwatch.process.library.cstr_operation import OPERATION
 from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:

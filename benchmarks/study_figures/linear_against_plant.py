@@ -10,8 +10,8 @@ from benchmarks.study_figures.canvas import BLUE, ORANGE, label, legend_below, p
 from benchmarks.study_figures.figure import Finding, Verdict, verdict
 from benchmarks.study_figures.steady_state_curve import REPORTED_T
 from benchmarks.study_figures.study import NAMES, Study
-from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW
-from reactorwatch.process.step_response import StepComparison, compare_step
+from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW
+from reactorwatch.process.linearise import StepComparison, compare_step
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
@@ -105,7 +105,8 @@ def _unit_step(study: Study, drawing: Drawing, name: str) -> Finding:
 
 
 def _compare(study: Study, step: float) -> StepComparison:
-    return compare_step(study.model, study.operating(FLOW), np.array([FLOW]), np.array([step]), _SPAN_MIN, _PERIOD_MIN)
+    point, flow = study.operating(FLOW).state, np.array([FLOW])
+    return compare_step(study.model, point, flow, np.array([step]), _SPAN_MIN, _PERIOD_MIN)
 
 
 def _steady_change(study: Study, step: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

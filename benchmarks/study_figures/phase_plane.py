@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.study_figures.canvas import BLACK, BLUE, GREEN, ORANGE, label, legend_below, panels
 from benchmarks.study_figures.figure import Finding, verdict
 from benchmarks.study_figures.study import NAMES, Study, row_times
-from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW
+from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

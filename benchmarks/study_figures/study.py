@@ -18,8 +18,8 @@ from reactorwatch.arrays import Array
 from reactorwatch.identification.families import LINEAR_FAMILIES, Model
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.structure import Structure
-from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, cstr
-from reactorwatch.process.library.cstr.operation import NOISE_SD, OPERATION
+from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW, cstr
+from reactorwatch.process.library.cstr_operation import NOISE_SD, OPERATION
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import SteadyState, steady_states

@@ -20,7 +20,7 @@ from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.regressor import Rows, rows_of
 from reactorwatch.identification.residual_tests import ResidualTest, independence, whiteness
 from reactorwatch.identification.structure import Structure
-from reactorwatch.spc.parameter_drift import learn
+from reactorwatch.spc.charts.parameters import learn
 
 ROWS_A_PARAMETER = 10
 """Least number of rows per parameter of a fitted model."""

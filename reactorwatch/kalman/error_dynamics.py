@@ -25,8 +25,8 @@ from reactorwatch.codegen.compiled_function import LANES, CompiledFunction
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.kalman.batch import LONGEST_ROW_MIN, InputUncertainty
 from reactorwatch.kalman.ekf_step import NoiseLevels, transition
-from reactorwatch.process.integrate import LONGEST_STEP_MIN
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.simulate import LONGEST_STEP_MIN
 
 _LEAST_PIVOT = 1e-12
 

@@ -35,9 +35,9 @@ from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.kalman.ekf_step import output_function
 from reactorwatch.process import effects_of, named_effects
 from reactorwatch.process.effect import TIMING, Effect
-from reactorwatch.process.effect_states import reset_function, rest_function, with_derivatives
-from reactorwatch.process.input_effects import InputLag
 from reactorwatch.process.model import MODEL_CACHE_SIZE, Parameter, ProcessModel, parameter, variable
+from reactorwatch.process.signal_effects import InputLag
+from reactorwatch.process.simulate import reset_function, rest_function, with_derivatives
 from reactorwatch.process.steady_state import SteadyState, SteadyStates
 
 START_SD = 3.0  # of a state that no sensor shows, in its scales

@@ -1,20 +1,19 @@
 """The study scores what was judged, draws each cause as often, and writes it down."""
 
-import json
 from dataclasses import replace
-from math import isnan, nan
+from math import nan
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.diagnosis_study import earlier, section, with_section
-from benchmarks.diagnosis_study import judge_record as run_one
+from benchmarks.diagnosis_study import judge_record, section
+from benchmarks.harness.pool import Pool
+from benchmarks.harness.tables import replace_between
 from benchmarks.hidden.classes import CLASSES, NEARLY, draw_record, find_class, seed_of
-from benchmarks.hidden.reliability import reliability_table
-from benchmarks.hidden.score import Score, Share, confusion
+from benchmarks.hidden.score import Score, Share, confusion, failures, main_table, percent, reliability_table
 from benchmarks.hidden.suspects import SuspectsJudged
-from benchmarks.hidden.tables import failures, main_table, percent
+from reactorwatch.errors import InputError
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import MEDIUM_NOISE
 from tests.hidden_effect.judge import Judged
@@ -48,10 +47,6 @@ def test_an_error_is_compared_with_the_noise_of_its_own_rows() -> None:
     assert score.drawn_in_sd == (1.0, 1.1)
 
 
-def test_where_there_is_nothing_there_is_no_score() -> None:
-    assert isnan(Score.of([]).first)
-
-
 def test_a_diagnosis_that_came_to_no_end_counts_as_a_miss() -> None:
     score = Score.of([one("a", "a"), one("a", "", verdict="", remark="InputError: no")])
     assert score.first == 0.5
@@ -61,13 +56,6 @@ def test_a_diagnosis_that_came_to_no_end_counts_as_a_miss() -> None:
 def test_the_confusion_table_counts_what_each_truth_was_called() -> None:
     found = dict(confusion([one("a", "a"), one("a", "b"), one("a", "a"), one("", "")]))
     assert found == {"a": [("a", 2), ("b", 1)], "nominal": [("nominal", 1)]}
-
-
-def test_a_failure_is_reported_with_its_seed() -> None:
-    (line,) = failures({"medium": [one("a", "a"), one("a", "b")]})
-    assert "seed 1" in line
-    assert "a step 2 " in line
-    assert "named b step" in line
 
 
 def test_a_share_has_the_interval_of_its_number_of_records() -> None:
@@ -111,36 +99,31 @@ def test_no_two_records_of_a_study_share_a_seed() -> None:
     assert len(set(seeds)) == len(seeds)
 
 
-def test_a_record_goes_through_and_comes_out_as_tables_that_can_be_put_together_later(tmp_path: Path) -> None:
-    found = {"150 min": [run_one("150 min", 1, 60_000_000)]}
+def test_a_study_that_was_stopped_continues_from_the_file_of_its_results(tmp_path: Path) -> None:
+    """The judged record is taken from the file, and what was half written when it was stopped is computed again."""
+    jobs, file = [("150 min", 1, 60_000_000)], tmp_path / "results"
+    found = {"150 min": Pool(1, results=file).run("150 min", judge_record, jobs)}
     assert found["150 min"][0].remark == ""
-    text = section(found, 60_000_000)
-    assert main_table(found) in text
-    assert "60000000" in text
-    file = tmp_path / "numbers.json"
-    file.write_text(json.dumps({"150 min": [found["150 min"][0].__dict__]}))
-    assert section(earlier([file])[0], 60_000_000) == text
+    assert main_table(found) in section(found, 60_000_000)
+    whole = file.read_bytes()
+    file.write_bytes(whole + whole[:100])
+    assert Pool(1, results=file).run("150 min", _refuse, jobs) == found["150 min"]
+    with pytest.raises(RuntimeError, match="not there yet"):
+        Pool(1, results=file).run("150 min", _refuse, [("150 min", 2, 60_000_000)])
 
 
-def test_the_tables_take_the_place_of_those_before() -> None:
-    page = "before\n<!-- made by make study: begin -->\nold\n<!-- made by make study: end -->\nafter\n"
-    once = with_section(page, "new\n")
-    assert once == page.replace("old", "new")
-    assert with_section(once, "new\n") == once
+def _refuse(job: tuple[str, int, int]) -> Judged:
+    raise InputError(f"{job[1]} is not there yet")
 
 
-def test_a_page_without_the_marks_is_left_alone() -> None:
+def test_tables_take_the_place_of_those_before_and_a_page_without_marks_is_refused(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- begin -->\nold\n<!-- end -->\nafter\n", encoding="utf-8")
+    for _ in range(2):
+        replace_between(page, "<!-- begin -->", "<!-- end -->", "new\n")
+        assert page.read_text(encoding="utf-8") == "before\n<!-- begin -->\nnew\n<!-- end -->\nafter\n"
     with pytest.raises(ValueError, match="must hold the marks"):
-        with_section("no marks", "new")
-
-
-def test_nothing_is_hidden_in_a_nominal_record() -> None:
-    assert draw_record(find_class("nominal"), 8, 70_000_000).causes == ()
-
-
-def test_an_unknown_class_is_refused_with_the_names_of_those_there_are() -> None:
-    with pytest.raises(KeyError, match=r"no class .easy.*closed loop"):
-        find_class("easy")
+        replace_between(page, "<!-- start -->", "<!-- end -->", "new")
 
 
 def test_what_has_no_name_fails_where_it_is_not_in_its_place() -> None:

@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.promise import black_box, faults, plants
-from benchmarks.promise.not_quite import Outcome, Plant, delay, print_counts, print_delays
-from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
-from benchmarks.promise.pool import median_interval, poisson_interval, run_jobs, share_interval
+from benchmarks.harness import plants
+from benchmarks.harness.plants import FLOWS, INPUTS, KINDS, Kind, simulate
+from benchmarks.harness.pool import Pool
+from benchmarks.harness.tables import median_interval, poisson_interval, share_interval
+from benchmarks.promise import black_box
+from benchmarks.promise.not_quite import Outcome, Plant, print_counts, print_delays
 from plant_node.record import simulate_record
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.runtime.parallel.jobs import SerialExecutor
 
 ROOT = Path(__file__).parents[3]
 RANDOM_STEPS = INPUTS["a new flow in 90 to 111 each minute"]
@@ -87,16 +88,6 @@ def test_the_interval_of_a_median_is_between_the_values_of_the_sign_test() -> No
     assert median_interval([float(value) for value in range(1, 21)]) == (6.0, 15.0)
 
 
-def test_a_job_that_fails_ends_the_table() -> None:
-    with pytest.raises(RuntimeError, match="nothing: "):
-        list(run_jobs(SerialExecutor(), int, ["1", "nothing"]))
-
-
-def test_the_delay_is_that_of_the_first_alarm_after_the_onset() -> None:
-    assert delay(Outcome([120.0, 401.5, 430.0], 0.1, True)) == pytest.approx(1.5)
-    assert delay(Outcome([120.0], 0.1, True)) == np.inf
-
-
 def test_the_tables_count_alarms_by_input_and_plants_whose_promise_is_not_kept(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -119,12 +110,12 @@ def test_the_tables_of_black_boxes_and_of_faults_have_a_line_for_each_kind(
         return black_box.Result(2 * (job.inputs == "wide"), 0.5, 100, 90, job.seed > black_box.SEED)
 
     monkeypatch.setattr(black_box, "watch", result)
-    black_box.print_table(SerialExecutor(), [job for job in black_box.jobs_of(2) if job.noise == "low"])
+    black_box.print_table(Pool(1), black_box.jobs_of(2, "auto", ["low"], list(FLOWS)))
     lines = capsys.readouterr().out.splitlines()
     assert lines[2] == "| low | wide | 4 | 1.00 | 4.00 (1.09 to 10.24) | 1 of 2 | 90.0 % |"
-    assert [line.split(" | ")[1] for line in lines[2:]] == [*black_box.INPUTS, "all", "all that are said to be kept"]
-    monkeypatch.setattr(faults, "watch", lambda job: 1.0 if job.has_equations else np.inf)
-    faults.print_table(SerialExecutor(), 1)
+    assert [line.split(" | ")[1] for line in lines[2:]] == [*FLOWS, "all", "all that are said to be kept"]
+    monkeypatch.setattr(black_box, "find_delay", lambda job: 1.0 if job.has_equations else np.inf)
+    black_box.print_faults(Pool(1), 1)
     lines = capsys.readouterr().out.splitlines()
     assert lines[2] == "| steps, with equations | 13 | 100 % (75 to 100) | 1.00 (1.00 to 1.00) |"
     assert lines[4].startswith("| steps, without equations | 13 | 0 % (0 to 25) | inf (inf to inf) |")
@@ -133,7 +124,7 @@ def test_the_tables_of_black_boxes_and_of_faults_have_a_line_for_each_kind(
 
 @pytest.mark.slow
 def test_the_command_prints_its_tables_from_worker_processes() -> None:
-    command = [sys.executable, "-m", "benchmarks.promise", "--kinds", "1", "--plants-only", "--processes", "2"]
+    command = [sys.executable, "-m", "benchmarks.promise", "--kinds", "1", "--only", "plants", "--jobs", "2"]
     found = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
     assert found.stdout.count("| all |") == 3
     assert "of 3 seen within 10 min" in found.stdout

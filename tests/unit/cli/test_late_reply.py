@@ -43,7 +43,7 @@ class Nodes:
 def test_alarms_are_listed_without_a_recorder_and_a_busy_one_is_named(
     called: Command, monkeypatch: pytest.MonkeyPatch, recorder: bool, said: str
 ) -> None:
-    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", lambda *_: Nodes(recorder))
+    monkeypatch.setattr("reactorwatch.cli.bus_client.connect", lambda *_: Nodes(recorder))
     done = called("alarm", "list", "--json", "--timeout", "0.1")
     assert (done.returncode, done.stderr) == (0, said)
     assert json.loads(done.stdout)["alarm"] == "shewhart/T"

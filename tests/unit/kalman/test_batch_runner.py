@@ -9,7 +9,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.kalman.batch import LEAST_ROWS, FilterRecord, FilterResult, run_together
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.ekf_step import NoiseLevels
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 
 ROWS = 2 * LEAST_ROWS
 LEVELS = [NoiseLevels((1e-3 * (1 + n), 0.2), (1e-4, 0.02 * n)) for n in range(6)]

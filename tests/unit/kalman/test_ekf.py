@@ -18,7 +18,7 @@ from reactorwatch.kalman.batch import FilterRecord, Innovation
 from reactorwatch.kalman.ekf import Filter, FilterState
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, OPERATING_STATE, cstr
+from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW, OPERATING_STATE, cstr
 from reactorwatch.process.model import Output, ProcessModel, new_clock, variable
 from reactorwatch.process.simulate import Simulator
 

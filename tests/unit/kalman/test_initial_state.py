@@ -12,8 +12,7 @@ from reactorwatch.kalman.batch import FilterRecord
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states
 

@@ -16,7 +16,7 @@ from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorLinearization
 from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.model import ProcessModel
 
 SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))

@@ -9,7 +9,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.kalman.batch import FilterRecord
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.noise_estimation import fit_noise
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 
 SMALLEST = (2e-4, 0.05)
 ROWS = 1000

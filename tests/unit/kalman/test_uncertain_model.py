@@ -9,8 +9,8 @@ from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.filter_states import learned_parameters, select_effects, widen_model
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 

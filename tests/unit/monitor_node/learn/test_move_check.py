@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.promise.black_box import TRAINING_MIN, sound_record, without_equations
+from benchmarks.harness.plants import TRAINING_MIN, sound_record, without_equations
 from monitor_node.core import Monitor
 from monitor_node.learn.training_rows import AfterMoves, after_largest_moves, compare_after_moves
 from reactorwatch.arrays import Array

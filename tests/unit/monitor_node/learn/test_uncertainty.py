@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from benchmarks.promise.plants import INPUTS, KINDS, Kind, simulate
+from benchmarks.harness.plants import INPUTS, KINDS, Kind, simulate
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.learn.process_reference import ProcessMemory, ProcessReference
@@ -21,7 +21,7 @@ from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.filter_states import is_disturbance
 from reactorwatch.process.extended_model import ExtendedModel
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 
 from ..samples import samples
 from ..warm_plant import changes, publish
