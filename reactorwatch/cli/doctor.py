@@ -28,10 +28,12 @@ from reactorwatch.runtime.security.certificates import read_certificate, read_co
 from reactorwatch.version import version
 
 RENEW_DAYS = 30
+"""As `certify --renew 30` in the cure: a month to plan it."""
 MAX_OFFSET_S = 1.0
+"""Far above what NTP leaves, and below a period of samples."""
 REPEAT_S = 0.2
+"""A subscription takes effect within it on a network of one site."""
 NODES = ("plant", "monitor", "recorder")
-MB = 1_000_000
 
 
 class Finding(NamedTuple):
@@ -111,7 +113,7 @@ def _check_certificate(config: BusConfig, plant: str, now: datetime) -> Iterator
 def _check_disk(folder: Path, room_mb: float) -> Finding:
     while not folder.exists() and folder != folder.parent:  # it is made when needed
         folder = folder.parent
-    free_mb = shutil.disk_usage(folder).free / MB
+    free_mb = shutil.disk_usage(folder).free / 1e6
     found = f"{free_mb:,.0f} MB free at {folder.resolve()}"
     if free_mb < room_mb:
         return Finding("disk", found, f"make room for {room_mb:,.0f} MB, or set keep_mb in [recorder]")

@@ -71,10 +71,6 @@ def table_text(record: Record, file: Path) -> str:
     return printable_lines(lines if gaps else [*lines, "no gaps"])
 
 
-MAX_LINES = 20
-"""Gaps that are listed one by one for people."""
-
-
 def saved_object(saved: RecoveryResult, out: Path) -> dict[str, Any]:
     """The object that `recover --json` prints."""
     return {

@@ -32,6 +32,7 @@ ROWS = 600
 
 FAULT = "coolant_flow:step:-0.1@30min"
 TRAINING_MIN = 15.0
+"""Half of the time before the fault."""
 REFERENCES: tuple[Literal["auto", "black-box", "arx"], ...] = ("auto", "black-box", "arx")
 
 

@@ -151,7 +151,7 @@ def _run() -> int:
     return code if isinstance(code, int) else 0
 
 
-AGAIN_S = 0.2
+AGAIN_S = 0.2  # a compiler drops an interrupt for less
 _BINDING = "llvmlite.binding"
 """Package whose code calls LLVM; a callback of LLVM runs within it."""
 

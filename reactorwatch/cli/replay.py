@@ -25,8 +25,7 @@ from recorder.tools.inspect import zero_ns_of
 SETTINGS = "settings"
 """Name of the nodes' settings in the metadata of a recording."""
 
-MAX_LINES = 10
-MAX_VALUE = 60
+MAX_LINES, MAX_VALUE = 10, 60  # differences, and letters of a value, that fit a terminal
 
 
 def run(file: Path, config: Path | None, plant: str | None, process: str | None = None, *, as_json: bool) -> int:

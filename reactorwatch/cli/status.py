@@ -9,7 +9,7 @@ from math import inf, isnan
 from typing import TYPE_CHECKING, Any
 
 from reactorwatch.cli.display import Screen, json_line, print_lines, print_screen_text, screen
-from reactorwatch.cli.status_view import ANNUNCIATED, Now, age_s, format_plant, sort_alarms
+from reactorwatch.cli.status_view import ANNUNCIATED, SECOND_NS, Now, age_s, format_plant, sort_alarms
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import priority_word, set_suspects, state_word
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode_message
@@ -35,15 +35,14 @@ if TYPE_CHECKING:
     from reactorwatch.description.process import Process
 
 
-SECOND_NS = 1_000_000_000
 WINDOW_S = 10
 """Seconds over which rates are counted, without the current one."""
 
-REFRESH_S = 1.0
+REFRESH_S = 1.0  # as often as a rate can change
 HISTORY_S = 60.0
 """History of health: longer than any node's period."""
 
-ANSWER_WITHIN_S = 2.0
+ANSWER_WITHIN_S = 2.0  # a node answers within milliseconds; one that is busy is asked again
 
 
 class StatusBoard:

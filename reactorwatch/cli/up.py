@@ -18,6 +18,7 @@ from reactorwatch.cli.kernels import compile_at_first_start
 from reactorwatch.cli.option_groups import BusOptions
 from reactorwatch.cli.plant_settings import PlayedRecord, load_source
 from reactorwatch.cli.processes import (
+    POLL_S,
     VIEWER,
     BusSettings,
     Processes,
@@ -41,9 +42,6 @@ from recorder.keep import ENDING
 from recorder.recording_files import file_names
 
 log = structlog.get_logger()
-POLL_S = 0.5
-DEFAULT_OUT = "runs"
-"""Default folder of recordings."""
 
 
 def run_until_stopped(
@@ -67,7 +65,7 @@ def run_until_stopped(
             raise InputError(f"settings [monitor]: {error}") from error
     of_recorder = tables.get("recorder", {})
     processes = {source.plant: source.process, **of_recorder.get("processes", {})}
-    of_recorder = {"recorder": {"out": DEFAULT_OUT, **of_recorder, "processes": processes}}
+    of_recorder = {"recorder": {"out": "runs", **of_recorder, "processes": processes}}
     recorder_flags = {"plant": source.plant, "out": str(out) if out is not None else None}
     recorder = restrict_to_plant(section(RecorderConfig, "recorder", of_recorder, recorder_flags), site)
     join = load_bus_settings(site, source.plant, tables, target.endpoint)

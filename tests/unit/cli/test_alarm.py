@@ -1,5 +1,7 @@
-"""`reactorwatch baseline` and `--mode`: what is sent, what is printed, and what is refused."""
+"""Commands of an operator: what is sent, what is printed, what is refused; a busy node is named."""
 
+import json
+import threading
 from typing import Any
 
 import msgspec
@@ -9,8 +11,10 @@ from typer.testing import CliRunner
 from reactorwatch.cli import bus_client
 from reactorwatch.cli.main import app
 from reactorwatch.cli.option_groups import ClientOptions, ProcessOptions
-from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply
+from reactorwatch.contract.codec import Encoded, encode_message
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Baseline, BaselineCommand, CommandReply
 from reactorwatch.errors import InputError
+from tests.running import Command
 
 BASELINES = [
     Baseline(id=0, what="trained", by="monitor"),
@@ -75,3 +79,43 @@ def test_a_mode_is_a_column_of_a_process_without_a_file() -> None:
         ProcessOptions().choose(["phase"])
     with pytest.raises(InputError, match="--input, --output and --mode describe a process without a file"):
         ProcessOptions("cstr").choose(["phase"])
+
+
+ALARM = Alarm(alarm="shewhart/T", state=AlarmState.ALARM_STATE_UNACKNOWLEDGED, text="T is high")
+
+
+class Nodes:
+    """A bus with a monitor that answers; a recorder, if there is one, does not answer in time."""
+
+    def __init__(self, recorder: bool) -> None:
+        self._recorder = recorder
+
+    def query(self, question: Encoded, timeout_s: float) -> list[Encoded]:
+        if question.key.endswith("/list_alarms"):
+            return [Encoded(question.key, *encode_message(CommandReply(accepted=True, alarms=[ALARM])))]
+        if self._recorder:
+            threading.Event().wait(timeout_s)
+        return []
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("recorder", "said"),
+    [
+        (
+            True,
+            "the alarms of the recorder are missing: the recorder of plant 'cstr' did not answer within 0.1 s; "
+            "give it a longer --timeout\n",
+        ),
+        (False, ""),
+    ],
+)
+def test_alarms_are_listed_without_a_recorder_and_a_busy_one_is_named(
+    called: Command, monkeypatch: pytest.MonkeyPatch, recorder: bool, said: str
+) -> None:
+    monkeypatch.setattr("reactorwatch.cli.bus_client.connect", lambda *_: Nodes(recorder))
+    done = called("alarm", "list", "--json", "--timeout", "0.1")
+    assert (done.returncode, done.stderr) == (0, said)
+    assert json.loads(done.stdout)["alarm"] == "shewhart/T"
