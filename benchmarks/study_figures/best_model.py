@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -11,8 +12,7 @@ from benchmarks.study_figures.canvas import BLUE, ORANGE, PURPLE, label, panels
 from benchmarks.study_figures.figure import Finding, Verdict
 from benchmarks.study_figures.neural import Neural
 from benchmarks.study_figures.study import ORDERS, OUTPUTS, Study
-from reactorwatch.identification.families import LINEAR_FAMILIES, Family
-from reactorwatch.identification.selection import EQUAL_PERCENT, Candidate, Selection, select
+from reactorwatch.identification.selection import EQUAL_PERCENT, LINEAR_FITS, Candidate, Fit, Selection, select
 from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:
@@ -27,14 +27,13 @@ _THIRD = 3
 def draw(study: Study, drawing: Drawing) -> Finding:
     """Free-run and one-step fits of every family and order."""
     neural = find_spec("sklearn") is not None
-    families: list[Family] = [*LINEAR_FAMILIES, *([Neural()] if neural else [])]
-    records: dict[str, tuple[Record, list[Family]]] = {study.source: (study.identification, families)}
+    fits = {**LINEAR_FITS, "neural": Neural().fit} if neural else LINEAR_FITS
+    records: dict[str, tuple[Record, Mapping[str, Fit]]] = {study.source: (study.identification, fits)}
     if study.measured is None:
-        linear = list(LINEAR_FAMILIES)
-        records["the same run without noise"] = (study.noise_free, linear)
+        records["the same run without noise"] = (study.noise_free, LINEAR_FITS)
         records["steps within 0.1 l/min of 100 l/min, without noise, where the plant is nearly linear"] = (
             study.small_steps,
-            linear,
+            LINEAR_FITS,
         )
     selections = {
         (name, output): select(record.columns["qc"], record.columns[output], record.time_min, of_it, ORDERS)
@@ -65,9 +64,9 @@ class ThirdOrder:
 
     def __init__(self, selections: list[Selection]) -> None:
         groups = [
-            [candidate for candidate in selection.candidates if candidate.family == family.name]
+            [candidate for candidate in selection.candidates if candidate.family == family]
             for selection in selections
-            for family in LINEAR_FAMILIES
+            for family in LINEAR_FITS
         ]
         self.of = len(groups)
         self.one_step = sum(_ahead(group, "one_step_percent") >= 0 for group in groups)
@@ -110,8 +109,8 @@ def _gains(selections: dict[tuple[str, str], Selection], name: str) -> dict[tupl
         for candidate in selections[name, output].candidates
     }
     return {
-        (family.name, output): runs[family.name, _THIRD, output] - runs[family.name, _THIRD - 1, output]
-        for family in LINEAR_FAMILIES
+        (family, output): runs[family, _THIRD, output] - runs[family, _THIRD - 1, output]
+        for family in LINEAR_FITS
         for output in OUTPUTS
     }
 

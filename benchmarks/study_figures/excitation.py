@@ -10,7 +10,7 @@ from benchmarks.study_figures.canvas import BLUE, GREEN, VERMILION, label, panel
 from benchmarks.study_figures.figure import Finding, verdict
 from benchmarks.study_figures.study import ORDERS, Study, levels, row_times
 from plant_node.scenario import RandomSteps, Scenario, Sines, Square
-from reactorwatch.identification.excitation import persistence
+from reactorwatch.identification.checks import persistence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

@@ -24,11 +24,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import fit_arx
-from reactorwatch.identification.excitation import Check, check_record, sampling
+from reactorwatch.identification.checks import Check, check_record, sampling
+from reactorwatch.identification.data import ScaledRecord, rows_of
+from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import LinearModel
-from reactorwatch.identification.regressor import rows_of
-from reactorwatch.identification.scaled_record import ScaledRecord
 from reactorwatch.identification.structure import Structure, as_columns
 
 OUTSIDE_THREE_SIGMA = 0.0027
@@ -77,7 +76,7 @@ def follow(
     if not rate.passed:
         return Conclusion("sample again", tuple(branches))
 
-    model = fit_arx(structure, *training)
+    model = fit_linear("arx", structure, *training)
     known = _present(model.residuals(*training))
     centre, sigma = float(np.mean(known)), float(np.std(known, ddof=structure.parameters))
     lower, upper = centre - 3.0 * sigma, centre + 3.0 * sigma

@@ -8,11 +8,11 @@ import numpy as np
 
 from benchmarks.study_figures.canvas import BLACK, BLUE, ORANGE, VERMILION, label, legend_below, panels
 from benchmarks.study_figures.figure import Finding, Verdict, verdict
-from benchmarks.study_figures.report_scheme import ORDER
+from benchmarks.study_figures.report_scheme import EVERY, ORDER, SKIP
 from benchmarks.study_figures.study import NAMES, OUTPUTS, Study, holdout_half
-from reactorwatch.identification.batch import SINGULAR_CONDITION
+from reactorwatch.identification.least_squares import SINGULAR_CONDITION
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
-from reactorwatch.identification.structure import REPORT_ROWS, Structure
+from reactorwatch.identification.structure import Structure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
@@ -41,7 +41,7 @@ def estimate(study: Study, drawing: Drawing) -> Finding:
             rows.append(f"| {output} | {name} | {model.rows} | {condition} | {values} |")
     legend_below(drawing, axes[0], 2)
     text = (
-        f"The scheme in full: rows {REPORT_ROWS.skip + 1}, {REPORT_ROWS.skip + 1 + REPORT_ROWS.every}, ... are fitted, "
+        f"The scheme in full: rows {SKIP + 1}, {SKIP + 1 + EVERY}, ... are fitted, "
         "their lags are the rows just before them, and the pseudo-inverse solves. The report scales its signals "
         "and does not give the factors; here each is centred and divided by its standard deviation, and the "
         f"parameters below are those of the signals' own units. Fitted to the first half of {study.source}.\n\n"

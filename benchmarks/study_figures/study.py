@@ -15,8 +15,8 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import Scenario
 from reactorwatch.arrays import Array
-from reactorwatch.identification.families import LINEAR_FAMILIES, Model
 from reactorwatch.identification.linear_model import LinearModel
+from reactorwatch.identification.selection import LINEAR_FITS, Model
 from reactorwatch.identification.structure import Structure
 from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW, cstr
 from reactorwatch.process.library.cstr_operation import NOISE_SD, OPERATION
@@ -120,8 +120,7 @@ class Study:
         if key not in self._fits:
             u, y, t = self.signals(output)
             half = y.size // 2
-            (kind,) = (item for item in LINEAR_FAMILIES if item.name == family)
-            self._fits[key] = kind.fit(Structure.of_order(order), u[:half], y[:half], t[:half])
+            self._fits[key] = LINEAR_FITS[family](Structure.of_order(order), u[:half], y[:half], t[:half])
         return self._fits[key]
 
     def report_fit(self, family: str, order: int, output: str) -> LinearModel:

@@ -1,17 +1,25 @@
-"""Checks that a record suffices to identify a model; each failure names the reason and the cure.
+"""Checks that a record suffices to identify a model, each with the reason of a failure and its cure; residual tests.
 
-Persistence of excitation (Ljung, System Identification, 2nd ed., chapter 13): a linear model of n
-parameters on past outputs and m on past inputs needs an input of order n + m, one whose n + m lagged copies, less
-their means, are linearly independent. A sinusoid excites 2, a sum of k sinusoids 2k, however long it lasts; a square
-wave or random steps many more. Measured here as the smallest over the largest singular value of the lagged copies.
-Independence does not depend on the spacing of the lags, but this measure does (neighbouring samples of a slow input are
-nearly equal), so the best of several spacings counts; the sampling rate has a check of its own.
+Persistence of excitation (Ljung, System Identification, 2nd ed., chapter 13): a linear model of n parameters on past
+outputs and m on past inputs needs an input of order n + m, one whose n + m lagged copies, less their means, are
+linearly independent. A sinusoid excites 2, a sum of k sinusoids 2k, however long it lasts; a square wave or random
+steps many more. Measured here as the smallest over the largest singular value of the lagged copies. Independence does
+not depend on the spacing of the lags, but this measure does (neighbouring samples of a slow input are nearly equal), so
+the best of several spacings counts; the sampling rate has a check of its own.
 
 The sampling rate is judged by the plant's response to a step, T95 in samples: 5 to 15 are advised (Isermann and
 Munchhof, Identification of Dynamic Systems, 2011, section 23.2). Above that neighbouring rows are nearly equal, the
-regressors become singular, and noise outweighs what a sample adds; below it the response is over between two
-samples. The step response is that of the instrumental variable model: least squares would take the noise for fast
-dynamics, and accept every sampling rate.
+regressors become singular, and noise outweighs what a sample adds; below it the response is over between two samples.
+The step response is that of the instrumental variable model: least squares would take the noise for fast dynamics, and
+accept every sampling rate.
+
+Whiteness of residuals: Ljung and Box (Biometrika 65 (1978) 297), Q = N (N+2) sum_k r_k^2 / (N-k), r_k the
+autocorrelation at lag k, is chi-squared with as many degrees of freedom as lags, less the number of fitted parameters
+on the output's own past, if the residuals are white. Independence from past inputs: Soderstrom and Stoica (System
+Identification, 1989, section 11.2), x = N r' R^-1 r with r the cross-covariances of residual and past inputs over the
+residuals' standard deviation and R the covariance matrix of these past inputs, is chi-squared with as many degrees of
+freedom as there are of them. The result is -log10 p, with p the probability of such a statistic under a true model: 6
+is one in a million, and it stays finite where p itself underflows.
 """
 
 import math
@@ -21,21 +29,16 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reactorwatch.errors import UnfitRecordError
-from reactorwatch.identification.instrumental_variable import instrumental_variable
-from reactorwatch.identification.regressor import consecutive_rows
-from reactorwatch.identification.scaled_record import ScaledRecord
-from reactorwatch.identification.simulation import RunPlan, simulate
+from reactorwatch.errors import InputError, UnfitRecordError
+from reactorwatch.identification.data import RunPlan, ScaledRecord, consecutive_rows
+from reactorwatch.identification.linear import instrumental_variable
+from reactorwatch.identification.linear_model import simulate
 from reactorwatch.identification.structure import Structure, as_columns
 
-INDEPENDENT = 0.01
-"""Smallest ratio of the weakest to the strongest direction of the input's lagged copies."""
-LARGEST_CONDITION = 1e4
-SLOWEST_SAMPLES, BEST_SAMPLES, FASTEST_SAMPLES = 3.0, 10.0, 30.0
-"""T95 in samples: sampling is too slow below, too fast above."""
-LEAST_AMPLITUDE = 3.0
-
-_LONGEST_STEP = 20_000
+LARGEST_CONDITION = 1e4  # of the scaled regressors: four digits are lost
+SLOWEST_SAMPLES, BEST_SAMPLES, FASTEST_SAMPLES = 3.0, 10.0, 30.0  # T95: about twice beyond what is advised is accepted
+LEAST_AMPLITUDE = 3.0  # of the output, in standard deviations of its noise
+DEFAULT_LAGS = 20
 
 
 class Check(msgspec.Struct, frozen=True):
@@ -46,27 +49,19 @@ class Check(msgspec.Struct, frozen=True):
         result: "ok", or the reason of a failure and its cure.
         value: measured value.
         limit: limit of the value.
+        decimation: advised decimation of the rows, of the check of the sampling rate; 1 if it is not too fast.
     """
 
     name: str
     result: str
     value: float
     limit: float
+    decimation: int = 1
 
     @property
     def passed(self) -> bool:
         """True if the result is "ok"."""
         return self.result == "ok"
-
-
-class SamplingCheck(Check, frozen=True):
-    """A check of the sampling rate.
-
-    Attributes:
-        decimation: advised decimation of the rows; 1 if the rate is good or too slow.
-    """
-
-    decimation: int = 1
 
 
 def check_record(
@@ -151,7 +146,7 @@ def _excited_order(copies: list[NDArray[np.float64]]) -> int:
     triangle = np.asarray(np.linalg.qr(np.concatenate([copy / size for copy in centred], axis=1), mode="r"))
     for lags in range(len(copies), 0, -1):
         values = np.linalg.svd(triangle[: lags * inputs, : lags * inputs], compute_uv=False)
-        if values[-1] >= INDEPENDENT * values[0]:
+        if values[-1] >= 0.01 * values[0]:
             return lags
     return 0
 
@@ -165,11 +160,7 @@ def conditioning(record: ScaledRecord) -> Check:
     structure, regressors = record.structure, record.rows().regressors
     if len(regressors) < structure.parameters:
         raise UnfitRecordError(f"{structure.parameters} parameters need as many complete rows, got {len(regressors)}")
-    return condition_check(float(np.linalg.cond(regressors)))
-
-
-def condition_check(condition: float) -> Check:
-    """Check the condition number of scaled regressors, from a record or a recursive estimator."""
+    condition = float(np.linalg.cond(regressors))
     value = condition if math.isfinite(condition) and condition < 1e16 else math.inf
     reason = (
         f"the regressors are nearly dependent, condition number {value:.1e}: "
@@ -178,7 +169,7 @@ def condition_check(condition: float) -> Check:
     return Check("conditioning", "ok" if value <= LARGEST_CONDITION else reason, value, LARGEST_CONDITION)
 
 
-def sampling(record: ScaledRecord) -> SamplingCheck:
+def sampling(record: ScaledRecord) -> Check:
     """Check that the sampling is neither too fast nor too slow for the plant.
 
     Raises:
@@ -187,20 +178,20 @@ def sampling(record: ScaledRecord) -> SamplingCheck:
     samples = response_samples(record.structure, instrumental_variable(record))
     if math.isnan(samples):
         reason = "cannot tell: the model found has no settled step response; a longer or livelier record would help"
-        return SamplingCheck("sampling", reason, math.nan, FASTEST_SAMPLES)
+        return Check("sampling", reason, math.nan, FASTEST_SAMPLES)
     if samples > FASTEST_SAMPLES:
         decimation = round(samples / BEST_SAMPLES)
         reason = (
             f"too fast: the response takes {samples:.0f} samples, {BEST_SAMPLES:.0f} suffice: take one of {decimation}"
         )
-        return SamplingCheck("sampling", reason, samples, FASTEST_SAMPLES, decimation)
+        return Check("sampling", reason, samples, FASTEST_SAMPLES, decimation)
     if samples < SLOWEST_SAMPLES:
         reason = (
             f"too slow: the response is over within {samples:.0f} samples: sample at least "
             f"{BEST_SAMPLES / samples:.0f} times faster"
         )
-        return SamplingCheck("sampling", reason, samples, SLOWEST_SAMPLES)
-    return SamplingCheck("sampling", "ok", samples, FASTEST_SAMPLES)
+        return Check("sampling", reason, samples, SLOWEST_SAMPLES)
+    return Check("sampling", "ok", samples, FASTEST_SAMPLES)
 
 
 def response_samples(structure: Structure, parameters: NDArray[np.float64]) -> float:
@@ -219,7 +210,7 @@ def response_samples(structure: Structure, parameters: NDArray[np.float64]) -> f
     if rest <= 0.0 or gains[strongest] == 0.0:
         return math.nan
     final = gains[strongest] / rest
-    length = _LONGEST_STEP + structure.history
+    length = 20_000 + structure.history
     step = np.zeros((length, structure.inputs))
     step[structure.history :, strongest] = 1.0
     starts = np.arange(length) == structure.history
@@ -253,3 +244,133 @@ def amplitude(record: ScaledRecord) -> Check:
         "move the input further or average samples"
     )
     return Check("amplitude", "ok" if value >= LEAST_AMPLITUDE else reason, value, LEAST_AMPLITUDE)
+
+
+class ResidualTest(msgspec.Struct, frozen=True):
+    """Result of a test of residuals.
+
+    Attributes:
+        name: "whiteness" or "independence".
+        statistic: test statistic, chi-squared under the null hypothesis.
+        degrees: degrees of freedom.
+        minus_log10_p: -log10 of its p-value; 0 when there are no residuals.
+    """
+
+    name: str
+    statistic: float
+    degrees: int
+    minus_log10_p: float
+
+
+def whiteness(residuals: ArrayLike, lags: int = DEFAULT_LAGS, fitted: int = 0) -> ResidualTest:
+    """Ljung-Box test of whiteness.
+
+    Args:
+        residuals: shape (rows,), NaN where there is none; pairs with a missing one are excluded.
+        lags: number of autocorrelations.
+        fitted: parameters on the output's own past that were fitted to these residuals (an ARX model's `a`).
+
+    Raises:
+        InputError: lags that leave no degree of freedom, or fewer than two residuals a lag.
+    """
+    if lags <= fitted or lags < 1:
+        raise InputError(f"lags must be above the {fitted} fitted parameters and at least 1, got {lags}")
+    values, present = _centre(residuals, lags)
+    count = int(present.sum())
+    variance = float(np.sum(values * values))
+    if variance == 0.0:
+        return ResidualTest("whiteness", 0.0, lags - fitted, 0.0)
+    statistic = 0.0
+    for lag in range(1, lags + 1):
+        pairs = int(np.sum(present[lag:] & present[:-lag]))
+        if pairs:
+            correlation = float(values[lag:] @ values[:-lag]) / variance
+            statistic += correlation**2 / pairs
+    statistic *= count * (count + 2.0)
+    return ResidualTest("whiteness", statistic, lags - fitted, minus_log10_p(statistic, lags - fitted))
+
+
+def independence(
+    residuals: ArrayLike,
+    inputs: ArrayLike,
+    delay: int = 1,
+    lags: int = DEFAULT_LAGS,
+    time: ArrayLike | None = None,
+) -> ResidualTest:
+    """Test that the residuals are uncorrelated with past inputs.
+
+    Args:
+        residuals: shape (rows,), NaN where there is none.
+        inputs: shape (rows,) or (rows, inputs).
+        delay: the first lag of the inputs that is tested.
+        lags: number of lags of each input.
+        time: shape (rows,); None: gaps are not detected.
+
+    Raises:
+        InputError: fewer than two residuals a lag, or a delay or number of lags below 1.
+    """
+    if delay < 1 or lags < 1:
+        raise InputError(f"delay and lags must be at least 1, got {delay} and {lags}")
+    values, present = _centre(residuals, lags)
+    u = as_columns(inputs, "inputs")
+    if len(u) != values.size:
+        raise InputError(f"residuals and inputs must have equally many rows, got {values.size} and {len(u)}")
+    reach = delay + lags - 1
+    rows = np.flatnonzero(present & (np.concatenate([[0], consecutive_rows(u, time)[:-1]]) >= reach))
+    if rows.size <= reach:
+        raise UnfitRecordError(
+            f"{lags} lags need more than {reach} rows with a residual and past inputs, got {rows.size}"
+        )
+    past = np.concatenate([u[rows - lag] for lag in range(delay, delay + lags)], axis=1)
+    past = past - past.mean(axis=0)
+    # A constant or duplicate input adds no direction; the projection counts independent ones.
+    directions, sizes, _ = np.linalg.svd(past, full_matrices=False)
+    directions = directions[:, sizes > 1e-9 * max(sizes[0], 1e-300)]
+    errors = values[rows]
+    variance = float(np.mean(errors * errors))
+    degrees = directions.shape[1]
+    if variance == 0.0 or degrees == 0:
+        return ResidualTest("independence", 0.0, degrees, 0.0)
+    statistic = float(np.sum((directions.T @ errors) ** 2)) / variance
+    return ResidualTest("independence", statistic, degrees, minus_log10_p(statistic, degrees))
+
+
+def minus_log10_p(statistic: float, degrees: int) -> float:
+    """-log10 of the upper tail of chi-squared, for any tail however small.
+
+    Beyond double range it is the continued fraction of the incomplete gamma function, DLMF 8.9.2, in logarithms.
+
+    Args:
+        statistic: value of chi-squared, at least 0.
+        degrees: degrees of freedom, at least 1.
+    """
+    from scipy.special import gammaincc, gammaln
+
+    a, x = 0.5 * degrees, 0.5 * statistic
+    probability = float(gammaincc(a, x))
+    if probability > 1e-200:
+        return abs(math.log10(probability))
+    # Lentz's method (Numerical Recipes, 3rd ed., section 6.2) for x well above a, where it converges in a few steps.
+    b = x + 1.0 - a
+    c, d = 1e300, 1.0 / b
+    fraction = d
+    for i in range(1, 1000):
+        term = -i * (i - a)
+        b += 2.0
+        d = 1.0 / (term * d + b)
+        c = b + term / c
+        fraction *= d * c
+        if abs(d * c - 1.0) < 1e-15:
+            break
+    return (x - a * math.log(x) + float(gammaln(a)) - math.log(fraction)) / math.log(10.0)
+
+
+def _centre(residuals: ArrayLike, lags: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Residuals less their mean, 0 where missing, and a mask of those present."""
+    values = np.asarray(residuals, dtype=np.float64)
+    if values.ndim != 1:
+        raise InputError(f"residuals must have the shape (rows,), got {values.shape}")
+    present = np.isfinite(values)
+    if present.sum() < 2 * lags:
+        raise UnfitRecordError(f"{lags} lags need at least {2 * lags} residuals, got {int(present.sum())}")
+    return np.where(present, values - np.mean(values[present]), 0.0), present

@@ -1,10 +1,14 @@
-"""Orders, names, row choices, and scaling with its undoing."""
+"""Structures, scaling with its undoing, and regressors from a record."""
 
 import numpy as np
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.structure import RowChoice, Scaling, Structure, as_columns
+from reactorwatch.identification.data import consecutive_rows, rows_of
+from reactorwatch.identification.structure import Scaling, Structure, as_columns
+
+U = np.arange(10.0, 20.0)
+Y = np.arange(0.0, 10.0)
 
 
 @pytest.mark.parametrize(
@@ -38,13 +42,6 @@ def test_names_of_several_signals_have_their_number() -> None:
     assert structure.parameter_names() == ("a1", "b1_1", "b1_2")
 
 
-def test_a_row_choice_that_cannot_be_is_named() -> None:
-    with pytest.raises(InputError, match="every must be at least 1, got 0"):
-        RowChoice(every=0)
-    with pytest.raises(InputError, match="skip must be at least 0, got -1"):
-        RowChoice(skip=-1)
-
-
 def test_undoing_the_scaling_gives_the_same_predictions() -> None:
     """Two inputs, random parameters: scaled model on scaled signals = undone model on the signals."""
     rng = np.random.default_rng(1)
@@ -58,7 +55,6 @@ def test_undoing_the_scaling_gives_the_same_predictions() -> None:
     scaled = np.concatenate([scaled_y[k - 1], scaled_y[k - 2], scaled_u[k - 1], [1.0]]) @ theta
     plain = np.concatenate([y[k - 1], y[k - 2], u[k - 1], [1.0]]) @ own
     assert plain == pytest.approx(scaled * scaling.output_spreads[0] + scaling.output_centres[0], rel=1e-12)
-    np.testing.assert_allclose(scaling.scale_parameters(structure, own), theta, rtol=1e-9)
 
 
 def test_a_model_without_offset_is_scaled_but_not_centred() -> None:
@@ -84,3 +80,37 @@ def test_signals_have_one_row_a_sample() -> None:
     assert as_columns([1.0, 2.0], "inputs").shape == (2, 1)
     with pytest.raises(InputError, match=r"inputs must have the shape \(rows, 2\), got \(3, 1\)"):
         as_columns([1.0, 2.0, 3.0], "inputs", 2)
+
+
+def test_a_row_holds_past_outputs_then_past_inputs_then_one() -> None:
+    """For na = 2, nb = 1, delay 3: y[k-1], y[k-2], u[k-3], 1."""
+    rows = rows_of(Structure(2, 1, delay=3), U, Y)
+    np.testing.assert_array_equal(rows.position, np.arange(3, 10))
+    np.testing.assert_array_equal(rows.regressors[0], [2.0, 1.0, 10.0, 1.0])
+    np.testing.assert_array_equal(rows.outputs[0], [3.0])
+
+
+def test_several_signals_stand_side_by_side_at_each_lag() -> None:
+    structure = Structure(1, 2, inputs=2, offset=False)
+    rows = rows_of(structure, np.column_stack([U, -U]), Y)
+    np.testing.assert_array_equal(rows.regressors[0], [1.0, 11.0, -11.0, 10.0, -10.0])
+
+
+def test_missing_values_and_gaps_cost_the_rows_that_reach_over_them() -> None:
+    """A missing output at 4 with lag 1, and a gap before 8, leave rows 1 2 3 6 7 9."""
+    outputs = Y.copy()
+    outputs[4] = np.nan
+    time = np.arange(10.0)
+    time[8:] += 0.5
+    np.testing.assert_array_equal(rows_of(Structure.of_order(1), U, outputs, time).position, [1, 2, 3, 6, 7, 9])
+    np.testing.assert_array_equal(consecutive_rows(outputs[:, None], time), [1, 2, 3, 4, 0, 1, 2, 3, 1, 2])
+
+
+def test_records_that_do_not_fit_are_refused() -> None:
+    structure = Structure.of_order(1)
+    with pytest.raises(InputError, match="equally many rows, got 10 and 9"):
+        rows_of(structure, U, Y[:9])
+    with pytest.raises(InputError, match=r"time must increase, got 1\.0 after 1\.0 in row 3"):
+        rows_of(structure, U[:3], Y[:3], [0.0, 1.0, 1.0])
+    with pytest.raises(InputError, match=r"time must have the shape \(10,\), got \(3,\)"):
+        rows_of(structure, U, Y, [0.0, 1.0, 2.0])

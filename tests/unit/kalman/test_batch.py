@@ -1,5 +1,6 @@
-"""Intervals in which an input changed at an unknown time."""
+"""Filters run as a batch give the output of each alone, to the last bit; inputs that changed at an unknown time."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import casadi as ca
@@ -7,10 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from plant_node.config import PlantConfig
-from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.batch import FilterRecord, FilterResult, InputUncertainty, insert_rows
+from reactorwatch.kalman.batch import (
+    LEAST_ROWS,
+    FilterRecord,
+    FilterResult,
+    InputUncertainty,
+    insert_rows,
+    run_together,
+)
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorLinearization
@@ -18,8 +24,58 @@ from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.model import ProcessModel
+from tests.unit.kalman.plant import SENSORS, record_of
 
-SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
+ROWS = 2 * LEAST_ROWS
+LEVELS = [NoiseLevels((1e-3 * (1 + n), 0.2), (1e-4, 0.02 * n)) for n in range(6)]
+
+
+def record(seed: int, rows: int = ROWS) -> FilterRecord:
+    """Record of a drifting plant that does not match the model."""
+    rng = np.random.default_rng(seed)
+    measured: Array = np.array([0.1, 438.5]) + rng.normal(size=(rows, 2)) * [1e-3, 0.2]
+    measured[rng.random(rows) < 0.05] = np.nan
+    qc: Array = 103.4 + np.cumsum(rng.normal(size=rows)) * 0.02
+    return FilterRecord(np.arange(rows) / 10.0, qc[:, None], measured, gate=6.0)
+
+
+def same(found: Sequence[FilterResult], expected: Sequence[FilterResult]) -> bool:
+    pairs = [pair for of in zip(found, expected, strict=True) for pair in zip(*of, strict=True)]
+    return all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
+
+
+def alone(records: Sequence[FilterRecord]) -> list[FilterResult]:
+    return [Filter(cstr(), noise).run(item) for noise, item in zip(LEVELS, records, strict=False)]
+
+
+def at_once(records: Sequence[FilterRecord]) -> list[FilterResult]:
+    filters = [Filter(cstr(), noise) for noise, _ in zip(LEVELS, records, strict=False)]
+    return run_together([item.run_batched(of) for item, of in zip(filters, records, strict=True)])
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 6])
+def test_each_filter_gives_the_output_it_gives_alone(count: int) -> None:
+    records = [record(seed) for seed in range(count)]
+    assert same(at_once(records), alone(records))
+
+
+def test_records_of_different_lengths_and_with_gaps_go_together() -> None:
+    records = [record(1), record(2, LEAST_ROWS + 200), record(3), record(4)]
+    times = records[2].time_min.copy()
+    times[700:] += 2.0
+    records[2] = FilterRecord(times, records[2].inputs, records[2].measured, gate=6.0)
+    assert same(at_once(records), alone(records))
+
+
+def test_one_that_loses_the_plant_does_not_disturb_the_others() -> None:
+    """In the middle of one record something is measured of which no filter can make a number."""
+    records = [record(seed) for seed in range(4)]
+    measured: Array = records[1].measured.copy()
+    measured[1000] = 1e308
+    records[1] = FilterRecord(records[1].time_min, records[1].inputs, measured)
+    found, expected = at_once(records), alone(records)
+    assert np.all(np.isnan(expected[1].prediction[1000]))
+    assert same(found, expected)
 
 
 @pytest.mark.parametrize("missing", [1, 2, 5, 40])
@@ -34,25 +90,9 @@ def test_inputs_may_have_changed_with_each_missing_row_and_the_one_after_them(mi
 
 
 @pytest.mark.parametrize("missing", [1, 2, 5])
-def test_a_tank_that_fills_is_as_uncertain_as_when_its_valve_opened(missing: int) -> None:
-    """dx/dt = u: the level rises by u times the time for which the valve was open."""
-    model, noise = filling(), NoiseLevels((0.1,), (0.0,))
-    kalman, sure = Filter(model, noise), Filter(model, noise)
-    for tank in (kalman, sure):
-        for row in range(50):
-            tank.update(0.1 * row, (0.0,), (5.0,))
-    moments, now = (4.9 + 0.1 * np.arange(1, missing + 2)).tolist(), 5.0 + 0.1 * missing
-    kalman.update(now, (3.0,), (np.nan,), changes=[(moment, (3.0,)) for moment in moments])
-    sure.update(now, (3.0,), (np.nan,))
-    by = 3.0 * (now - np.array(moments))
-    assert kalman.state.x[0] == pytest.approx(sure.state.x[0] + np.mean(by), rel=1e-9)
-    assert kalman.state.P[0] == pytest.approx(sure.state.P[0] + np.var(by), rel=1e-9)
-
-
-@pytest.mark.parametrize("missing", [1, 2, 5])
-def test_what_follows_a_level_goes_with_the_square_of_the_time_for_which_the_valve_was_open(missing: int) -> None:
+def test_a_level_is_as_uncertain_as_when_its_valve_opened_and_what_follows_it_with_the_square(missing: int) -> None:
     """dx/dt = u, dz/dt = x: of u since r the level x is u r, and z is u r^2 / 2."""
-    model, noise = filling(followed=True), NoiseLevels((0.1,), (0.0, 0.0))
+    model, noise = filling(), NoiseLevels((0.1,), (0.0, 0.0))
     kalman, sure = Filter(model, noise), Filter(model, noise)
     for tanks in (kalman, sure):
         for row in range(50):
@@ -136,15 +176,14 @@ def test_what_a_noise_search_learns_does_not_take_holes_for_noise() -> None:
 def test_a_sticking_valve_keeps_its_place_behind_a_hole() -> None:
     """It follows moves of more than 6 l/min alone, whenever they were."""
     fault = parse_fault("valve_stiction:constant:6.0")
-    record = simulate_record(PlantConfig(seed=5, faults=(str(fault),)), 3000)
-    qc, there = record.columns["qc"], np.ones(3000, dtype=bool)
+    time_min, qc, measured = record_of(3000, seed=5, faults=(str(fault),))
+    there = np.ones(3000, dtype=bool)
     there[2 + np.flatnonzero(np.diff(qc[1:]))[::3]] = False
-    measured = np.column_stack([record.columns["C"], record.columns["T"]])
     uncertainty = InputUncertainty.for_missing_rows(
-        record.time_min[there], qc[there][:, None], missing_of(record.time_min[there], qc[there])
+        time_min[there], qc[there][:, None], missing_of(time_min[there], qc[there])
     )
     kalman = Filter(fault.extend(cstr()), NoiseLevels(SENSORS.measurement_sd, (0.0,) * 3))
-    found = kalman.run(FilterRecord(record.time_min[there], qc[there], measured[there], uncertainty=uncertainty))
+    found = kalman.run(FilterRecord(time_min[there], qc[there], measured[there], uncertainty=uncertainty))
     stands = np.empty(3000)
     stands[0] = qc[0]
     for row in range(1, 3000):
@@ -173,32 +212,27 @@ def test_a_record_without_holes_stays_as_it_is() -> None:
     assert rows.time_min is time_min
 
 
-def filling(followed: bool = False) -> ProcessModel:
+def filling() -> ProcessModel:
     """A tank that fills as fast as its valve lets it, and what its level fills; built from the reactor's parts."""
     model = cstr()
     level = replace(model.states[1], lower=-100.0, upper=100.0, scale=1.0)
     output = replace(model.outputs[1], expression=level.symbol)
     other = replace(model.states[0], lower=-100.0, upper=100.0, scale=1.0)
-    states, rhs = [level, other], [model.inputs[0].symbol + ca.SX(0), level.symbol + ca.SX(0)]
-    count = 2 if followed else 1
-    return replace(
-        model, states=tuple(states[:count]), rhs=tuple(rhs[:count]), outputs=(output,), at_rest={}, resets={}
-    )
+    rhs = model.inputs[0].symbol + ca.SX(0), level.symbol + ca.SX(0)
+    return replace(model, states=(level, other), rhs=rhs, outputs=(output,), at_rest={}, resets={})
 
 
 def with_holes(seed: int) -> tuple[Array, Array, Array, Array]:
     """A run of the reactor with rows missing, most where qc moves; which rows are there."""
     random = np.random.default_rng(seed)
     rows = 6000
-    record = simulate_record(PlantConfig(seed=seed), rows)
-    measured = np.column_stack([record.columns["C"], record.columns["T"]])
-    qc = record.columns["qc"]
+    time_min, qc, measured = record_of(rows, seed=seed)
     there = np.ones(rows, dtype=bool)
     moves = np.flatnonzero(np.diff(qc)) + 1
     there[moves[random.random(moves.size) < 0.7]] = False
     there[random.random(rows) < 0.05] = False
     there[0] = True
-    return record.time_min, qc, measured, there
+    return time_min, qc, measured, there
 
 
 def missing_of(time_min: Array, qc: Array) -> NDArray[np.intp]:

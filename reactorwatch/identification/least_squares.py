@@ -1,22 +1,86 @@
-"""Least squares of a function that is not linear in its parameters, by Marquardt's method.
+"""Least squares: linear by QR, and of a function that is not linear in its parameters by Marquardt's method.
 
-J. SIAM 11 (1963) 431. A step to parameters that the function does not admit, such as a model with a pole on or outside
-the unit circle, is shortened.
+The regressors X, scaled, are factored, X = Q R, and R p = Q' y solved: the normal equations X'X p = X'y would square
+the condition number (Golub and Van Loan, Matrix Computations, 4th ed., section 5.3). With N rows, n parameters and
+residuals r, the noise variance is r'r / (N - n) and the parameters' covariance that times (R'R)^-1 (Ljung, System
+Identification, 2nd ed., appendix II).
+
+Marquardt's method (J. SIAM 11 (1963) 431) takes the gradient of the prediction for the regressors. A step to parameters
+that the function does not admit, such as a model with a pole on or outside the unit circle, is shortened.
 """
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.identification.batch import LeastSquares, least_squares
+from reactorwatch.errors import InputError, UnfitRecordError
+from reactorwatch.identification.structure import as_columns
 
-ITERATIONS = 200
-_PRECISION = 1e-12  # a smaller relative gain of a step ends the descent
+SINGULAR_CONDITION = 1e13  # beyond it the parameters are rounding error
+ITERATIONS = 200  # of a descent; it ends before where a step gains less than 1e-12 of the sum of squares
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """A least squares solution.
+
+    Attributes:
+        parameters: shape (parameters,).
+        inverse: shape (parameters, parameters), (X'X)^-1.
+        noise_variance: r'r / (rows - parameters); inf for as many rows as parameters.
+        condition: condition number of the regressors.
+        rows: number of rows.
+    """
+
+    parameters: NDArray[np.float64]
+    inverse: NDArray[np.float64]
+    noise_variance: float
+    condition: float
+    rows: int
+
+
+def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
+    """Solve a least squares problem.
+
+    Args:
+        regressors: shape (rows, parameters).
+        outputs: shape (rows,) or (rows, 1).
+
+    Raises:
+        InputError: fewer rows than parameters, values that are not finite, or regressors that don't determine the
+            parameters.
+    """
+    x, y = as_columns(regressors, "regressors"), as_columns(outputs, "outputs", 1)
+    rows, parameters = x.shape
+    if len(y) != rows:
+        raise InputError(f"regressors and outputs must have equally many rows, got {rows} and {len(y)}")
+    if rows < parameters:
+        raise UnfitRecordError(f"{parameters} parameters need at least {parameters} complete rows, got {rows}")
+    for name, values in (("regressors", x), ("outputs", y)):
+        if not np.all(np.isfinite(values)):
+            row = int(np.argmin(np.isfinite(values).all(axis=1)))
+            raise InputError(f"{name} must be finite, got {values[row]} in row {row + 1}")
+    q, r = np.linalg.qr(x)
+    values = np.linalg.svd(r, compute_uv=False)
+    condition = float(values[0] / values[-1]) if values[-1] > 0.0 else np.inf
+    if condition > SINGULAR_CONDITION:
+        raise UnfitRecordError(
+            f"the rows don't determine {parameters} parameters: condition number {condition:.1e}, at most "
+            f"{SINGULAR_CONDITION:.0e} can be solved; try a lower order, slower sampling, other rows, a livelier input"
+        )
+    inverse_factor = np.linalg.inv(r)
+    theta = np.linalg.solve(r, q.T @ y)
+    residuals = y - x @ theta
+    free = rows - parameters
+    squares = np.sum(residuals * residuals, axis=0)
+    variance = float(squares[0]) / free if free > 0 else np.inf
+    return LeastSquares(theta[:, 0], inverse_factor @ inverse_factor.T, variance, condition, rows)
 
 
 class Objective(Protocol):
@@ -30,11 +94,7 @@ class Objective(Protocol):
 
 
 def descend(objective: Objective, start: Array, iterations: int = ITERATIONS) -> tuple[Array, float]:
-    """Minimise from a start that the objective admits.
-
-    Returns:
-        The parameters and their sum of squares.
-    """
+    """Minimise from a start that the objective admits; returns the parameters and their sum of squares."""
     size = start.size
     theta, damping = start, 1e-3
     errors, gradient = objective(theta)
@@ -57,7 +117,7 @@ def descend(objective: Objective, start: Array, iterations: int = ITERATIONS) ->
                     damping = max(0.1 * damping, 1e-12)
                     break
             damping *= 10.0
-        if not _PRECISION * squares < gain < math.inf:
+        if not 1e-12 * squares < gain < math.inf:
             break
     return theta, squares
 
