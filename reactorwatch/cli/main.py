@@ -64,7 +64,7 @@ COMMANDS: dict[str, dict[str, Command | typer.Typer]] = {
     "Site": {"router": site.router, "certify": site.certify, "doctor": site.doctor},
     "Studies": {"linearise": studies.linearise, "charts": studies.charts, "demo": studies.demo},
 }
-"""Commands by the person who needs them, as the help lists them."""
+"""Commands by person, as the help lists them."""
 
 
 class _Root(TyperGroup):

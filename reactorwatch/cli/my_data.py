@@ -57,9 +57,9 @@ def info(
     with task(f"reading {file.name}"):
         if is_table(check_recording(file)) and not file.is_dir():
             record = (
-                read_table(file, None, table.stated)
+                read_table(file, None, table.file_format)
                 if choice.is_default
-                else read_signals(file, choice, None, table.stated)
+                else read_signals(file, choice, None, table.file_format)
             )
             text = json_line(table_object(record, file)) if as_json else table_text(record, file)
         else:
@@ -125,7 +125,7 @@ def backtest(
         plant=table.plant,
         columns=table.columns,
         process=choice,
-        stated=table.stated,
+        stated=table.file_format,
         as_json=as_json,
         settings=settings,
         log_rows=rows is not None,
@@ -195,7 +195,9 @@ def identify(
     if compare and (validate is not None or settle):
         raise InputError("--compare chooses by the second half of FILE: leave --validate and --settle out")
     measured, held_out = (
-        None if path is None else record(check_recording(path), table.plant, table.columns, described, table.stated)
+        None
+        if path is None
+        else record(check_recording(path), table.plant, table.columns, described, table.file_format)
         for path in (file, validate)
     )
     assert measured is not None
@@ -251,7 +253,7 @@ def diagnose(
         plant=table.plant,
         columns=table.columns,
         process=choice,
-        stated=table.stated,
+        stated=table.file_format,
         as_json=as_json,
         uncertain=uncertain,
         tolerance=parse_tolerances(tolerance),
@@ -287,7 +289,7 @@ def causes(
         measured = excite(model, resolutions(described))
     else:
         path = check_recording(record)
-        measured, described = record_of_process(path, table.plant, table.columns, choice, table.stated)
+        measured, described = record_of_process(path, table.plant, table.columns, choice, table.file_format)
         model = described.require_model()
     run = make_run(measured, model)
     with task(f"comparing the causes of {described.name}"):
@@ -321,7 +323,9 @@ def simulate(
 
     choice = chosen.choose()
     out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
-    measured, described = record_of_process(check_recording(file), table.plant, table.columns, choice, table.stated)
+    measured, described = record_of_process(
+        check_recording(file), table.plant, table.columns, choice, table.file_format
+    )
     model = described.require_model()
     with task(f"simulating {file.name}"):
         simulated = simulate_along(measured, model, fault or [], settle)

@@ -57,9 +57,9 @@ def up(
         "faults": fault or None,
     }
     choice = chosen.choose()
-    if record is None and (table.stated != GUESS or choice.outputs):
+    if record is None and (table.file_format != GUESS or choice.outputs):
         raise InputError("options about the form of a table are for the record of --record; name it, or leave them out")
-    played = None if record is None else PlayedRecord(record, table.stated)
+    played = None if record is None else PlayedRecord(record, table.file_format)
     with describe_in_file(choice) as named:
         flags["process"] = named
         raise typer.Exit(run_until_stopped(target, out, flags, diagnose, site, played))

@@ -89,7 +89,7 @@ class TableOptions:
     ] = None
 
     @property
-    def stated(self) -> FileFormat:
+    def file_format(self) -> FileFormat:
         """The form as it is stated."""
         values = {item.name: getattr(self, item.name) for item in fields(FileFormat)}
         lists = {name: tuple(values[name] or ()) for name in ("missing", "quality_good")}
@@ -278,7 +278,7 @@ def _options_of(parameter: inspect.Parameter) -> list[inspect.Parameter]:
 
 
 def _about(option: inspect.Parameter) -> Any:
-    """What Typer is told about an option or argument."""
+    """Typer's description of an option or argument."""
     return get_args(option.annotation)[1]
 
 

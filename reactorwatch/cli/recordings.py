@@ -103,7 +103,7 @@ def replay(
             "--up plays the whole file with its own names",
         )
         pace = {"name": target.name, "speed": parse_pace(rate, "--rate"), "process": chosen.process}
-        played = PlayedRecord(check_recording(file), table.stated)
+        played = PlayedRecord(check_recording(file), table.file_format)
         raise typer.Exit(run_until_stopped(target, None, pace, None, None, played))
     from reactorwatch.records.decode import is_table
     from reactorwatch.records.record import MINUTE_NS
@@ -126,7 +126,7 @@ def replay(
         "inputs": choice.inputs or None,
         "outputs": choice.outputs or None,
         "columns": column.columns or None,
-        "table": stated_settings(table.stated),
+        "table": stated_settings(table.file_format),
     }
     run_replay(section(ReplayConfig, "replay", tables, flags), bus)
 
@@ -164,7 +164,7 @@ def dashboard(
     if drawn is not None and not drawn.is_file():
         raise InputError(f"--diagnosis {diagnosis}: holds no {DRAWING}; it must be the folder that diagnose -o wrote")
     with task(f"drawing {file.name}"):
-        recording = open_messages(check_recording(file), table.plant, stated=table.stated, choice=choice)
+        recording = open_messages(check_recording(file), table.plant, stated=table.file_format, choice=choice)
         run = read_segments(recording.messages, given_zero_ns=recording.zero_ns, process=recording.process)
         write_rrd(_check_samples(run, file), out, diagnosis=drawn)
     print_lines(f"wrote {out}", *([f"note: read as: {recording.read_as}"] if recording.read_as else []))
@@ -197,7 +197,7 @@ def import_csv(
     out = check_output(out, ".mcap", (*files, choice.file), force=force)
     with task(f"importing {files[0].name}"):
         sources = list(map(check_input, files))
-        record = convert(sources, out, table.plant, table.columns, stated=table.stated, choice=choice)
+        record = convert(sources, out, table.plant, table.columns, stated=table.file_format, choice=choice)
     print_report(_report_text(out, record))
 
 
@@ -217,7 +217,7 @@ def export_csv(
     choice = chosen.choose()
     out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
     with task(f"exporting {file.name}"):
-        record = convert(check_recording(file), out, table.plant, clock=clock, stated=table.stated, choice=choice)
+        record = convert(check_recording(file), out, table.plant, clock=clock, stated=table.file_format, choice=choice)
     print_report(_report_text(out, record))
 
 
