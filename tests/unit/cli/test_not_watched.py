@@ -201,7 +201,7 @@ def test_bad_input_and_use_end_with_2_and_print_no_result(
     assert (ended.returncode, ended.stdout) == (2, "")
 
 
-Command = Callable[[list[str]], object]
+Typed = Callable[[list[str]], object]
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +225,7 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def main(monkeypatch: pytest.MonkeyPatch) -> Command:
+def main(monkeypatch: pytest.MonkeyPatch) -> Typed:
     """RunColumns a command; returns its exit code."""
 
     def run(words: list[str]) -> object:
@@ -244,7 +244,7 @@ def test_backtest_names_the_signal_that_has_no_value_and_watches_the_others(
     kind: str,
     records: Path,
     tmp_path: Path,
-    main: Command,
+    main: Typed,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     file = records / f"no_{signal}.csv"
@@ -263,7 +263,7 @@ def test_backtest_names_the_signal_that_has_no_value_and_watches_the_others(
 
 
 def test_backtest_without_any_output_is_refused_with_the_file(
-    records: Path, main: Command, capsys: pytest.CaptureFixture[str]
+    records: Path, main: Typed, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["backtest", str(records / "only_qc.csv")]) == 3
     told = capsys.readouterr().err
@@ -279,7 +279,7 @@ def test_identify_names_the_signal_that_has_no_value_and_the_file(
     output: str,
     options: list[str],
     records: Path,
-    main: Command,
+    main: Typed,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["identify", str(records / f"{record}.csv"), "--output", output, *options]) == 3
@@ -288,7 +288,7 @@ def test_identify_names_the_signal_that_has_no_value_and_the_file(
 
 
 def test_backtest_reports_why_no_training_was_fit_and_does_not_blame_its_length(
-    main: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    main: Typed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Rows at random times, watched by the identified model, which needs one period."""
     generator = np.random.default_rng(2)
