@@ -56,9 +56,7 @@ class TableOptions:
     ] = None
     sheet: Annotated[
         str | None,
-        Option(
-            hidden=True, rich_help_panel="file", help="The sheet of a workbook, by name or number [the first table]."
-        ),
+        fold(FILE, help="The sheet of a workbook, by name or number [the first table]."),
     ] = None
     dates: Annotated[
         str | None, fold(FILE, help="Order in dates such as 03/04/2026, month-first or day-first [by all rows].")
