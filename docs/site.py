@@ -133,30 +133,41 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
 def command_reference() -> str:
     """Reference of the command line: each command with its help, arguments and options."""
     from reactorwatch.cli.main import app
+    from reactorwatch.cli.option_groups import GROUPS
 
     root = typer.main.get_command(app)
     parts = ["# Commands", "", "Generated from the program. `reactorwatch COMMAND --help` prints the same."]
-    _describe_commands(root, "reactorwatch", parts)
+    folded: dict[str, dict[str, str]] = {group: {} for group in GROUPS}
+    _describe_commands(root, "reactorwatch", parts, folded)
+    for group, options in folded.items():
+        parts += ["", f"## {GROUPS[group]}", "", f"Options of the commands that have `--help-{group}`.", ""]
+        parts += ["| option | meaning |", "|---|---|", *options.values()]
     return "\n".join(parts) + "\n"
 
 
-def _describe_commands(command: Any, name: str, parts: list[str]) -> None:
+def _describe_commands(command: Any, name: str, parts: list[str], folded: dict[str, dict[str, str]]) -> None:
     if hasattr(command, "commands"):
         for word, inner in command.commands.items():
-            _describe_commands(inner, f"{name} {word}", parts)
+            if not inner.hidden:
+                _describe_commands(inner, f"{name} {word}", parts, folded)
         return
     context = command.make_context(name, [], resilient_parsing=True)
     usage = " ".join(command.collect_usage_pieces(context))
     parts += ["", f"## {name.removeprefix('reactorwatch ')}", "", inspect.cleandoc(command.help or ""), ""]
     parts += ["```text", f"{name} {usage}".strip(), "```", "", "| option | meaning |", "|---|---|"]
     for item in command.params:
-        if getattr(item, "hidden", False):
+        group = folded.get(getattr(item, "rich_help_panel", None) or "")
+        if group is None and getattr(item, "hidden", False):
             continue
         words = item.opts if item.param_type_name == "option" else [str(item.name).upper()]
         names = ", ".join(f"`{word}`" for word in words)
         default = _default(item)
         text = " ".join((getattr(item, "help", None) or "").split()).replace("|", "\\|").replace("<", "&lt;")
-        parts.append(f"| {names} | {text}{default} |")
+        row = f"| {names} | {text}{default} |"
+        if group is None:
+            parts.append(row)
+        else:
+            group.setdefault(names, row)
 
 
 def _default(item: Any) -> str:

@@ -65,7 +65,6 @@ PERSONAL_NAME = re.compile(
 
 EXCEPTIONS = {
     "reactorwatch/api/diagnosis.py::DiagnosisResult.extended: participle": "a public name",
-    "reactorwatch/cli/alarm.py::By: people, who": "an operator is a person",
 }
 """Entries that stay, each with its reason."""
 

@@ -33,8 +33,8 @@ def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
 def _reproduce(asked: argparse.Namespace) -> int:
     from benchmarks.study_figures.reproduce import check_out, reproduce
     from reactorwatch.api.files import record
+    from reactorwatch.cli.display import print_report
     from reactorwatch.cli.options import check_recording
-    from reactorwatch.cli.printing import print_text
 
     if asked.seed < 0:
         raise InputError(f"--seed: must be at least 0, got {asked.seed}")
@@ -44,7 +44,7 @@ def _reproduce(asked: argparse.Namespace) -> int:
     measured = None if asked.record is None else record(check_recording(asked.record))
     if measured is not None and measured.runs is not None:
         raise InputError(f"--record {asked.record}: must be one run, {measured.describe_runs()}; cut one run out of it")
-    print_text(reproduce(asked.out, asked.seed, asked.only, measured, data=asked.data, processes=asked.jobs))
+    print_report(reproduce(asked.out, asked.seed, asked.only, measured, data=asked.data, processes=asked.jobs))
     return 0
 
 

@@ -7,7 +7,7 @@ little to be judged, with an exit code of 3 if no other was judged. This process
 import csv
 import glob
 import io
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,11 +17,12 @@ import msgspec
 import typer
 
 from reactorwatch.api.files import expand_folder
-from reactorwatch.cli.display import format_rows, print_report
-from reactorwatch.cli.printing import json_line, print_lines
-from reactorwatch.cli.progress import bar, task
+from reactorwatch.arrays import Array
+from reactorwatch.cli.display import bar, format_rows, json_line, print_lines, print_report, task
 from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError, UnfitRecordError
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import list_files, quote_formula
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.write import atomic_write, fill_folder
@@ -29,7 +30,6 @@ from reactorwatch.runtime.executors import choose_executor
 from reactorwatch.runtime.jobs import Failed, in_job_order
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Options = TypeVar("Options", bound="FileOptions")
@@ -39,17 +39,9 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class FileOptions:
-    """Options of a command, the same for all files.
+    """Options of a command, the same for all files."""
 
-    Attributes:
-        plant: plant in recordings; None: the only one.
-        columns: names of columns by signal.
-        process: the process; the default: as recorded, or as the settings of the command say.
-        stated: statements about the form of a table.
-        as_json: format the results as JSON.
-    """
-
-    plant: str | None = None
+    plant: str | None = None  # in recordings; None: the only one
     columns: dict[str, str] = field(default_factory=dict)
     process: ProcessChoice = DEFAULT_CHOICE
     stated: FileFormat = GUESS
@@ -57,70 +49,42 @@ class FileOptions:
 
 
 class Job(NamedTuple, Generic[Options]):
-    """A file and what is done with it.
+    """A file and what is done with it."""
 
-    Attributes:
-        file: the file as named.
-        at: path of the file for the worker.
-        asked: options of the command.
-        folder: folder for what is written about the file; None: nothing is.
-    """
-
-    file: Path
-    at: Path
+    file: Path  # as named
+    at: Path  # for the worker
     asked: Options
-    folder: Path | None = None
+    folder: Path | None = None  # for what is written about the file
 
 
 @dataclass(frozen=True)
 class JobResult:
-    """Result of a file.
-
-    Attributes:
-        text: output.
-        row: row of the summary.
-        remark: remark on the file for standard error; empty: none.
-        not_written: error of writing the result's files; empty: none.
-        not_watched: reason why no row could be judged; empty: one was.
-        extra: what else the command needs of the file.
-    """
+    """Result of a file."""
 
     text: str
     row: Row
-    remark: str = ""
-    not_written: str = ""
-    not_watched: str = ""
-    extra: Any = None
+    remark: str = ""  # for standard error
+    not_written: str = ""  # why the files of the result are not
+    not_watched: str = ""  # why no row could be judged
+    extra: Any = None  # what else the command needs
 
 
 @dataclass(frozen=True)
 class JobKind(Generic[Options]):
     """A kind of job.
 
-    Attributes:
-        doing: name of the work, for the progress display.
-        work: runs a job.
-        columns: names of a row's results, between `watched` and `error`; null for a file that could not be used.
-            `watched` is false for one that holds too little, and null for one that cannot be read.
-        summary: formats rows as a table.
+    The columns are the names of a row's results, between `watched` and `error`. `watched` is false for a file that
+    holds too little, and null for one that cannot be read.
     """
 
-    doing: str
+    doing: str  # for the progress display
     work: Callable[[Job[Options]], JobResult]
     columns: tuple[str, ...]
     summary: Callable[[Sequence[Row]], str]
 
 
 def expand_files(names: Sequence[Path]) -> list[Path]:
-    """Expand folders and patterns to files, in the order given; files of one are sorted.
-
-    Args:
-        names: names of files, folders (see `expand_folder`), or patterns such as `runs/*.csv` and `runs/**/*.mcap`.
-            Names of files are not checked.
-
-    Raises:
-        InputError: a pattern has no match, or a folder holds no records and recordings.
-    """
+    """Expand folders and patterns to files, in the order given; files of one are sorted."""
     files: list[Path] = []
     for name in names:
         if glob.has_magic(str(name)) and not name.exists():
@@ -142,14 +106,7 @@ def _expand_match(folder: Path) -> list[Path]:
 def make_jobs(
     files: Sequence[Path], asked: Options, folders: Sequence[Path | None] | None = None, *, elsewhere: bool
 ) -> list[Job[Options]]:
-    """Make a job for each file.
-
-    Args:
-        files: the files.
-        asked: options of the command.
-        folders: a folder for each file; None: there are none.
-        elsewhere: use absolute paths, for workers with another working folder.
-    """
+    """Make a job for each file."""
     folders = [None] * len(files) if folders is None else folders
     if not elsewhere:
         return [Job(file, file, asked, folder) for file, folder in zip(files, folders, strict=True)]
@@ -169,21 +126,7 @@ def run_jobs(
     scheduler: str | None,
     on_end: Callable[[list[Any]], None] | None = None,
 ) -> None:
-    """Run the jobs and print the result of each file in their order, and a summary of several.
-
-    Args:
-        kind: kind of the jobs.
-        jobs: one for each file; as JSON, each result is an object on a line, and there is no summary.
-        out: folder for the summary of several files; None: no folder.
-        processes: number of processes; None: one a core.
-        scheduler: address of a cluster, or None.
-        on_end: called with the `extra` of the files that were watched, in their order; None: not called.
-
-    Raises:
-        InputError: the single file cannot be used, or there are no such workers.
-        typer.Exit: with 2, some of several files could not be used; with 3, none of them could be watched. Each of
-            these has its line.
-    """
+    """Run the jobs and print the result of each file in their order, and a summary of several."""
     file, as_json = jobs[0].file, jobs[0].asked.as_json
     if len(jobs) == 1 and scheduler is None:
         with task(f"{kind.doing} {file.name}"), unfit_lines([file], as_json=as_json):
@@ -252,19 +195,6 @@ def results_in_order(
 
     Left to the garbage collection, the work would be ended while nothing handles the interrupt, which would be raised
     again in the midst of it.
-
-    Args:
-        work: a plain function.
-        jobs: arguments of the calls.
-        doing: name of the work, for the bar.
-        processes: number of processes; None: one a core.
-        scheduler: address of a cluster, or None.
-
-    Yields:
-        The results in the order of the jobs.
-
-    Raises:
-        InputError: there are no such workers.
     """
     executor = choose_executor(processes, scheduler)
     with bar(doing, len(jobs)) as advance, closing(executor.map_unordered(work, jobs)) as outcomes:
@@ -298,11 +228,7 @@ def _count_failed(rows: Sequence[Row]) -> int:
 
 
 def write_summary(folder: Path, rows: Sequence[Row]) -> None:
-    """Write `summary.json` and `summary.csv`.
-
-    Raises:
-        InputError: the folder cannot be made or written to.
-    """
+    """Write `summary.json` and `summary.csv`."""
     unwatched = sum(row["watched"] is False for row in rows)
     summary = {"files": len(rows), "failed": _count_failed(rows), "not_watched": unwatched, "results": list(rows)}
     table = io.StringIO()
@@ -323,3 +249,11 @@ def as_table(rows: Sequence[dict[str, str]]) -> str:
     """Format rows as a table; empty columns are left out."""
     names = [name for name in rows[0] if any(row[name] for row in rows)]
     return format_rows([names, *([row[name] for name in names] for row in rows)])
+
+
+def unit_remark(model: ProcessModel, columns: Mapping[str, Array], time_min: Array) -> str:
+    """Remark on the first unit that is not the model's; empty if there is none."""
+    wrong = find_wrong_unit(model, columns, time_min)
+    return (
+        "" if wrong is None else f"{wrong.text}. The plant's equations cannot be its reference; an identified model can"
+    )

@@ -1,47 +1,45 @@
-"""`causes`: the causes that the sensors and an excitation of a process distinguish."""
+"""`causes`: the causes that sensors distinguish: JSON for programs, a matrix for people."""
 
-from pathlib import Path
-from typing import Annotated
+from reactorwatch.cli.batch import as_table
+from reactorwatch.cli.display import json_line
+from reactorwatch.diagnosis.identifiability import TIMES, Identifiability
 
-from typer import Option
-
-from reactorwatch.cli.option_groups import TableOptions
-from reactorwatch.cli.options import Columns, Json, Plant, Process, check_recording, parse_columns
-from reactorwatch.cli.printing import print_text
+ALIKE, APART = "=", "."
+"""Signs of the matrix."""
 
 
-def causes(
-    *,
-    process: Process = None,
-    record: Annotated[
-        Path | None, Option(help="A record whose inputs, times and noise count [a usual excitation].")
-    ] = None,
-    plant: Plant = None,
-    column: Columns = None,
-    as_json: Json = False,
-    table: TableOptions,
-) -> None:
-    """Show which causes the sensors distinguish, and from which size on each is seen."""
-    from plant_node.config import resolutions
-    from reactorwatch.api.files import record_of_process
-    from reactorwatch.cli.causes_report import as_json_text, as_matrix
-    from reactorwatch.cli.progress import task
-    from reactorwatch.description.choice import ProcessChoice
-    from reactorwatch.diagnosis.identifiability import identifiability
-    from reactorwatch.diagnosis.record_checks import make_run
-    from reactorwatch.diagnosis.usual_excitation import excite
+def as_json_text(found: Identifiability, process: str, rows: int) -> str:
+    """Format as a JSON object."""
+    seen = [item for item in found.causes if item.is_visible]
+    report = {
+        "process": process,
+        "rows": rows,
+        "causes": [item.effect.name for item in found.causes],
+        "smallest_size": {item.effect.name: {"value": item.smallest, "unit": item.effect.unit} for item in seen},
+        "alike": [list(group) for group in found.alike],
+        "invisible": [item.effect.name for item in found.causes if not item.is_visible],
+    }
+    return json_line(report)
 
-    choice = ProcessChoice(process)
-    if record is None:
-        described = choice.load()
-        model = described.require_model()
-        measured = excite(model, resolutions(described))
-    else:
-        path, columns = check_recording(record), parse_columns(column)
-        measured, described = record_of_process(path, plant, columns, choice, table.stated)
-        model = described.require_model()
-    run = make_run(measured, model)
-    with task(f"comparing the causes of {described.name}"):
-        found = identifiability(model, described.causes, run)
-    show = as_json_text if as_json else as_matrix
-    print_text(show(found, described.name, run.time_min.size))
+
+def as_matrix(found: Identifiability, process: str, rows: int) -> str:
+    """Format as a matrix: a row for each cause, with a sign for each other one of its number."""
+    group_of = {name: group for group in found.alike for name in group}
+    names = [item.effect.name for item in found.causes]
+    lines = []
+    for number, item in enumerate(found.causes, start=1):
+        name, unit = item.effect.name, "" if item.effect.unit == "1" else f" {item.effect.unit}"
+        alike = group_of.get(name, ())
+        signs = "".join(
+            str(number % 10) if other == name else ALIKE if other in alike else APART if item.is_visible else " "
+            for other in names
+        )
+        size = f"{item.smallest:.2g}{unit}" if item.is_visible else "never"
+        lines.append({"no.": str(number), "cause": name, "seen from": size, "distinct": signs})
+    text = [
+        f"{process}: {len(names)} causes over {rows} rows; a column for each, in the same order",
+        as_table(lines),
+        f"{ALIKE} looks the same at {TIMES:g} times the smallest size, {APART} does not",
+    ]
+    text += [f"alike: {', '.join(group)}" for group in found.alike]
+    return "\n".join(text)

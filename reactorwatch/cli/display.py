@@ -1,48 +1,41 @@
-"""Readable output: aligned rows, and colours by meaning on a terminal.
+"""Terminal output: lines, aligned rows with styles by meaning, reports wrapped at words, and progress.
 
-On a terminal a row of cells takes one line, whose last cell is cut to fit; a file or a pipe gets the same text in full,
-without colours. Colours: red for what is wrong now, yellow for what needs attention, green for what is right, cyan for
-names of causes. `NO_COLOR` is respected.
+On a terminal a row takes one line, whose last cell is cut to fit; a file or a pipe gets the same text in full, without
+colours. `NO_COLOR` is respected. Progress is shown on a terminal only, on standard error, above which output appears.
 """
 
+import contextlib
+import os
 import re
+import shutil
 import sys
-from collections.abc import Iterable, Sequence
-from io import StringIO
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from textwrap import wrap
 from typing import NamedTuple
 
 import typer
 
-from reactorwatch.terminal import printable
+from reactorwatch.terminal import printable, printable_lines
 
-WRONG, ATTENTION, RIGHT, CAUSE, FAINT, STRONG = "bold red", "yellow", "green", "cyan", "dim", "bold"
-"""Styles by meaning."""
+WRONG, ATTENTION, RIGHT, CAUSE, FAINT, STRONG = "1;31", "33", "32", "36", "2", "1"
+"""Styles by meaning, as parameters of a terminal's escape sequence: bold red for what is wrong now, yellow for what
+needs attention, green for what is right, cyan for names of causes, dim, bold."""
 
 GAP = 2
 """Blanks between columns."""
 
-
+_LEAST_WIDTH = 20
+"""Narrower than any word of a report but a path."""
 _NAME = re.compile(r"\s+\S(?:\S| (?! ))*\s{2,}(?=\S)| *[A-Za-z][\w ]{1,20}: |- ")
+"""The name before a value in a report: the further lines of the value start below it."""
 _COLUMNS = re.compile(r"\S {3,}\S")
-_MEANINGS = (
-    (r"^(?:The simulation is right|no alarms|no gaps|nothing was damaged)(?s:.*)$", RIGHT),
-    (r"the same alarms, value for value", RIGHT),
-    (r"^(?:Detected|Raised|The simulation is wrong)\b(?s:.*)$", STRONG),
-    (r"\((?:critical|high)\)|OTHER ALARMS|\bfailed\b", WRONG),
-    (r"\(medium\)|^\s*note: |is not watched|^(?:not trustworthy yet|nothing was watched): ", ATTENTION),
-    (r"(?<=cause named: )[^,\n]+|(?<=suspect: )[^\n]+", CAUSE),
-)
-"""Styles of what a report states, by pattern."""
+"""Blanks between the columns of a table's row, which is cut and not wrapped."""
+
+Advance = Callable[[float, str], None]
 
 
 class Cell(NamedTuple):
-    """A text with a style.
-
-    Attributes:
-        text: one line of text.
-        style: one of the styles of this module; empty: none.
-    """
+    """One line of text with a style; empty: none."""
 
     text: str
     style: str = ""
@@ -51,10 +44,29 @@ class Cell(NamedTuple):
 Row = Sequence[Cell | str]
 
 
+class Screen(NamedTuple):
+    """The terminal that the output goes to: its width, or None for a file or a pipe; and True if it shows colours."""
+
+    width: int | None = None
+    colour: bool = False
+
+
+def screen() -> Screen:
+    """The terminal of standard output."""
+    if not sys.stdout.isatty():
+        return Screen()
+    has_colour = not os.environ.get("NO_COLOR") and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
+    return Screen(shutil.get_terminal_size().columns, has_colour)
+
+
+def print_lines(*lines: str, err: bool = False) -> None:
+    """Print lines, on standard error if `err`, without line breaks and control characters in them."""
+    typer.echo(printable_lines(lines), err=err)
+
+
 def print_rows(rows: Iterable[Row], indent: int = 0) -> None:
-    """Print rows in aligned columns, one line each; see `format_rows`."""
-    text = format_rows(list(rows), indent, width=screen_width(), colour=has_colour())
-    if text:
+    """Print rows in aligned columns, one line each."""
+    if text := format_rows(list(rows), indent, screen()):
         typer.echo(text)
 
 
@@ -65,101 +77,64 @@ def print_screen_text(text: str) -> None:
 
 def print_headline(text: str, style: str = STRONG) -> None:
     """Print a sentence, wrapped at words on a terminal."""
-    width = screen_width()
-    if width is None:
-        typer.echo(printable(text))
-        return
-    from rich.text import Text
-
-    typer.echo(_render([Text(printable(text), style)], width, colour=has_colour()))
+    width, colour = screen()
+    lines = wrap_line(printable(text), width)
+    typer.echo("\n".join(_paint(line, style) if colour else line for line in lines))
 
 
 def print_report(text: str, *, as_json: bool = False) -> None:
-    """Print a text of several lines: wrapped and coloured on a terminal, elsewhere as it is.
+    """Print sentences, `  name   value` lines and tables, wrapped on a terminal; JSON stays as it is everywhere."""
+    width = None if as_json else screen().width
+    typer.echo("\n".join(row for line in text.split("\n") for row in wrap_line(printable(line), width)))
 
-    Args:
-        text: sentences, `  name   value` lines and tables.
-        as_json: it is for machines, and stays as it is everywhere.
+
+def json_line(value: object) -> str:
+    """Format as JSON on one line."""
+    import msgspec
+
+    return msgspec.json.encode(value).decode()
+
+
+def wrap_line(line: str, width: int | None) -> list[str]:
+    """Wrap a line of a report: a value below itself, or below its name where nothing would fit beside that.
+
+    A line with more columns is a row of a table, and is cut.
     """
-    width = None if as_json else screen_width()
-    lines = [printable(line) for line in text.split("\n")]
-    typer.echo("\n".join(lines) if width is None else format_report(lines, width, colour=has_colour()))
-
-
-def format_report(lines: Sequence[str], width: int, *, colour: bool) -> str:
-    """Format the lines of a report for a terminal.
-
-    Sentences are wrapped at words, and the value of a `  name   value` line below itself. A line with more columns is a
-    row of a table, and is cut.
-
-    Args:
-        lines: the lines.
-        width: width of the terminal.
-        colour: add escape sequences.
-    """
-    from rich.text import Text
-
-    shown = []
-    for line in lines:
-        prefix, value = _split_name(line)
-        rows = [_cut(line, width)] if _COLUMNS.search(value) else _wrap(line, len(prefix), width)
-        text = Text("\n".join(rows))
-        text.stylize(FAINT, 0, len(prefix))
-        for meaning, style in _MEANINGS:
-            text.highlight_regex(meaning, style)
-        shown.append(text)
-    return _render(shown, 10_000, colour=colour)
-
-
-def _split_name(line: str) -> tuple[str, str]:
+    if width is None:
+        return [line]
     match = _NAME.match(line)
-    prefix = match[0] if match is not None else ""
-    return prefix, line[len(prefix) :]
-
-
-def _wrap(line: str, indent: int, width: int) -> list[str]:
-    """Wrap a line at words; where nothing would fit beside its name, below it."""
+    indent = len(match[0]) if match is not None else 0
+    if _COLUMNS.search(line[indent:]):
+        return [_cut(line, width)]
     blanks = indent if indent < width // 2 else len(line) - len(line.lstrip()) + GAP
-    wrapped = wrap(
+    rows = wrap(
         line,
-        max(width, 20),
+        max(width, _LEAST_WIDTH),
         subsequent_indent=" " * blanks,
         break_long_words=False,
         break_on_hyphens=False,
-        drop_whitespace=True,
         replace_whitespace=False,
     )
-    return wrapped or [""]
+    return rows or [""]
 
 
-def format_rows(rows: Sequence[Row], indent: int = 0, *, width: int | None = None, colour: bool = False) -> str:
-    """Format rows in aligned columns, one line each.
-
-    Args:
-        rows: cells of each row; a row may have fewer cells than others.
-        indent: blanks before each row.
-        width: width to which lines are cut; None: they are not cut.
-        colour: add the escape sequences of the styles.
-    """
+def format_rows(rows: Sequence[Row], indent: int = 0, to: Screen = Screen()) -> str:  # noqa: B008 (it is frozen)
+    """Format rows in aligned columns, one line each; a row may have fewer cells than others."""
     cells = [[_cell(item) for item in row] for row in rows]
     columns = max(map(len, cells), default=0)
     widths = [max(_length(row[i].text) for row in cells if i < len(row)) for i in range(columns)]
     lines = []
     for row in cells:
-        parts, used = [Cell(" " * indent)], indent
+        line, used = " " * indent, indent
         for index, (text, style) in enumerate(row):
-            shown = _cut(text, None if width is None else width - used)
+            shown = _cut(text, None if to.width is None else to.width - used)
             blanks = 0 if index == len(row) - 1 else widths[index] - _length(shown) + GAP
-            if width is not None:
-                blanks = min(blanks, width - used - _length(shown))
-            parts += [Cell(shown, style), Cell(" " * blanks)]
+            if to.width is not None:
+                blanks = min(blanks, to.width - used - _length(shown))
+            line += (_paint(shown, style) if to.colour else shown) + " " * blanks
             used += _length(shown) + blanks
-        lines.append(parts)
-    if not colour:
-        return "\n".join("".join(text for text, _ in parts).rstrip() for parts in lines)
-    from rich.text import Text
-
-    return _render([Text.assemble(*((text, style) for text, style in parts)) for parts in lines], 10_000, colour=True)
+        lines.append(line.rstrip())
+    return "\n".join(lines)
 
 
 def format_age(seconds: float) -> str:
@@ -172,6 +147,10 @@ def format_age(seconds: float) -> str:
         if seconds >= size:
             return f"{seconds / size:.{decimals}f} {unit}"
     return f"{max(seconds, 0.0):.0f} s"
+
+
+def _paint(text: str, style: str) -> str:
+    return f"\x1b[{style}m{text}\x1b[0m" if style and text else text
 
 
 def _cell(item: Cell | str) -> Cell:
@@ -196,37 +175,36 @@ def _cut(text: str, room: int | None) -> str:
     return f"{text}…" if room > 0 else ""
 
 
-def screen_width() -> int | None:
-    """Width of the terminal; None: the output goes elsewhere."""
-    if not sys.stdout.isatty():
-        return None
+def _escape_markup(text: str) -> str:
+    """Escape a text, which may hold names of files, for the terminal and for Rich."""
+    from rich.markup import escape
+
+    return escape(printable(text))
+
+
+@contextlib.contextmanager
+def bar(text: str, total: float | None) -> Iterator[Advance]:
+    """Show a bar, or a spinner without a total, while the context lasts; yields a function of progress and text."""
+    if not sys.stderr.isatty():
+        yield lambda _completed, _now: None
+        return
     from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    return Console().width
-
-
-def has_colour() -> bool:
-    """True if the output goes to a terminal that shows colours."""
-    if not sys.stdout.isatty():
-        return False
-    from rich.console import Console
-
-    return Console().color_system is not None
-
-
-def _render(texts: Sequence[object], width: int, *, colour: bool) -> str:
-    """Lines of rich texts, with escape sequences where colour is wanted."""
-    from rich.console import Console
-
-    file = StringIO()
-    console = Console(
-        file=file,
-        width=width,
-        color_system="standard" if colour else None,
-        force_terminal=colour,
-        no_color=not colour,
-        highlight=False,
+    label = TextColumn("{task.description}")
+    columns = (
+        (SpinnerColumn(), label, TimeElapsedColumn()) if total is None else (label, BarColumn(), TimeRemainingColumn())
     )
-    for text in texts:
-        console.print(text, soft_wrap=width >= 10_000)
-    return file.getvalue().rstrip("\n")
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
+        number = progress.add_task(_escape_markup(text), total=total)
+
+        def advance(completed: float, now: str) -> None:
+            progress.update(number, completed=completed, description=_escape_markup(now))
+
+        yield advance
+
+
+def task(text: str) -> contextlib.AbstractContextManager[Advance]:
+    """Show a spinner while the context lasts."""
+    return bar(text, None)

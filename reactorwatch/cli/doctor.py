@@ -28,42 +28,26 @@ from reactorwatch.runtime.security.certificates import read_certificate, read_co
 from reactorwatch.version import version
 
 RENEW_DAYS = 30
+"""As `certify --renew 30` in the cure: a month to plan it."""
 MAX_OFFSET_S = 1.0
+"""Far above what NTP leaves, and below a period of samples."""
 REPEAT_S = 0.2
+"""A subscription takes effect within it on a network of one site."""
 NODES = ("plant", "monitor", "recorder")
-MB = 1_000_000
 
 
 class Finding(NamedTuple):
-    """Result of one check.
-
-    Attributes:
-        check: name of the check.
-        found: the result.
-        cure: the action to take; empty if nothing is wrong.
-    """
+    """Result of one check."""
 
     check: str
     found: str
-    cure: str = ""
+    cure: str = ""  # empty if nothing is wrong
 
 
 def run_checks(
     config: BusConfig, plant: str, folder: Path, room_mb: float, timeout_s: float, now: datetime
 ) -> Iterator[Finding]:
-    """Run the checks of a deployment; those that need a router are skipped without one.
-
-    Args:
-        config: connection to the bus.
-        plant: name of the plant.
-        folder: folder of the recordings.
-        room_mb: space that recordings need there.
-        timeout_s: seconds to wait for nodes.
-        now: the time.
-
-    Raises:
-        InputError: a certificate or key cannot be read.
-    """
+    """Run the checks of a deployment; those that need a router are skipped without one."""
     yield from _check_certificate(config, plant, now)
     yield _check_disk(folder, room_mb)
     try:
@@ -129,7 +113,7 @@ def _check_certificate(config: BusConfig, plant: str, now: datetime) -> Iterator
 def _check_disk(folder: Path, room_mb: float) -> Finding:
     while not folder.exists() and folder != folder.parent:  # it is made when needed
         folder = folder.parent
-    free_mb = shutil.disk_usage(folder).free / MB
+    free_mb = shutil.disk_usage(folder).free / 1e6
     found = f"{free_mb:,.0f} MB free at {folder.resolve()}"
     if free_mb < room_mb:
         return Finding("disk", found, f"make room for {room_mb:,.0f} MB, or set keep_mb in [recorder]")

@@ -27,12 +27,12 @@ from reactorwatch.version import version
 from recorder.tools.player import samples_of
 
 log = structlog.get_logger()
-
 ROWS = 600
 """Rows of the record: enough for a diagnosis, and for a fault after the monitor's training."""
 
 FAULT = "coolant_flow:step:-0.1@30min"
 TRAINING_MIN = 15.0
+"""Half of the time before the fault."""
 REFERENCES: tuple[Literal["auto", "black-box", "arx"], ...] = ("auto", "black-box", "arx")
 
 

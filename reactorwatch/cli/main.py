@@ -5,33 +5,22 @@ Any other error is a fault of this software and is reported as in every process 
 Only the imports for `--help` are here; each command imports its own when it is called.
 """
 
+import atexit
 import gc
 import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn, cast
+from types import FrameType
+from typing import Any, NoReturn, cast
 
 import typer
+from typer.core import TyperGroup
 
-from reactorwatch.cli import (
-    alarm,
-    baseline,
-    causes,
-    charts,
-    examples,
-    files,
-    models,
-    nodes,
-    recordings,
-    runs,
-    site,
-    studies,
-    view,
-)
-from reactorwatch.cli.interrupt import clear_interrupt, raise_until_handled
+from reactorwatch.cli import alarm, my_data, my_plant, recordings, site, studies
+from reactorwatch.cli.display import print_lines
 from reactorwatch.cli.option_groups import Command, add_commands
-from reactorwatch.cli.printing import print_lines
 from reactorwatch.runtime.crash import INTERRUPTED, UNUSABLE, guard, print_error
 from reactorwatch.version import this_build
 
@@ -41,11 +30,58 @@ UsageProblem: type[typer.BadParameter] = next(
 )
 
 NAME = "reactorwatch"
-
 LIMITS_FILE = "REACTORWATCH_LIMITS"
 """Environment variable with the path of a settings file whose limits hold, for commands that take no settings."""
 
+COMMANDS: dict[str, dict[str, Command | typer.Typer]] = {
+    "My data": {
+        "info": my_data.info,
+        "backtest": my_data.backtest,
+        "identify": my_data.identify,
+        "diagnose": my_data.diagnose,
+        "causes": my_data.causes,
+        "simulate": my_data.simulate,
+        "example": my_data.example,
+    },
+    "My plant": {
+        "up": my_plant.up,
+        "plant": my_plant.plant,
+        "monitor": my_plant.monitor,
+        "status": my_plant.status,
+        "alarm": alarm.alarms,
+        "baseline": alarm.baselines,
+        "view": my_plant.view,
+    },
+    "Recordings": {
+        "record": recordings.record,
+        "replay": recordings.replay,
+        "import": recordings.import_csv,
+        "export": recordings.export_csv,
+        "dashboard": recordings.dashboard,
+        "cut": recordings.cut,
+        "recover": recordings.recover,
+    },
+    "Site": {"router": site.router, "certify": site.certify, "doctor": site.doctor},
+    "Studies": {"linearise": studies.linearise, "charts": studies.charts, "demo": studies.demo},
+}
+"""Commands by person, as the help lists them."""
+
+
+class _Root(TyperGroup):
+    """The command, whose help lists its commands by person."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a section for each person."""
+        width = max(len(name) for group in COMMANDS.values() for name in group)
+        for person, group in COMMANDS.items():
+            with formatter.section(person):
+                limit = formatter.width - 6 - width
+                texts = {name: self.commands[name].get_short_help_str(limit) for name in group}
+                formatter.write_dl([(f"{name:{width}}", text) for name, text in texts.items()])
+
+
 app = typer.Typer(
+    cls=_Root,
     name=NAME,
     help="Watches a process plant as it runs, and explains it when it misbehaves.",
     no_args_is_help=True,
@@ -53,40 +89,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-COMMANDS: dict[str, Command] = {
-    "up": runs.up,
-    "demo": runs.demo,
-    "plant": nodes.plant,
-    "monitor": nodes.monitor,
-    "record": nodes.record,
-    "replay": nodes.replay,
-    "example": examples.example,
-    "view": view.view,
-    "certify": site.certify,
-    "router": site.router,
-    "doctor": site.doctor,
-    "status": site.status,
-    "ack": (alarm.acknowledge, "Acknowledge alarms: short for `alarm acknowledge`."),
-    "dashboard": files.dashboard,
-    "import": files.import_csv,
-    "export": files.export_csv,
-    "recover": recordings.recover,
-    "info": recordings.info,
-    "cut": recordings.cut,
-    "simulate": studies.simulate,
-    "backtest": studies.backtest,
-    "diagnose": studies.diagnose,
-    "causes": causes.causes,
-    "identify": models.identify,
-    "linearise": models.linearise,
-}
-add_commands(app, COMMANDS)
-for name, group, text in (
-    ("alarm", alarm.alarms, "List, acknowledge, shelve, suppress or comment the alarms of a plant."),
-    ("baseline", baseline.baselines, "Accept, relearn or restore the baseline of a plant."),
-    ("charts", charts.charts, "Control charts: how long they run, and which is fastest."),
-):
-    app.add_typer(group, name=name, help=text)
+for _group in COMMANDS.values():
+    for _name, _command in _group.items():
+        if isinstance(_command, typer.Typer):
+            app.add_typer(_command, name=_name)
+        else:
+            add_commands(app, {_name: _command})
+add_commands(app, {"ack": alarm.acknowledge}, hidden=True)
 
 
 def _print_version(wanted: bool) -> None:
@@ -140,3 +149,44 @@ def _run() -> int:
         print_error(NAME, error.format_message())
         return UNUSABLE
     return code if isinstance(code, int) else 0
+
+
+AGAIN_S = 0.2  # a compiler drops an interrupt for less
+_BINDING = "llvmlite.binding"
+"""Package whose code calls LLVM; a callback of LLVM runs within it."""
+
+
+def raise_until_handled() -> None:
+    """Let SIGINT raise KeyboardInterrupt in the main thread, repeatedly until `clear_interrupt` is called."""
+    signal.signal(signal.SIGINT, _interrupt)
+    atexit.register(clear_interrupt)
+
+
+def clear_interrupt() -> None:
+    """Stop raising for the interrupts so far; an alarm that comes yet is ignored, also while the interpreter ends."""
+    signal.signal(signal.SIGALRM, signal.SIG_IGN)
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    if number == signal.SIGINT:
+        signal.signal(signal.SIGALRM, _interrupt)
+    elif signal.getsignal(signal.SIGALRM) is signal.SIG_IGN:  # it was on its way when the interrupts were cleared
+        return
+    signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
+    if _is_handled(sys.exception()):
+        return
+    while frame is not None:
+        if frame.f_globals.get("__name__", "").startswith(_BINDING):
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
+def _is_handled(error: BaseException | None) -> bool:
+    """True while an interrupt is handled, also by closing a generator, whose GeneratorExit has it as context."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__context__
+    return False

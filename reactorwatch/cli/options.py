@@ -1,14 +1,10 @@
-"""Options that several commands share, alone or as groups that travel together, and parsers of their values.
-
-A group is a dataclass whose fields are the options; `reactorwatch.cli.option_groups` makes them options of a command.
-"""
+"""Single options that several commands share, and parsers of their values; `option_groups.py` has the groups."""
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 import typer
 from typer import Argument, Option
@@ -16,46 +12,29 @@ from typer import Argument, Option
 from reactorwatch.errors import InputError
 from reactorwatch.records.write import check_output_file
 
-if TYPE_CHECKING:
-    from reactorwatch.description.choice import ProcessChoice
-
 Value = TypeVar("Value")
-
 MAX_WAIT_S = 86_400.0
 """Largest timeout: the system's clocks take no infinite times."""
 
-TIMEOUT_S = 5.0
-"""Default time to wait for the reply to a command."""
-
-Settings = Annotated[Path | None, Option("--config", help="Settings file (TOML), a table for each node.")]
-Plant = Annotated[str | None, Option("--plant", help="Name of the plant [cstr].")]
 Json = Annotated[bool, Option("--json", help="One JSON object, for machines.")]
-Columns = Annotated[
-    list[str] | None, Option(help="A column of another name, as signal=column: --column T=reactor_temp.")
-]
-Process = Annotated[
-    str | None,
-    Option(
-        "--process", "--model", help="A process: a name in the catalogue, or a .toml, .py or extended.json file [cstr]."
-    ),
-]
-Inputs = Annotated[
-    list[str] | None,
-    Option("--input", help="A column that is an input, without a process (repeatable, or with commas)."),
-]
+
 Reference = Annotated[
     str | None, Option(help="Model that predicts each row: auto, equations, black-box or arx [auto].")
 ]
+
 Force = Annotated[
     bool, Option("--force", help="Replace a file that is there and is of another kind than its name says.")
 ]
+
 Diagnose = Annotated[Path | None, Option(help="After an alarm, diagnose the recent rows into a folder in this one.")]
+
 Files = Annotated[
     list[Path],
     Argument(
         help="Records (.csv or other tables) or recordings (.mcap), folders of them, or patterns such as 'runs/*.csv'."
     ),
 ]
+
 Recording = Annotated[Path, Argument(help="A recording (.mcap), a folder of them, or a record (.csv).")]
 RecordFile = Annotated[Path, Argument(help="A record (.csv) or recording (.mcap).")]
 Seed = Annotated[int | None, Option(help="Of the input and the noise.")]
@@ -63,89 +42,18 @@ Speed = Annotated[str | None, Option(help="Plant time over wall time: a number, 
 Begin = Annotated[str | None, Option("--from", help="Since the start, such as 10min [the start].")]
 End = Annotated[str | None, Option("--to", help="Since the start, such as 20min [the end].")]
 Jobs = Annotated[int | None, Option(help="How many at a time, each in a process [one a core].", min=1)]
+
 Scheduler = Annotated[
     str | None, Option(help="Of a Dask cluster to do it, such as tcp://127.0.0.1:8786 (reactorwatch[cluster]).")
 ]
 
-
-@dataclass(frozen=True)
-class BusOptions:
-    """Settings file and router of a command on the bus."""
-
-    config: Settings = None
-    endpoint: Annotated[str | None, Option(help="Address of the router [tcp/127.0.0.1:7447].")] = None
-
-
-@dataclass(frozen=True)
-class PlantOptions(BusOptions):
-    """Settings file, router and plant of a command on the bus."""
-
-    name: Plant = None
-
-
-@dataclass(frozen=True)
-class ClientOptions(PlantOptions):
-    """Settings file, router, plant and timeout of a command to a node."""
-
-    timeout: Annotated[float, Option(help="Seconds to wait for the monitor.", min=0.1, max=MAX_WAIT_S)] = TIMEOUT_S
-
-
-@dataclass(frozen=True)
-class ProcessOptions:
-    """The process of a record or a plant: as a whole, or by its columns."""
-
-    process: Process = None
-    inputs: Inputs = None
-    outputs: Annotated[
-        list[str] | None, Option("--output", help="A column to watch, without a process (repeatable, or with commas).")
-    ] = None
-
-    def choose(self, modes: list[str] | None = None) -> "ProcessChoice":
-        """Choice of the process.
-
-        Args:
-            modes: columns that say how a process without a description is operated.
-
-        Raises:
-            InputError: as `ProcessChoice`.
-        """
-        from reactorwatch.description.choice import ProcessChoice
-
-        return ProcessChoice(self.process, *(tuple(_split(texts)) for texts in (self.inputs, self.outputs, modes)))
-
-
-@dataclass(frozen=True)
-class TrainingOptions:
-    """Length of a training."""
-
-    training: Annotated[float | None, Option(help="Minutes to learn from [cstr: 100; else see --training-rows].")] = (
-        None
-    )
-    training_rows: Annotated[
-        int | None,
-        Option(help="Rows to learn from, instead of minutes [1000, or a third of a record if that is fewer]."),
-    ] = None
-
-    @property
-    def is_given(self) -> bool:
-        """True if a length is given."""
-        return self.training is not None or self.training_rows is not None
-
-    def flags(self, tables: dict[str, dict[str, Any]]) -> dict[str, float | int | None]:
-        """Settings of the monitor; a length that is given takes the place of one in the tables, which is removed."""
-        flags = {"training_min": self.training, "training_rows": self.training_rows}
-        if self.is_given:
-            for name in flags:
-                tables.get("monitor", {}).pop(name, None)
-        return flags
+Site = Annotated[
+    Path | None, Option(help="Folder that `certify` made: run its router, and each node with its certificate [none].")
+]
 
 
 def check_encodable(text: str | None) -> str | None:
-    """Check that a text can be sent in a message; returns it.
-
-    Raises:
-        BadParameter: the terminal sent bytes that are no UTF-8.
-    """
+    """Check that a text can be sent in a message; returns it."""
     try:
         (text or "").encode()
     except UnicodeEncodeError as error:
@@ -154,11 +62,7 @@ def check_encodable(text: str | None) -> str | None:
 
 
 def parse_columns(pairs: list[str] | None) -> dict[str, str]:
-    """Parse `signal=column` pairs to names of columns by signal.
-
-    Raises:
-        InputError: a text is no such pair.
-    """
+    """Parse `signal=column` pairs to names of columns by signal."""
     names = {}
     for pair in pairs or []:
         signal, equals, column = pair.partition("=")
@@ -168,7 +72,7 @@ def parse_columns(pairs: list[str] | None) -> dict[str, str]:
     return names
 
 
-def _split(texts: Iterable[str] | None) -> list[str]:
+def split_at_commas(texts: Iterable[str] | None) -> list[str]:
     """Split texts at their commas."""
     return [name.strip() for text in texts or () for name in text.split(",")]
 
@@ -179,24 +83,16 @@ def split_names(texts: list[str] | None) -> tuple[str, ...]:
     >>> split_names(["h1,h2", "h3", "h1"])
     ('h1', 'h2', 'h3')
     """
-    return tuple(dict.fromkeys(filter(None, _split(texts))))
+    return tuple(dict.fromkeys(filter(None, split_at_commas(texts))))
 
 
 def parse_tolerances(text: str | None) -> dict[str, float]:
-    """Parse `C=0.002,T=0.5` to tolerances by output.
-
-    Raises:
-        InputError: the text has another form.
-    """
+    """Parse `C=0.002,T=0.5` to tolerances by output."""
     return _parse_values(text, float, "--tolerance must be output=number, such as C=0.002,T=0.5")
 
 
 def parse_limits(text: str | None) -> dict[str, tuple[float, float]]:
-    """Parse `qc=85..115,T=425..455` to the lowest and highest values in an experiment, by signal.
-
-    Raises:
-        InputError: the text has another form.
-    """
+    """Parse `qc=85..115,T=425..455` to the lowest and highest values in an experiment, by signal."""
 
     def ends(value: str) -> tuple[float, float]:
         low, _, high = value.partition("..")
@@ -218,11 +114,7 @@ def _parse_values(text: str | None, parse: Callable[[str], Value], rule: str) ->
 
 
 def parse_pace(text: str | None, option: str) -> float | None:
-    """Parse a speed or a rate: a positive number, or `max` for infinity.
-
-    Raises:
-        InputError: the text is neither.
-    """
+    """Parse a speed or a rate: a positive number, or `max` for infinity."""
     if text is None:
         return None
     if text == "max":
@@ -240,11 +132,7 @@ _SECONDS = {"s": 1, "min": 60, "h": 3600}
 
 
 def parse_span_ns(text: str, option: str) -> int:
-    """Parse a span of time, such as `90s`, `10min`, `1.5h` or `-20min`, to nanoseconds.
-
-    Raises:
-        InputError: the text has another form.
-    """
+    """Parse a span of time, such as `90s`, `10min`, `1.5h` or `-20min`, to nanoseconds."""
     match = re.fullmatch(r"(-?\d+(?:\.\d+)?)(s|min|h)", text)
     if match is None:
         raise InputError(f"{option} must be a number with s, min or h, such as 10min, got {text!r}")
@@ -257,20 +145,12 @@ def parse_span_ns(text: str, option: str) -> int:
 
 
 def check_recording(path: Path) -> Path:
-    """Check that an input file, or a folder of recordings, exists; returns its path.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Check that an input file, or a folder of recordings, exists; returns its path."""
     return path if path.is_dir() else check_input(path)
 
 
 def check_input(path: Path) -> Path:
-    """Check that an input file exists; returns its path.
-
-    Raises:
-        InputError: it does not, or is a folder.
-    """
+    """Check that an input file exists; returns its path."""
     if path.is_dir():
         raise InputError(f"{path}: is a folder, a file was expected")
     if not path.exists():
@@ -279,17 +159,7 @@ def check_input(path: Path) -> Path:
 
 
 def check_output(path: Path, suffix: str | tuple[str, ...], sources: Iterable[Path | None], *, force: bool) -> Path:
-    """Check that an output file may be written and has the right suffix; returns its path.
-
-    Args:
-        path: the file.
-        suffix: the required suffix, or those of which it must have one.
-        sources: see `check_output_file`.
-        force: see `check_output_file`.
-
-    Raises:
-        InputError: as `check_output_file`; or its name has another suffix.
-    """
+    """Check that an output file may be written and has the right suffix; returns its path."""
     check_output_file(path, sources, force=force)
     suffixes = (suffix,) if isinstance(suffix, str) else suffix
     if path.suffix.lower() not in suffixes:

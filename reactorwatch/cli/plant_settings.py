@@ -19,18 +19,12 @@ from recorder.files.recording import Recording
 from recorder.tools.convert import plant_name
 
 Tables = dict[str, dict[str, Any]]
-
 WAIT_FOR = ("monitor", "recorder")
 """Nodes that must be alive before the first sample."""
 
 
 class PlayedRecord(NamedTuple):
-    """A record that is played in place of a simulated plant.
-
-    Attributes:
-        path: a recording or a table.
-        stated: statements about the form of a table.
-    """
+    """A record that is played in place of a simulated plant."""
 
     path: Path
     stated: FileFormat = GUESS
@@ -38,23 +32,14 @@ class PlayedRecord(NamedTuple):
 
 @dataclass(frozen=True)
 class Source:
-    """Source of a run's samples.
+    """Source of a run's samples."""
 
-    Attributes:
-        node: `plant` or `replay`.
-        settings: settings of the node.
-        plant: name of the plant.
-        process: name or file of the process.
-        is_named: True if flags or a recording name the process, False if it is that of the plant's settings.
-        rows: number of rows of a played record, of which a third is the longest training; None: it does not matter.
-    """
-
-    node: str
+    node: str  # `plant` or `replay`
     settings: PlantConfig | ReplayConfig
     plant: str
     process: str
-    is_named: bool
-    rows: int | None = None
+    is_named: bool  # False: the process is that of the plant's settings
+    rows: int | None = None  # of a played record; a third of them is the longest training
 
     @property
     def has_end(self) -> bool:
@@ -73,9 +58,6 @@ class Source:
 
         The monitor of a plant whose settings name an extended model judges by the equations that its own settings name,
         so that the deviations of the plant are found.
-
-        Args:
-            tables: tables of the settings file.
         """
         flags: dict[str, Any] = {"plant": self.plant}
         stated = tables.get("monitor", {}).keys() & {"process", "model", "input", "inputs", "outputs"}
@@ -91,16 +73,7 @@ class Source:
 
 
 def load_source(tables: Tables, flags: dict[str, Any], played: PlayedRecord | None) -> Source:
-    """Settings of the source of a run's samples.
-
-    Args:
-        tables: tables of the settings file.
-        flags: flags of the plant by key; None: not given.
-        played: a record that is played; None: a plant is simulated.
-
-    Raises:
-        InputError: invalid settings.
-    """
+    """Settings of the source of a run's samples."""
     if played is None:
         waiting = {"plant": {"wait_for": list(WAIT_FOR), **tables.get("plant", {})}}
         plant = complete_plant_settings(load_plant_settings(waiting, flags))
@@ -118,15 +91,7 @@ def load_source(tables: Tables, flags: dict[str, Any], played: PlayedRecord | No
 
 
 def load_plant_settings(tables: Tables, flags: dict[str, Any]) -> PlantConfig:
-    """Settings of a plant; one whose process the flags name is named after it.
-
-    Args:
-        tables: tables of the settings file.
-        flags: flags by key; None: not given.
-
-    Raises:
-        InputError: invalid settings, or there is no such process.
-    """
+    """Settings of a plant; one whose process the flags name is named after it."""
     process = flags.get("process")
     if process is not None and not (flags.get("name") or "name" in tables.get("plant", {})):
         flags = {**flags, "name": plant_name(None, find_process(process))}
@@ -134,21 +99,13 @@ def load_plant_settings(tables: Tables, flags: dict[str, Any]) -> PlantConfig:
 
 
 def complete_plant_settings(config: PlantConfig) -> PlantConfig:
-    """Settings in which what the process decides is written out.
-
-    Raises:
-        InputError: the process has no equations, or settings do not fit it.
-    """
+    """Settings in which what the process decides is written out."""
     changed, process = load_process(config)
     return fit_settings(changed, process).complete(config)
 
 
 def _replay_settings(tables: Tables, played: PlayedRecord, flags: dict[str, Any]) -> ReplayConfig:
-    """Settings of a replay in place of a plant.
-
-    Raises:
-        InputError: invalid settings, there is no such record, or flags for a simulation.
-    """
+    """Settings of a replay in place of a plant."""
     for name, option in (("seed", "--seed"), ("faults", "--fault")):
         if flags.get(name) is not None:
             raise InputError(f"--record {played.path}: a record is played, not simulated; leave {option} out")
@@ -164,11 +121,7 @@ def _replay_settings(tables: Tables, played: PlayedRecord, flags: dict[str, Any]
 
 
 def _played_process(path: Path, process: str | None, plant: str | None) -> tuple[str, str]:
-    """Process of a played record, by name or file, and the name of its plant.
-
-    Raises:
-        InputError: there is no such process, or a recording holds several plants.
-    """
+    """Process of a played record, by name or file, and the name of its plant."""
     if not is_table(path):
         recording = Recording(path)
         recorded = recording.one_plant()

@@ -1,25 +1,236 @@
-"""Commands for recordings: `recover`, `info` and `cut`."""
+"""Commands for recordings: record, replay, import, export, dashboard, cut, recover."""
 
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from typer import Argument, Option
 
-from reactorwatch.cli.option_groups import TableOptions
+from reactorwatch.cli.display import json_line, print_lines, print_report, task
+from reactorwatch.cli.option_groups import (
+    ColumnOptions,
+    PlantOptions,
+    PlantTableOptions,
+    ProcessOptions,
+    RecordOptions,
+    TableOptions,
+    stated_settings,
+)
 from reactorwatch.cli.options import (
     Begin,
     End,
     Force,
     Json,
-    ProcessOptions,
+    Recording,
     check_input,
     check_output,
     check_recording,
+    parse_pace,
     parse_span_ns,
 )
-from reactorwatch.cli.printing import json_line, print_lines, print_text
 from reactorwatch.errors import InputError
+
+if TYPE_CHECKING:
+    from reactorwatch.records.record import Record
+    from recorder.columns import RunColumns
+
+
+def record(
+    *,
+    target: PlantOptions,
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="File or folder to write to, made if it does not exist [.].")
+    ] = None,
+) -> None:
+    """Record everything on the bus into an MCAP file."""
+    from reactorwatch.cli.bus_client import metrics_settings, node_settings
+    from reactorwatch.records.write import check_folder_name
+    from reactorwatch.runtime.config import section
+    from recorder.__main__ import run
+    from recorder.config import RecorderConfig
+
+    if out is not None and out.suffix != ".mcap":
+        check_folder_name(out, "--out")
+    tables, bus = node_settings(target)
+    flags = {"plant": target.name, "out": str(out) if out is not None else None}
+    run(section(RecorderConfig, "recorder", tables, flags), bus, metrics_settings(tables))
+
+
+def replay(
+    *,
+    file: Recording,
+    target: PlantOptions,
+    rate: Annotated[str | None, Option(help="Times real time: a number, or 'max' [1].")] = None,
+    begin: Begin = None,
+    end: End = None,
+    loop: Annotated[bool | None, Option("--loop", help="Restart at the end.")] = None,
+    chosen: ProcessOptions,
+    verify: Annotated[
+        bool,
+        Option(
+            "--verify",
+            help="Publish nothing; run it through the monitor's core and compare the output with the recorded "
+            "messages. Ends with 0 if all are equal, 1 if not.",
+        ),
+    ] = False,
+    up: Annotated[
+        bool, Option("--up", help="Bring a router, a monitor and a recorder, as `up --record` does.")
+    ] = False,
+    as_json: Json = False,
+    column: ColumnOptions,
+    table: TableOptions,
+) -> None:
+    """Publish a recording or a record as the plant did, or verify a recording.
+
+    In a terminal the keys space, right, up and down pause and resume it, step it, and change its rate.
+    """
+    from reactorwatch.cli.bus_client import node_settings
+
+    part = {"--from": begin, "--to": end, "--loop": loop, "--column": column.column}
+    if verify:
+        from reactorwatch.cli.replay import run
+
+        given = {"--rate": rate, **part, "--input": chosen.inputs, "--output": chosen.outputs, "--up": up}
+        _refuse(given, "--verify publishes nothing and takes the whole recording")
+        raise typer.Exit(run(check_recording(file), target.config, target.name, chosen.process, as_json=as_json))
+    if up:
+        from reactorwatch.cli.plant_settings import PlayedRecord
+        from reactorwatch.cli.up import run_until_stopped
+
+        _refuse(
+            {**part, "--input": chosen.inputs, "--output": chosen.outputs},
+            "--up plays the whole file with its own names",
+        )
+        pace = {"name": target.name, "speed": parse_pace(rate, "--rate"), "process": chosen.process}
+        played = PlayedRecord(check_recording(file), table.file_format)
+        raise typer.Exit(run_until_stopped(target, None, pace, None, None, played))
+    from reactorwatch.records.decode import is_table
+    from reactorwatch.records.record import MINUTE_NS
+    from reactorwatch.runtime.config import section
+    from recorder.config import ReplayConfig
+    from recorder.tools.replay import run_replay
+
+    if column.column and not is_table(file):
+        raise InputError(f"--column is for the columns of a .csv file or another table, got {file}")
+    choice = chosen.choose()
+    tables, bus = node_settings(target)
+    flags = {
+        "file": str(check_recording(file)),
+        "plant": target.name,
+        "rate": parse_pace(rate, "--rate"),
+        "from_min": parse_span_ns(begin, "--from") / MINUTE_NS if begin is not None else None,
+        "to_min": parse_span_ns(end, "--to") / MINUTE_NS if end is not None else None,
+        "loop": loop,
+        "process": choice.process,
+        "inputs": choice.inputs or None,
+        "outputs": choice.outputs or None,
+        "columns": column.columns or None,
+        "table": stated_settings(table.file_format),
+    }
+    run_replay(section(ReplayConfig, "replay", tables, flags), bus)
+
+
+def _refuse(given: dict[str, Any], why: str) -> None:
+    """Refuse options that are given beside one which excludes them."""
+    for option, value in given.items():
+        if value:
+            raise InputError(f"{why}; leave out {option}")
+
+
+Out = Annotated[Path, Option("--out", "-o", help="The file to write.")]
+
+
+def dashboard(
+    *,
+    file: Recording,
+    out: Out,
+    chosen: ProcessOptions,
+    diagnosis: Annotated[
+        Path | None, Option(help="The report of a diagnosis of it (a folder), drawn into a tab.")
+    ] = None,
+    force: Force = False,
+    table: PlantTableOptions,
+) -> None:
+    """Draw a recording into a Rerun file, without a screen."""
+    from reactorwatch.api.files import open_messages
+    from reactorwatch.cli.diagnose import DRAWING
+    from recorder.columns import read_segments
+    from recorder.view.file import write_rrd
+
+    choice = chosen.choose()
+    drawn = diagnosis / DRAWING if diagnosis is not None else None
+    out = check_output(out, ".rrd", (file, drawn, choice.file), force=force)
+    if drawn is not None and not drawn.is_file():
+        raise InputError(f"--diagnosis {diagnosis}: holds no {DRAWING}; it must be the folder that diagnose -o wrote")
+    with task(f"drawing {file.name}"):
+        recording = open_messages(check_recording(file), table.plant, stated=table.file_format, choice=choice)
+        run = read_segments(recording.messages, given_zero_ns=recording.zero_ns, process=recording.process)
+        write_rrd(_check_samples(run, file), out, diagnosis=drawn)
+    print_lines(f"wrote {out}", *([f"note: read as: {recording.read_as}"] if recording.read_as else []))
+
+
+def _check_samples(runs: "Iterable[RunColumns]", file: Path) -> "Iterator[RunColumns]":
+    """Pass segments of a run on, and check that one of them has a usable sample."""
+    import numpy as np
+
+    is_measured = False
+    for run in runs:
+        is_measured = is_measured or any(np.isfinite(series.value).any() for series in run.samples.values())
+        yield run
+    if not is_measured:
+        raise InputError(f"{file}: holds no sample that can be used")
+
+
+def import_csv(
+    *,
+    files: Annotated[list[Path], Argument(help="A record (.csv or another table), or several in a row.")],
+    out: Out,
+    chosen: ProcessOptions,
+    force: Force = False,
+    table: RecordOptions,
+) -> None:
+    """Turn a record (.csv or another table), or several in a row, into a recording (.mcap)."""
+    from recorder.tools.convert import import_csv as convert
+
+    choice = chosen.choose()
+    out = check_output(out, ".mcap", (*files, choice.file), force=force)
+    with task(f"importing {files[0].name}"):
+        sources = list(map(check_input, files))
+        record = convert(sources, out, table.plant, table.columns, stated=table.file_format, choice=choice)
+    print_report(_report_text(out, record))
+
+
+def export_csv(
+    *,
+    file: Recording,
+    out: Out,
+    chosen: ProcessOptions,
+    clock: Annotated[bool, Option("--clock", help="Add a column with the clock time, ISO 8601 in UTC.")] = False,
+    force: Force = False,
+    table: PlantTableOptions,
+) -> None:
+    """Turn a recording (.mcap) into a record (.csv, .csv.gz, .xlsx or .parquet), with all its signals."""
+    from reactorwatch.records.write import WRITTEN_SUFFIXES
+    from recorder.tools.convert import export_csv as convert
+
+    choice = chosen.choose()
+    out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
+    with task(f"exporting {file.name}"):
+        record = convert(check_recording(file), out, table.plant, clock=clock, stated=table.file_format, choice=choice)
+    print_report(_report_text(out, record))
+
+
+def _report_text(out: Path, record: "Record") -> str:
+    from reactorwatch.records.decode import quote_formula
+
+    remarks, quoted = list(record.remarks), [name for name in record.columns if quote_formula(name) != name]
+    if quoted and out.suffix.lower() in (".csv", ".gz"):
+        remarks.append(
+            f"a spreadsheet would take {quoted[0]!r} for a formula, so a quote stands before it, which is "
+            "left out when the file is read here"
+        )
+    return "\n".join([f"wrote {out}: {record.rows} rows", *(f"note: {remark}" for remark in remarks)])
 
 
 def recover(
@@ -29,8 +240,7 @@ def recover(
     as_json: Json = False,
 ) -> None:
     """Recover the intact messages of a damaged recording."""
-    from reactorwatch.cli.progress import task
-    from reactorwatch.cli.recording_reports import saved_object, saved_text
+    from reactorwatch.cli.info import saved_object, saved_text
     from recorder.files.copies import recover as save
     from recorder.files.part_file import is_locked
 
@@ -39,40 +249,7 @@ def recover(
     out = check_output(out, ".mcap", (file,), force=force) if out is not None else _beside(file)
     with task(f"recovering {file.name}"):
         saved = save(file, out)
-    print_text(json_line(saved_object(saved, out)) if as_json else saved_text(saved, file, out))
-
-
-def info(
-    *,
-    file: Annotated[Path, Argument(help="A recording (.mcap), a folder of them, or a table.")],
-    chosen: ProcessOptions,
-    as_json: Json = False,
-    table: TableOptions,
-) -> None:
-    """Show the contents of a recording, and missing messages; or how a table is read, and what is in it."""
-    from reactorwatch.cli.display import print_report
-    from reactorwatch.cli.progress import task
-    from reactorwatch.cli.recording_reports import info_object, info_text
-    from reactorwatch.cli.table_report import table_object, table_text
-    from reactorwatch.description.read import read_signals
-    from reactorwatch.records.decode import is_table
-    from reactorwatch.records.read import read_table
-    from recorder.tools.inspect import inspect
-
-    choice = chosen.choose()
-    with task(f"reading {file.name}"):
-        if is_table(check_recording(file)) and not file.is_dir():
-            record = (
-                read_table(file, None, table.stated)
-                if choice.is_default
-                else read_signals(file, choice, None, table.stated)
-            )
-            text = json_line(table_object(record, file)) if as_json else table_text(record, file)
-        else:
-            seen = inspect(file)
-            if not choice.is_default:
-                seen = replace(seen, processes=dict.fromkeys(seen.overview.runs, choice.load()))
-            text = json_line(info_object(seen, file)) if as_json else info_text(seen, file)
+    text = json_line(saved_object(saved, out)) if as_json else saved_text(saved, file, out)
     print_report(text, as_json=as_json)
 
 
@@ -84,7 +261,6 @@ def cut(
     force: Force = False,
 ) -> None:
     """Copy a span of plant time out of a recording."""
-    from reactorwatch.cli.progress import task
     from recorder.files.copies import cut as copy
     from recorder.files.copies import sample_window
     from recorder.files.metadata import ZERO_NS
@@ -106,11 +282,7 @@ def cut(
 
 
 def _beside(file: Path) -> Path:
-    """Default path of a recovered file, which is never overwritten.
-
-    Raises:
-        InputError: the file exists.
-    """
+    """Default path of a recovered file, which is never overwritten."""
     out = file.with_name(f"{file.name.removesuffix('.part').removesuffix('.mcap')}-recovered.mcap")
     if out.exists():
         raise InputError(f"{out}: exists already; name another file with --out")

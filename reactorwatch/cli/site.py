@@ -1,23 +1,23 @@
-"""Commands of a site: `certify` makes certificates and rules, `router` enforces them, `doctor` and `status` check."""
+"""Commands of a site: `certify` makes certificates and rules, `router` enforces them, `doctor` checks."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
-from reactorwatch.cli.options import (
-    MAX_WAIT_S,
-    TIMEOUT_S,
-    BusOptions,
-    Json,
-    PlantOptions,
-    Process,
-    Settings,
-    check_input,
-)
-from reactorwatch.cli.printing import json_line, print_lines
+from reactorwatch.cli.display import json_line, print_lines
+from reactorwatch.cli.option_groups import BUS, BusOptions, PlantOptions, fold
+from reactorwatch.cli.options import MAX_WAIT_S, Json, check_input
 from reactorwatch.errors import InputError
+
+
+@dataclass(frozen=True)
+class DoctorOptions(PlantOptions):
+    """Settings file, router, plant and timeout of a check."""
+
+    timeout: Annotated[float, fold(BUS, help="Seconds to listen for nodes.", min=0.1, max=MAX_WAIT_S)] = 12.0
 
 
 def certify(
@@ -62,16 +62,14 @@ def certify(
 
 
 def router(
+    *,
     file: Annotated[
         Path | None,
         Argument(
             help="Zenoh's settings, as `certify` writes them: router.json5 [a plain router, on this machine alone]."
         ),
     ] = None,
-    config: Settings = None,
-    endpoint: Annotated[
-        str | None, Option(help="Address at which a plain router listens [tcp/127.0.0.1:7447].")
-    ] = None,
+    target: BusOptions,
 ) -> None:
     """Run a router until stopped: that of a site, with certificates and access rules, or without a file a plain one.
 
@@ -86,10 +84,10 @@ def router(
     from reactorwatch.runtime.logs import configure
     from reactorwatch.runtime.retry import retry
 
-    if file is not None and (config is not None or endpoint is not None):
+    if file is not None and (target.config is not None or target.endpoint is not None):
         raise InputError(f"{file}: has the address of this router; leave out --config and --endpoint")
-    tables = read_settings(config)
-    settings = section(BusConfig, "bus", tables, {"endpoint": endpoint})
+    tables = read_settings(target.config)
+    settings = section(BusConfig, "bus", tables, {"endpoint": target.endpoint})
     configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
     log = structlog.get_logger()
     with log_refusals(), stop_on_signals() as stop:
@@ -109,22 +107,21 @@ def router(
 
 def doctor(
     *,
-    target: PlantOptions,
-    timeout: Annotated[float, Option(help="Seconds to listen for nodes.", min=0.1, max=MAX_WAIT_S)] = 12.0,
+    target: DoctorOptions,
     as_json: Json = False,
 ) -> None:
     """Check a deployment from here: one line a check, with the cure. Ends with 0 if all checks pass, 1 if not."""
     from datetime import UTC, datetime
 
+    from reactorwatch.cli.bus_client import load_recorder_settings
     from reactorwatch.cli.doctor import run_checks
-    from reactorwatch.cli.observer import load_recorder_settings
 
     bus, recorder = load_recorder_settings(target)
     out = Path(recorder.out)
     folder = out.parent if out.suffix == ".mcap" else out
     is_well = True
     checks = []
-    for finding in run_checks(bus, recorder.plant, folder, recorder.rotate_mb, timeout, datetime.now(UTC)):
+    for finding in run_checks(bus, recorder.plant, folder, recorder.rotate_mb, target.timeout, datetime.now(UTC)):
         is_well = is_well and not finding.cure
         checks.append({"ok": not finding.cure, **finding._asdict()})
         if not as_json:
@@ -133,34 +130,3 @@ def doctor(
     if as_json:
         print_lines(json_line({"ok": is_well, "checks": checks}))
     raise typer.Exit(0 if is_well else 1)
-
-
-def status(
-    *,
-    nodes: Annotated[list[str] | None, Argument(help="With --check: these nodes [plant, monitor, recorder].")] = None,
-    target: BusOptions,
-    name: Annotated[str | None, Option("--plant", help="Which plant [all that may be read].")] = None,
-    process: Process = None,
-    check: Annotated[
-        bool, Option("--check", help="Check that nodes are alive, and nothing else. Ends with 0 if all are, 1 if not.")
-    ] = False,
-    timeout: Annotated[
-        float, Option(help="With --check: seconds to wait for them.", min=0.1, max=MAX_WAIT_S)
-    ] = TIMEOUT_S,
-    once: Annotated[bool, Option("--once", help="Show it once.")] = False,
-    seconds: Annotated[float, Option(help="How long to listen before showing it once.", min=0.1, max=MAX_WAIT_S)] = 4.0,
-    as_json: Json = False,
-) -> None:
-    """Show the current state of plants, nodes, rates and alarms, until stopped; or check that nodes are alive."""
-    from reactorwatch.cli.observer import load_recorder_settings, observed_process
-    from reactorwatch.cli.status import check_alive, run
-
-    bus, recorder = load_recorder_settings(PlantOptions(target.config, target.endpoint, name))
-    if check:
-        raise typer.Exit(check_alive(bus, recorder.plant, tuple(nodes or ()), timeout, as_json=as_json))
-    if nodes:
-        raise InputError(f"{nodes[0]}: nodes are named for --check alone; give it, or leave them out")
-    described = observed_process(process, recorder)
-    # a certificate is for one plant, and messages of others are not received
-    plant = recorder.plant if name is not None or bus.ca is not None else None
-    run(bus, plant, seconds, described, once=once, as_json=as_json)

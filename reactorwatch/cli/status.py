@@ -1,4 +1,4 @@
-"""`status`: current state of plants, their nodes, rates and alarms."""
+"""`status`: current state of plants, their nodes, rates and alarms, as JSON or as text for people."""
 
 import contextlib
 import threading
@@ -8,10 +8,8 @@ from collections.abc import Sequence
 from math import inf, isnan
 from typing import TYPE_CHECKING, Any
 
-from reactorwatch.cli.alarm_rows import ANNUNCIATED, Now, age_s, sort_alarms
-from reactorwatch.cli.display import has_colour, print_screen_text, screen_width
-from reactorwatch.cli.printing import json_line, print_lines
-from reactorwatch.cli.status_view import format_plant
+from reactorwatch.cli.display import Screen, json_line, print_lines, print_screen_text, screen
+from reactorwatch.cli.status_view import ANNUNCIATED, SECOND_NS, Now, age_s, format_plant, sort_alarms
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import priority_word, set_suspects, state_word
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode_message
@@ -36,22 +34,19 @@ from recorder.samples import measured_value
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process
 
-SECOND_NS = 1_000_000_000
+
 WINDOW_S = 10
 """Seconds over which rates are counted, without the current one."""
-REFRESH_S = 1.0
+
+REFRESH_S = 1.0  # as often as a rate can change
 HISTORY_S = 60.0
 """History of health: longer than any node's period."""
-ANSWER_WITHIN_S = 2.0
+
+ANSWER_WITHIN_S = 2.0  # a node answers within milliseconds; one that is busy is asked again
 
 
 class StatusBoard:
-    """State of the plants; may be called from any thread.
-
-    Args:
-        start_ns: time of the subscription.
-        process: process of the plants, all of whose signals are shown; None: unknown.
-    """
+    """State of the plants; may be called from any thread."""
 
     def __init__(self, start_ns: int, process: "Process | None" = None) -> None:
         self._start_ns = start_ns
@@ -138,14 +133,14 @@ class StatusBoard:
                 **promise_fields(self._promises.get(name)),
             }
 
-    def text(self, now_ns: int, width: int | None = None, *, colour: bool = False) -> str:
+    def text(self, now_ns: int, to: Screen = Screen()) -> str:  # noqa: B008 (it is frozen)
         """State of all plants for people; see `format_plant`."""
         parts = []
         for name in self.plants:
             plant = self.plant(name, now_ns)
             with self._lock:
                 alarms, now = self._visible_alarms(name), self._now(name, now_ns)
-            parts.append(format_plant(plant, alarms, now, width=width, colour=colour))
+            parts.append(format_plant(plant, alarms, now, to))
         return "\n\n".join(parts) or "no nodes"
 
     def _visible_alarms(self, plant: str) -> list[Alarm]:
@@ -203,19 +198,7 @@ def run(
     once: bool,
     as_json: bool,
 ) -> None:
-    """Show the status, once or until SIGINT or SIGTERM.
-
-    Args:
-        config: connection to the bus.
-        plant: name of the plant; None: all plants.
-        listen_s: seconds before the status is shown once.
-        process: process of the plants; None: unknown.
-        once: show it once.
-        as_json: show it once, as one JSON object.
-
-    Raises:
-        InputError: there is no router, or it refuses the connection.
-    """
+    """Show the status, once or until SIGINT or SIGTERM."""
     with stop_on_signals() as stop:
         try:
             bus = connect_now(config)
@@ -234,21 +217,7 @@ def run(
 
 
 def check_alive(config: BusConfig, plant: str, nodes: Sequence[str], timeout_s: float, *, as_json: bool) -> int:
-    """Wait until nodes of a plant are alive, by their liveliness tokens, and print which are.
-
-    Args:
-        config: connection to the bus.
-        plant: name of the plant.
-        nodes: names of the nodes; empty: those that publish health, with a replay in place of the plant.
-        timeout_s: seconds to wait for router and nodes together.
-        as_json: print one JSON object.
-
-    Returns:
-        0 if all of them are alive within the time, else 1.
-
-    Raises:
-        InputError: Zenoh does not understand the endpoint.
-    """
+    """Wait until nodes of a plant are alive, by their liveliness tokens, and print which are."""
     alive: set[str] = set()
     changed, stop = threading.Condition(), StopSignal()
     until_s = time.monotonic() + timeout_s
@@ -325,7 +294,7 @@ def _text(board: StatusBoard, *, as_json: bool = False) -> str:
     if as_json:
         plants = [board.plant(name, now_ns) for name in board.plants]
         return printable(json_line({"plants": plants}))
-    return board.text(now_ns, screen_width(), colour=has_colour())
+    return board.text(now_ns, screen())
 
 
 def _alarm(alarm: Alarm, now: Now) -> dict[str, Any]:

@@ -1,50 +1,112 @@
-"""Status of plants as text for people: values, nodes, alarms."""
+"""Alarms and the status of plants as rows for people."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
-from reactorwatch.cli.alarm_rows import Now, advise_acknowledgement, alarm_rows
 from reactorwatch.cli.display import (
     ATTENTION,
+    CAUSE,
     FAINT,
+    GAP,
     RIGHT,
     STRONG,
     WRONG,
     Cell,
     Row,
+    Screen,
     format_age,
-    format_report,
     format_rows,
+    wrap_line,
 )
-from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.contract.alarm_text import describe_suspects, priority_word, state_word
+from reactorwatch.contract.keys import RECORDING
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Priority
 from reactorwatch.contract.promise_text import describe_power
+
+HEADER = tuple(Cell(word, FAINT) for word in ("priority", "incident", "alarm", "state", "for", "likely cause"))
+SECOND_NS = 1_000_000_000
+UNACKNOWLEDGED = (AlarmState.ALARM_STATE_UNACKNOWLEDGED, AlarmState.ALARM_STATE_RETURNED_UNACKNOWLEDGED)
+ANNUNCIATED = (*UNACKNOWLEDGED, AlarmState.ALARM_STATE_ACKNOWLEDGED)
+
+_STYLES = {
+    Priority.PRIORITY_CRITICAL: WRONG,
+    Priority.PRIORITY_HIGH: WRONG,
+    Priority.PRIORITY_MEDIUM: ATTENTION,
+}
+
+
+def sort_alarms(alarms: Iterable[Alarm]) -> list[Alarm]:
+    """Alarms by priority, the most urgent first, then by incident, the newest first, then by time."""
+    return sorted(alarms, key=lambda alarm: (-alarm.priority, -alarm.incident, alarm.raised_ns, alarm.alarm))
+
+
+class Now(NamedTuple):
+    """Present times, in ns: an alarm's age is in that of the node that raises it."""
+
+    plant: int  # of the monitor's alarms
+    clock: int  # of the recorder's alarms
+
+
+def age_s(alarm: Alarm, now: Now) -> float | None:
+    """Seconds since an alarm was raised; None if it is not annunciated."""
+    if not alarm.raised_ns or alarm.state not in ANNUNCIATED:
+        return None
+    now_ns = now.clock if alarm.alarm.startswith(f"{RECORDING}/") else now.plant
+    return (now_ns - alarm.raised_ns) / SECOND_NS
+
+
+def alarm_row(alarm: Alarm, now: Now) -> Row:
+    """Cells of an alarm, in the order of `HEADER`."""
+    age = age_s(alarm, now)
+    unseen = alarm.state in UNACKNOWLEDGED
+    cause = describe_suspects(alarm.suspects)
+    return (
+        Cell(priority_word(alarm.priority), _STYLES.get(alarm.priority, "")),
+        str(alarm.incident or ""),
+        Cell(alarm.alarm, STRONG if unseen else ""),
+        state_word(alarm.state),
+        "" if age is None else format_age(age),
+        Cell(cause, CAUSE) if cause else alarm.text,
+    )
+
+
+def alarm_rows(alarms: Iterable[Alarm], now: Now) -> list[Row]:
+    """Header and a row for each alarm, sorted."""
+    return [HEADER, *(alarm_row(alarm, now) for alarm in sort_alarms(alarms))]
+
+
+def advise_acknowledgement(alarms: Iterable[Alarm], plant: str | None = None) -> str:
+    """Command that acknowledges the latest incident with an unacknowledged alarm; empty if there is none."""
+    incidents = [alarm.incident for alarm in alarms if alarm.state in UNACKNOWLEDGED]
+    number = max(incidents, default=0)
+    if not number:
+        return ""
+    of_plant = f" --plant {plant}" if plant is not None else ""
+    return f"seen? reactorwatch ack --incident {number} --by NAME{of_plant}"
+
 
 _INDENT = 2
 
 
 def format_plant(
-    plant: dict[str, Any], alarms: Sequence[Alarm], now: Now, *, width: int | None = None, colour: bool = False
+    plant: dict[str, Any],
+    alarms: Sequence[Alarm],
+    now: Now,
+    to: Screen = Screen(),  # noqa: B008 (it is frozen)
 ) -> str:
-    """Format the status of a plant.
-
-    Args:
-        plant: the object that `status --json` prints for it.
-        alarms: its annunciated alarms.
-        now: its present times.
-        width: see `format_rows`.
-        colour: see `format_rows`.
-    """
-    parts = [format_rows([_values(plant)], width=width, colour=colour)]
+    """Format the status of a plant, the object that `status --json` prints for it, with its annunciated alarms."""
     nodes = [_node(node) for node in plant["nodes"]]
-    parts.append(format_rows(nodes or [("no nodes",)], _INDENT, width=width, colour=colour))
-    promise = format_rows(_promise(plant), _INDENT, colour=colour and width is None)
-    parts.append(promise if width is None else format_report(promise.split("\n"), width, colour=colour))
+    parts = [
+        format_rows([_values(plant)], to=to),
+        format_rows(nodes or [("no nodes",)], _INDENT, to),
+        format_rows(_promise(plant, to.width), _INDENT, to),
+    ]
     if alarms:
-        parts.append(format_rows(alarm_rows(alarms, now), _INDENT, width=width, colour=colour))
         advice = advise_acknowledgement(alarms, plant["plant"])
-        parts.append(format_rows([(Cell(advice, FAINT),)] if advice else [], _INDENT, width=width, colour=colour))
+        parts.append(format_rows(alarm_rows(alarms, now), _INDENT, to))
+        parts.append(format_rows([(Cell(advice, FAINT),)] if advice else [], _INDENT, to))
     else:
-        parts.append(format_rows([(Cell("no alarms", RIGHT),)], _INDENT, width=width, colour=colour))
+        parts.append(format_rows([(Cell("no alarms", RIGHT),)], _INDENT, to))
     return "\n".join(filter(None, parts))
 
 
@@ -63,16 +125,21 @@ def _values(plant: dict[str, Any]) -> Row:
     return (*cells, *([] if rate is None else [Cell(f"{rate:.3g} samples/s", FAINT if rate else WRONG)]))
 
 
-def _promise(plant: dict[str, Any]) -> list[Row]:
-    """Promise of false alarms and the power, if they are known."""
+def _promise(plant: dict[str, Any], width: int | None) -> list[Row]:
+    """Promise of false alarms and the power, if they are known, each wrapped beside its name."""
     promise = plant["promise"]
     if promise is None:
         return []
     is_good = promise["kept"] and not promise["drifted"]
-    rows: list[Row] = [("promise", Cell(promise["text"], "" if is_good else ATTENTION))]
+    named = {"promise": Cell(promise["text"], "" if is_good else ATTENTION)}
     if plant["power"]:
-        rows.append(("seen in an hour", Cell(describe_power(plant["power"]), FAINT)))
-    return rows
+        named["seen in an hour"] = Cell(describe_power(plant["power"]), FAINT)
+    room = None if width is None else width - _INDENT - max(map(len, named)) - GAP
+    return [
+        (name if index == 0 else "", Cell(line, style))
+        for name, (text, style) in named.items()
+        for index, line in enumerate(wrap_line(text, room))
+    ]
 
 
 def _node(node: dict[str, Any]) -> Row:

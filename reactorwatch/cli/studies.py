@@ -1,207 +1,198 @@
-"""Commands on records: `simulate`, `backtest` and `diagnose`."""
+"""Commands for studies: linearise, charts, demo."""
 
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from typer import Option
+import typer
+from typer import Argument, Option
 
-from reactorwatch.cli.display import print_report
-from reactorwatch.cli.option_groups import TableOptions
-from reactorwatch.cli.options import (
-    Columns,
-    Files,
-    Force,
-    Jobs,
-    Json,
-    Plant,
-    Process,
-    ProcessOptions,
-    RecordFile,
-    Reference,
-    Scheduler,
-    Settings,
-    TrainingOptions,
-    check_output,
-    check_recording,
-    parse_columns,
-    parse_limits,
-    parse_tolerances,
-    split_names,
-)
+from reactorwatch.cli.display import json_line, print_lines, print_report
+from reactorwatch.cli.option_groups import ProcessOption, new_group
+from reactorwatch.cli.options import Json, Site, parse_pace
 from reactorwatch.errors import InputError
 
 
-def simulate(
+def linearise(
     *,
-    file: RecordFile,
-    out: Annotated[Path, Option("--out", "-o", help="The file to write (.csv or another table).")],
-    plant: Plant = None,
+    levels: Annotated[list[float], Argument(help="Level of each input, in its order and unit (qc of cstr).")],
+    chosen: ProcessOption,
+    step: Annotated[
+        float | None,
+        Option(help="Of each input, by which linear model and plant are compared [a tenth of its scale; qc: 1 l/min]."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Print the linear models at all steady states of constant inputs."""
+    from reactorwatch.cli.linearise import describe
+
+    print_report(describe(chosen.choose().load().require_model(), levels, step, as_json=as_json), as_json=as_json)
+
+
+Shift = Annotated[float, Option(help="Of the mean, in standard deviations; 0: the false alarms.")]
+SteadyState = Annotated[bool, Option("--steady-state", help="The chart has long run when the shift comes.")]
+Rules = Annotated[str, Option(help="Run rules, some of 1,2,3,4.")]
+Dimension = Annotated[int, Option(help="Number of signals.")]
+Weight = Annotated[float, Option("--lambda", help="Weight of the newest sample.")]
+
+
+def shewhart(
+    shift: Shift = 0.0,
+    rules: Rules = "1",
+    limit: Annotated[float, Option(help="Width L of the outer lines, in standard deviations.")] = 3.0,
+    steady_state: SteadyState = False,
+    as_json: Json = False,
+) -> None:
+    """Individual values, with run rules."""
+    from reactorwatch.spc.charts.shewhart import shewhart_run_length
+
+    length = shewhart_run_length(shift, limit, _rules(rules), steady_state=steady_state)
+    _print_length(length, as_json, chart="shewhart", rules=list(_rules(rules)), limit=limit, shift=shift)
+
+
+def cusum(
+    k: Annotated[float, Option(help="Allowance, in standard deviations.")],
+    h: Annotated[float, Option(help="Limit, in standard deviations.")],
+    shift: Shift = 0.0,
+    headstart: Annotated[float, Option(help="Where the sums start, in standard deviations.")] = 0.0,
+    one_sided: Annotated[bool, Option("--one-sided", help="The high sum only.")] = False,
+    steady_state: SteadyState = False,
+    as_json: Json = False,
+) -> None:
+    """Two-sided cumulative sums."""
+    from reactorwatch.spc.charts.cusum import cusum_run_length
+
+    length = cusum_run_length(shift, k, h, headstart, one_sided=one_sided, steady_state=steady_state)
+    _print_length(length, as_json, chart="cusum", k=k, h=h, headstart=headstart, shift=shift)
+
+
+def ewma(
+    weight: Weight,
+    limit: Annotated[float, Option(help="L, in standard deviations of the average.")],
+    shift: Shift = 0.0,
+    exact_limits: Annotated[bool, Option("--exact-limits", help="Limits that widen from the start.")] = False,
+    steady_state: SteadyState = False,
+    as_json: Json = False,
+) -> None:
+    """Exponentially weighted moving average."""
+    from reactorwatch.spc.charts.ewma import ewma_run_length
+
+    length = ewma_run_length(shift, weight, limit, exact_limits=exact_limits, steady_state=steady_state)
+    _print_length(length, as_json, chart="ewma", **{"lambda": weight}, limit=limit, shift=shift)
+
+
+def mewma(
+    dimension: Annotated[int, Option(help="Number of signals.")],
+    weight: Weight,
+    limit: Annotated[float, Option(help="H, of the statistic.")],
+    shift: Shift = 0.0,
+    steady_state: SteadyState = False,
+    as_json: Json = False,
+) -> None:
+    """Moving average of several signals."""
+    from reactorwatch.spc.charts.mewma import mewma_run_length
+
+    length = mewma_run_length(shift, dimension, weight, limit, steady_state=steady_state)
+    _print_length(length, as_json, chart="mewma", dimension=dimension, **{"lambda": weight}, limit=limit, shift=shift)
+
+
+def t2(
+    dimension: Annotated[int, Option(help="Number of signals.")],
+    limit: Annotated[float, Option(help="Of T2.")],
+    shift: Shift = 0.0,
+    steady_state: SteadyState = False,
+    as_json: Json = False,
+) -> None:
+    """Hotelling's T2, known covariance; it has no memory, so its steady state is as any other."""
+    from reactorwatch.spc.charts.t2 import t2_run_length
+
+    _print_length(
+        t2_run_length(shift, dimension, limit), as_json, chart="t2", dimension=dimension, limit=limit, shift=shift
+    )
+
+
+def list_charts() -> None:
+    """List the charts of a monitor, with their keys in its settings."""
+    from reactorwatch.spc.charts.base import Setting
+    from reactorwatch.spc.charts.catalogue import CHARTS
+
+    for kind in CHARTS:
+        print_lines(f"{kind.name:<11} {(kind.__doc__ or '').partition(chr(10))[0]}")
+        for item in kind.settings:
+            if isinstance(item, Setting):
+                print_lines(f"{'':<11} {item.key} = {item.default:g}, in [{item.lower:g}, {item.upper:g}]")
+            else:
+                print_lines(f"{'':<11} {item.key}: at most {item.most} of the signals")
+
+
+def design(
+    chart: Annotated[str, Argument(help="shewhart, ewma, cusum, t2 or mewma.")],
+    arl0: Annotated[float, Option(help="Samples to a false alarm, on average.")],
+    shift: Annotated[float, Option(help="To be detected, in standard deviations.")],
+    dimension: Dimension = 2,
+    rules: Rules = "1",
+    as_json: Json = False,
+) -> None:
+    """The chart that detects a shift fastest at a rate of false alarms."""
+    from reactorwatch.spc.charts.catalogue import CHARTS
+    from reactorwatch.spc.run_length import check_design
+
+    kinds = {kind.name: kind for kind in CHARTS if "fastest" in vars(kind)}
+    if chart not in kinds:
+        raise InputError(f"chart must be one of {', '.join(kinds)}, got {chart!r}")
+    check_design(arl0, shift, dimension)
+    found = kinds[chart].fastest(arl0, shift, dimension, _rules(rules))
+    if as_json:
+        print_lines(json_line(found))
+        return
+    print_lines(chart)
+    for name, value in found.parameters.items():
+        text = ",".join(map(str, value)) if isinstance(value, list) else f"{value:.6g}"
+        print_lines(f"  {name:<10} {text}")
+    print_lines(f"false alarm every {found.arl0:g} samples; a shift of {found.shift:g} is seen after {found.arl:.4g}")
+
+
+def _rules(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(rule) for rule in text.split(","))
+    except ValueError:
+        raise InputError(f"--rules must be some of 1,2,3,4 with commas between, got {text!r}") from None
+
+
+def _print_length(length: float, as_json: bool, **chart: object) -> None:
+    """Print the run length: one number, or one object with the chart's parameters."""
+    if not as_json:
+        print_lines(f"{length:.8g}")
+        return
+    print_lines(json_line({**chart, "arl": length}))
+
+
+charts = new_group("Control charts: how long they run, and which is fastest.", {"design": design, "list": list_charts})
+
+
+charts.add_typer(
+    new_group(
+        "The average run length of a chart, in samples.",
+        {"shewhart": shewhart, "cusum": cusum, "ewma": ewma, "mewma": mewma, "t2": t2},
+    ),
+    name="arl",
+)
+
+
+def demo(
+    *,
+    out: Annotated[Path | None, Option("--out", "-o", help="Folder for the run [runs/demo-<time>].")] = None,
+    duration: Annotated[float, Option(help="Minutes of plant time.", min=150)] = 240.0,
+    speed: Annotated[str, Option(help="Plant time over wall time.")] = "400",
     fault: Annotated[
-        list[str] | None, Option(help="A fault, as cause:profile:size@onset, onset in the file's time.")
-    ] = None,
-    process: Process = None,
-    settle: Annotated[
-        int, Option(help="First rows that set the state it starts from, and are left out of errors.")
-    ] = 0,
-    column: Columns = None,
-    force: Force = False,
-    as_json: Json = False,
-    table: TableOptions,
-) -> None:
-    """Run the plant's equations along a record.
-
-    They start from its first row and run freely, driven by its inputs.
-    """
-    from reactorwatch.api.files import record_of_process
-    from reactorwatch.api.simulation import report, simulate_along
-    from reactorwatch.cli.progress import task
-    from reactorwatch.description.choice import ProcessChoice
-    from reactorwatch.records.write import WRITTEN_SUFFIXES, write_table
-
-    choice = ProcessChoice(process)
-    out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
-    measured, described = record_of_process(check_recording(file), plant, parse_columns(column), choice, table.stated)
-    model = described.require_model()
-    with task(f"simulating {file.name}"):
-        simulated = simulate_along(measured, model, fault or [], settle)
-        try:
-            write_table(out, simulated)
-        except InputError:
-            print_report(report(measured, simulated, model, None, settle=settle, as_json=as_json), as_json=as_json)
-            raise
-    print_report(report(measured, simulated, model, out, settle=settle, as_json=as_json), as_json=as_json)
-
-
-def backtest(
-    *,
-    files: Files,
-    config: Settings = None,
-    chosen: ProcessOptions,
-    modes: Annotated[
-        list[str] | None,
-        Option(
-            "--mode",
-            help="A column that says how the plant is operated, without a process (repeatable, or with commas).",
-        ),
-    ] = None,
-    plant: Plant = None,
-    train: Annotated[
-        Path | None, Option(help="A record to learn from, all of it; FILES are then watched from their first row.")
-    ] = None,
-    training: TrainingOptions,
-    reference: Reference = None,
-    column: Columns = None,
-    out: Annotated[Path | None, Option("--out", "-o", help="Folder for a summary of several files.")] = None,
-    rows: Annotated[
-        Path | None, Option(help="A file (.csv) for each row of FILES, and whether an alarm is active.")
-    ] = None,
-    jobs: Jobs = None,
-    scheduler: Scheduler = None,
-    force: Force = False,
-    as_json: Json = False,
-    table: TableOptions,
-) -> None:
-    """Run the monitor over recordings at full speed."""
-    from monitor_node.config import MonitorConfig
-    from reactorwatch.cli.backtest_jobs import BACKTEST, BacktestOptions, train_on, write_rows
-    from reactorwatch.cli.batch import SUMMARY, expand_files, make_jobs, run_jobs, unfit_lines
-    from reactorwatch.cli.progress import task
-    from reactorwatch.contract.keys import DEFAULT_PLANT
-    from reactorwatch.records.write import check_output_folder
-    from reactorwatch.runtime.config import read_settings, section
-
-    named, choice = expand_files(files), chosen.choose(modes)
-    sources = (*named, config, train, choice.file)
-    if out is not None:
-        check_output_folder(out, SUMMARY, sources, force=force)
-    if rows is not None:
-        rows = check_output(rows, ".csv", sources, force=force)
-    if train is not None and training.is_given:
-        raise InputError(f"--train {train}: all of it is the training; leave --training and --training-rows out")
-    tables = read_settings(config)
-    flags: dict[str, Any] = {"plant": plant or DEFAULT_PLANT, "reference": reference, "process": choice.process}
-    if choice.outputs:
-        choice.load()  # reports a column of two roles
-        flags |= {"inputs": choice.inputs, "outputs": choice.outputs, "modes": choice.modes}
-    flags |= training.flags(tables)
-    settings = section(MonitorConfig, "monitor", tables, flags)
-    asked = BacktestOptions(
-        plant=plant,
-        columns=parse_columns(column),
-        process=choice,
-        stated=table.stated,
-        as_json=as_json,
-        settings=settings,
-        log_rows=rows is not None,
-        is_one_of_many=len(named) > 1,
-    )
-    if train is not None:
-        with task(f"learning from {train.name}"), unfit_lines(named, as_json=as_json):
-            asked = replace(asked, trained=train_on(train, asked))
-    run_jobs(
-        BACKTEST,
-        make_jobs(named, asked, elsewhere=scheduler is not None),
-        out,
-        processes=jobs,
-        scheduler=scheduler,
-        on_end=None if rows is None else partial(write_rows, rows),
-    )
-
-
-def diagnose(
-    *,
-    files: Files,
-    out: Annotated[
-        Path | None, Option("--out", "-o", help="Folder for a report; of several files, a folder each.")
-    ] = None,
-    tolerance: Annotated[
         str | None,
-        Option(help="Differences that do not matter in practice, such as C=0.002,T=0.5 [a fiftieth of the range]."),
+        Option(help="The fault, as cause:profile:size@onset [of the process; coolant_flow:step:-0.15@150min]."),
     ] = None,
-    uncertain: Annotated[
-        str | None, Option(help="Parameters that are known but to a standard deviation, such as K3=2%,Tf=0.5K [none].")
-    ] = None,
-    limit: Annotated[
-        str | None,
-        Option(
-            "--limits",
-            help="What a proposed experiment keeps to, such as qc=85..115,T=425..455 [a little beyond the record].",
-        ),
-    ] = None,
-    process: Process = None,
-    without: Annotated[
-        list[str] | None, Option(help="A cause that is left out (repeatable); nothing takes its place.")
-    ] = None,
-    plant: Plant = None,
-    column: Columns = None,
-    jobs: Jobs = None,
-    scheduler: Scheduler = None,
-    force: Force = False,
-    as_json: Json = False,
-    table: TableOptions,
+    chosen: ProcessOption,
+    seed: Annotated[int, Option(help="Of the input and the noise.")] = 1,
+    site: Site = None,
 ) -> None:
-    """Find where a simulation differs from the record, and name the cause."""
-    from reactorwatch.cli.batch import expand_files, run_jobs, unfit_lines
-    from reactorwatch.cli.diagnosis import DiagnosisOptions
-    from reactorwatch.cli.diagnosis_jobs import DIAGNOSIS, check_out, diagnosis_jobs
-    from reactorwatch.description.choice import ProcessChoice
+    """Simulate, watch, record, draw and diagnose a plant with a fault."""
+    from reactorwatch.cli.demo import run
 
-    named = expand_files(files)
-    choice = ProcessChoice(process)
-    check_out(named, out, choice.file, force=force)
-    asked = DiagnosisOptions(
-        plant=plant,
-        columns=parse_columns(column),
-        process=choice,
-        stated=table.stated,
-        as_json=as_json,
-        uncertain=uncertain,
-        tolerance=parse_tolerances(tolerance),
-        limits=parse_limits(limit),
-        without=split_names(without),
-    )
-    with unfit_lines(named, as_json=as_json):
-        todo = diagnosis_jobs(named, out, asked, elsewhere=scheduler is not None)
-    run_jobs(DIAGNOSIS, todo, out, processes=jobs, scheduler=scheduler)
+    flags = {"process": chosen.process, "duration_min": duration, "speed": parse_pace(speed, "--speed"), "seed": seed}
+    raise typer.Exit(run(flags, fault, out, site))

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from reactorwatch.api.files import open_messages, record
-from reactorwatch.cli.diagnosis import DiagnosisOptions, load_case
-from reactorwatch.cli.verification import run as run_verification
+from reactorwatch.cli.diagnose import DiagnosisOptions, load_case
+from reactorwatch.cli.replay import run as run_verification
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import decode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate

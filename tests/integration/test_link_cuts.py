@@ -25,7 +25,7 @@ from benchmarks.link_cuts import (
     stick,
 )
 from benchmarks.recorder_kills import BATCHES_PER_S, PATIENCE_S, SIGNALS, Publisher, Tokens
-from reactorwatch.cli.recording_reports import info_text
+from reactorwatch.cli.info import info_text
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from reactorwatch.cli.verification import run
+from reactorwatch.cli.replay import run
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Baseline

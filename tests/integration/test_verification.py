@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from reactorwatch.cli.verification import run
+from reactorwatch.cli.replay import run
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import decode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Sample

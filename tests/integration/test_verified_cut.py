@@ -17,7 +17,7 @@ from plant_node.config import PlantConfig
 from plant_node.node import PlantNode
 from plant_node.record import plant_from
 from reactorwatch.cli.processes import settings_text
-from reactorwatch.cli.verification import run
+from reactorwatch.cli.replay import run
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.config import BusConfig

@@ -13,10 +13,9 @@ import structlog
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reactorwatch.cli.alarm import _line
+from reactorwatch.cli.alarm import _alarm_line
+from reactorwatch.cli.display import _escape_markup, print_lines
 from reactorwatch.cli.main import main
-from reactorwatch.cli.printing import print_lines
-from reactorwatch.cli.progress import _escape_markup
 from reactorwatch.cli.status import StatusBoard, _text
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import ALARM_STATE_UNACKNOWLEDGED, QUALITY_GOOD, Alarm, Sample
@@ -27,7 +26,7 @@ from recorder.files.writer import RecordingWriter
 
 ROOT = Path(__file__).parents[2]
 HOSTILE = "\x1b[2J\x1b]0;title\x07 a\r\nb\tc\x7f\x9b31m\u202eevil\u2066\u200b\u2028\u2029\ufeff\U000e0041"
-BORDER = {"printing.py", "crash.py", "display.py", "replay.py"}
+BORDER = {"crash.py", "display.py", "replay.py"}
 
 
 def acted_on(text: str) -> list[str]:
@@ -121,7 +120,7 @@ def test_no_command_sends_a_terminal_what_it_would_act_on(
 
 def test_alarms_and_status_from_the_bus_are_shown_and_not_sent(capsys: pytest.CaptureFixture[str]) -> None:
     alarm = Alarm(alarm=HOSTILE, state=ALARM_STATE_UNACKNOWLEDGED, text=HOSTILE, by=HOSTILE, comment=HOSTILE)
-    print_lines(_line(alarm))
+    print_lines(_alarm_line(alarm))
     board = StatusBoard(0)
     body = encode(Publication("reactor/x/alarm/T", alarm))
     board.on_message(Encoded(f"reactor/{HOSTILE.replace('/', '')}/alarm/T", body.payload, body.encoding))

@@ -82,7 +82,7 @@ def test_an_unexpected_error_is_one_line_with_the_path_of_a_report(
 ) -> None:
     for name in (
         "recorder.tools.inspect.inspect",
-        "reactorwatch.cli.linear_models.describe",
+        "reactorwatch.cli.linearise.describe",
         "reactorwatch.spc.charts.ewma.Ewma.fastest",
     ):
         monkeypatch.setattr(name, crashing)
@@ -225,9 +225,9 @@ def test_a_recording_of_a_plant_with_an_impossible_name_is_watched_under_no_name
     "fails",
     [
         "reactorwatch.diagnosis.report.page.as_page",
-        "reactorwatch.cli.diagnosis.report_object",
-        "reactorwatch.cli.diagnosis.write_extended_model",
-        "reactorwatch.cli.diagnosis_drawing.write_drawing",
+        "reactorwatch.cli.diagnose.report_object",
+        "reactorwatch.cli.diagnose.write_extended_model",
+        "reactorwatch.cli.diagnose.write_drawing",
     ],
 )
 def test_a_report_that_cannot_be_made_leaves_no_half_of_it(

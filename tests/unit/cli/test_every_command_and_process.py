@@ -63,8 +63,8 @@ ENDLESS = (
 """Functions that run nodes, or show them, until they are stopped."""
 
 SLOW = (
-    "reactorwatch.cli.backtest_jobs.run",
-    "reactorwatch.cli.diagnosis_jobs.diagnose_case",
+    "reactorwatch.cli.backtest.run",
+    "reactorwatch.cli.diagnose.diagnose_case",
     "reactorwatch.diagnosis.identifiability.identifiability",
 )
 """Functions that take seconds, and get a process that is already loaded."""

@@ -8,8 +8,8 @@ import pytest
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.cli import identification
-from reactorwatch.cli.linear_models import describe
+from reactorwatch.cli import identify
+from reactorwatch.cli.linearise import describe
 from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
@@ -27,7 +27,7 @@ def measured() -> Record:
 
 def identified(measured: Record, **options: object) -> dict[str, object]:
     form = ModelForm(**options)  # type: ignore[arg-type]
-    said: dict[str, object] = json.loads(identification.fit(measured, ("qc",), ("T",), form, as_json=True))
+    said: dict[str, object] = json.loads(identify.fit(measured, ("qc",), ("T",), form, as_json=True))
     return said
 
 
@@ -69,9 +69,9 @@ def test_row_by_row_gives_what_all_rows_at_once_give(measured: Record) -> None:
 
 
 def test_compare_names_the_chosen_model_and_the_reason(measured: Record) -> None:
-    text = identification.compare(measured, ("qc",), ("C",), TWO, as_json=False)
+    text = identify.compare(measured, ("qc",), ("C",), TWO, as_json=False)
     assert text.splitlines()[-1].endswith(".")
-    said = json.loads(identification.compare(measured, ("qc",), ("C",), TWO, as_json=True))
+    said = json.loads(identify.compare(measured, ("qc",), ("C",), TWO, as_json=True))
     assert {(item["family"], item["order"]) for item in said["candidates"]} == {
         ("arx", 1), ("arx", 2), ("oe", 1), ("oe", 2),
     }  # fmt: skip

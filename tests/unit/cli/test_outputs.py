@@ -12,7 +12,7 @@ import pytest
 import typer
 
 from reactorwatch.cli.batch import SUMMARY
-from reactorwatch.cli.diagnosis import REPORT
+from reactorwatch.cli.diagnose import REPORT
 from reactorwatch.cli.main import app, main
 from reactorwatch.records import write
 from recorder import RecordedMessage

@@ -1,16 +1,27 @@
-"""Settings of a run of any process: the source of its samples, the monitor and the recording are of one process."""
+"""Settings of the nodes of a run, from files, flags and columns, and where the nodes write."""
 
+import shlex
+import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from diagnosis_node.trigger import DiagnosisConfig
+from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.cli.demonstration import choose_fault
-from reactorwatch.cli.observer import observed_process
+from reactorwatch.cli import up
+from reactorwatch.cli.bus_client import observed_process
+from reactorwatch.cli.demo import choose_fault
+from reactorwatch.cli.main import app, main
+from reactorwatch.cli.my_plant import describe_in_file
+from reactorwatch.cli.option_groups import BusOptions
 from reactorwatch.cli.plant_settings import PlayedRecord, load_source
+from reactorwatch.cli.up import diagnosis_settings
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
@@ -18,6 +29,9 @@ from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.write import write_table
+from reactorwatch.runtime.config import BusConfig, section
+from reactorwatch.runtime.event_loop import StopSignal
+from recorder.__main__ import record
 from recorder.config import RecorderConfig, ReplayConfig
 from recorder.tools.convert import import_csv
 from tests.unit.plant_node.test_plant_of_any_process import RIG
@@ -142,3 +156,265 @@ def test_an_observer_takes_the_process_from_the_settings_of_the_recorder_unless_
         assert found is not None
         assert found.name == expected
     assert observed_process(None, RecorderConfig(plant="south")) is None
+
+
+def test_columns_are_described_in_a_file_that_is_gone_after_the_run() -> None:
+    choice = ProcessChoice(None, ("Heater 1", "Heater 2"), ("T 1", 'a "quoted" name'))
+    with describe_in_file(choice) as named:
+        assert named is not None
+        assert find_process(named) == choice.load()
+    assert not Path(named).exists()
+
+
+@pytest.mark.parametrize("named", [None, "three_tanks"])
+def test_a_process_that_has_a_name_needs_no_file(named: str | None) -> None:
+    with describe_in_file(ProcessChoice(named)) as found:
+        assert found == named
+
+
+def test_columns_without_a_record_are_refused_with_the_cure() -> None:
+    run = CliRunner().invoke(app, ["up", "--input", "q", "--output", "th"])
+    assert isinstance(run.exception, InputError)
+    assert "are for the record of --record; name it, or leave them out" in str(run.exception)
+
+
+@pytest.mark.parametrize(("arguments", "inputs"), [(["--input", "q1,q2"], ("q1", "q2")), ([], ())])
+def test_the_monitor_takes_its_signals_from_columns(
+    monkeypatch: pytest.MonkeyPatch, arguments: list[str], inputs: tuple[str, ...]
+) -> None:
+    started: list[MonitorConfig] = []
+
+    def start(config: MonitorConfig, *_: Any, **__: Any) -> None:
+        started.append(config)
+
+    monkeypatch.setattr("monitor_node.__main__.run", start)
+    run = CliRunner().invoke(app, ["monitor", "--output", "th", "--output", "p", *arguments])
+    assert run.exit_code == 0, run.exception
+    assert [(config.inputs, config.outputs) for config in started] == [(inputs, ("th", "p"))]
+
+
+MODEL = '{"format": "reactorwatch.model.v1", "model": "cstr"}'
+
+
+def test_plant_and_model_are_those_of_the_monitor(tmp_path: Path) -> None:
+    (tmp_path / "known.json").write_text(MODEL)
+    monitor = MonitorConfig(plant="unit_2", process=str(tmp_path / "known.json"))
+    found = diagnosis_settings({}, monitor, tmp_path / "reports")
+    assert found == DiagnosisConfig(plant="unit_2", out=str(tmp_path / "reports"), process=monitor.process)
+
+
+def test_settings_override_the_default_and_a_flag_overrides_both(tmp_path: Path) -> None:
+    table = {"out": "here", "after_min": 12.0}
+    assert diagnosis_settings({"diagnosis": table}, MonitorConfig(), None) == DiagnosisConfig(out="here", after_min=12)
+    assert diagnosis_settings({"diagnosis": table}, MonitorConfig(), tmp_path).out == str(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({"out": "FILE"}, "FILE: is a file, the name of a folder was expected"),
+        ({"out": "new", "model": "none.json"}, "none.json: there is no such file"),
+        ({"after": 3}, r"unknown key 'after'; did you mean 'after_min'\?"),
+        ({"window_min": 10.0}, r"window_min must be in \[20, 1e\+06\], got 10"),
+    ],
+)
+def test_an_impossible_setting_is_reported_before_anything_runs(
+    table: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("FILE").write_text("")
+    with pytest.raises(InputError, match=said):
+        diagnosis_settings({"diagnosis": table}, MonitorConfig(), None)
+
+
+NOT_PLANTS = "plants must be reactor/ and a name with or without '*'"
+NO_SHARD = "shard must be like 2/5, the second of five"
+
+
+def error_line(options: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+    """The line that the command ends with."""
+    monkeypatch.setattr(sys, "argv", ["reactorwatch", "monitor", "--endpoint", "tcp/127.0.0.1:1", *options])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+@pytest.mark.parametrize(
+    "plants", ["", "foo", "reactor", "reactor/", "reactor/**", "reactor/a/*", "reactor/a b", "x/*"]
+)
+def test_plants_that_are_no_key_expression_of_plants(
+    plants: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = error_line(["--plants", plants], monkeypatch, capsys)
+    assert NOT_PLANTS in line
+    assert f"got {plants!r}" in line
+
+
+@pytest.mark.parametrize("shard", ["", "2", "0/5", "6/5", "-1/5", "1/0", "two/five", "1/2/3", "1/1001", "1 /2"])
+def test_a_shard_that_is_none(shard: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    line = error_line(["--plants", "reactor/*", "--shard", shard], monkeypatch, capsys)
+    assert NO_SHARD in line
+    assert f"got {shard!r}" in line
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--shard", "1/2"], "--shard is a part of the plants that --plants names; give both"),
+        (["--plants", "reactor/*", "--plant", "x"], "--plant is for the monitor of one plant"),
+        (["--plants", "reactor/*", "--diagnose", "x"], "--diagnose is for the monitor of one plant"),
+    ],
+)
+def test_options_that_do_not_go_together(
+    options: list[str], why: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert why in error_line(options, monkeypatch, capsys)
+
+
+@pytest.mark.parametrize("options", [["--plants", "reactor/*"], []])
+def test_a_folder_for_states_that_cannot_be_made(
+    options: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    line = error_line([*options, "--state", str(tmp_path / "file")], monkeypatch, capsys)
+    assert f"--state {tmp_path / 'file'}: is a file, the name of a folder was expected" in line
+
+
+def test_a_file_that_can_hold_but_one_plants_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text("[monitor]\nstate_file = 'x'\n")
+    line = error_line(["--config", str(settings), "--plants", "reactor/*"], monkeypatch, capsys)
+    assert "holds what is known of one plant; a fleet takes [fleet] state, a folder" in line
+
+
+def test_settings_that_make_no_monitor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text(
+        "[monitor]\noutputs = ['p']\npriorities = {}\nreference = 'process'\n[fleet]\nplants = 'reactor/*'\n"
+    )
+    assert "reference" in error_line(["--config", str(settings)], monkeypatch, capsys)
+
+
+@pytest.mark.parametrize("outputs", [("x2",), ("C",), ("C", "T"), ("T", "level")])
+def test_default_priorities_hold_for_any_outputs(outputs: tuple[str, ...]) -> None:
+    config = MonitorConfig(inputs=("u",), outputs=outputs)
+    assert config.priorities == ({"T": "high"} if "T" in outputs else {})
+
+
+def test_priorities_that_are_given_must_name_outputs() -> None:
+    with pytest.raises(InputError, match="priorities are by output"):
+        section(MonitorConfig, "monitor", {"monitor": {"outputs": ["x2"], "priorities": {"T": "high"}}}, {})
+
+
+@pytest.mark.parametrize("out", ["recordings", "a/b"])
+def test_a_recorder_makes_the_folder_that_it_writes_to(tmp_path: Path, out: str) -> None:
+    stop = StopSignal()
+    stop.set()
+    record(RecorderConfig(out=str(tmp_path / out)), BusConfig(endpoint="tcp/127.0.0.1:1"), stop)
+    assert (tmp_path / out).is_dir()
+
+
+@pytest.mark.parametrize(
+    ("settings", "flag", "expected"),
+    [
+        ("", None, "runs"),
+        ("", "flag", "flag"),
+        ("[recorder]\nout = 'set'\n", None, "set"),
+        ("[recorder]\nout = 'set'\n", "flag", "flag"),
+        ("[recorder]\nout = 'set/run.mcap'\n", None, "set"),
+    ],
+)
+def test_up_records_in_the_folder_of_flag_then_settings_then_default(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: str, flag: str | None, expected: str
+) -> None:
+    def stop_here(*_arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    Path("settings.toml").write_text(settings, encoding="utf-8")
+    monkeypatch.setattr(up, "open_router", lambda *_: nullcontext())
+    monkeypatch.setattr(up, "Processes", stop_here)
+    with pytest.raises(KeyboardInterrupt):
+        up.run_until_stopped(BusOptions(Path("settings.toml")), Path(flag) if flag else None, {})
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == [expected]
+    assert len(list((tmp_path / expected).glob("*.toml"))) == 1
+
+
+def test_up_leaves_a_recording_of_that_name_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(up, "open_router", lambda *_: nullcontext())
+    (tmp_path / "run.mcap").write_bytes(b"")
+    with pytest.raises(InputError, match="a recording of that name exists"):
+        up.run_until_stopped(BusOptions(), tmp_path / "run.mcap", {})
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+
+
+@pytest.mark.parametrize("option", [["--endpoint", "tcp/127.0.0.1:1"], ["--config", "settings.toml"]])
+def test_a_router_takes_a_file_or_settings_and_not_both(
+    option: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["reactorwatch", "router", "router.json5", *option])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert "leave out --config and --endpoint" in capsys.readouterr().err
+
+
+def run(typed: str, monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(sys, "argv", ["reactorwatch", *shlex.split(typed)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture
+def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    (tmp_path / "run.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    made: list[tuple[Any, ...]] = []
+
+    def run_until_stopped(*arguments: Any) -> int:
+        made.append(arguments)
+        return 0
+
+    monkeypatch.setattr(up, "run_until_stopped", run_until_stopped)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("replay", "up"),
+    [
+        ("replay run.csv --up --rate 60", "up --record run.csv --speed 60"),
+        ("replay run.csv --up --plant north --process cstr", "up --record run.csv --plant north --process cstr"),
+    ],
+)
+def test_it_runs_what_up_runs_with_the_same_record(
+    replay: str, up: str, calls: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(replay, monkeypatch) == run(up, monkeypatch) == 0
+    (target, out, flags, *rest), (up_target, up_out, up_flags, *up_rest) = calls
+    assert (target.config, target.endpoint, out, rest) == (up_target.config, up_target.endpoint, up_out, up_rest)
+    assert flags == {name: up_flags[name] for name in flags}
+    assert not any(value for name, value in up_flags.items() if name not in flags)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"), [("--up --from 1min", "--from"), ("--up --loop", "--loop"), ("--verify --up", "--up")]
+)
+def test_a_part_of_the_file_or_a_verification_is_refused_in_one_line(
+    options: str,
+    named: str,
+    calls: list[tuple[Any, ...]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(f"replay run.csv {options}", monkeypatch) == 2
+    assert calls == []
+    shown = capsys.readouterr()
+    assert shown.err.count("\n") == 1
+    assert shown.err.rstrip().endswith(f"leave out {named}")

@@ -1,11 +1,22 @@
-"""`status` shows what was published: rates counted by hand, active alarms, nodes that are present or not."""
+"""`status` shows what was published: rates counted by hand, active alarms, nodes, the promise."""
 
 from google.protobuf.message import Message
 
-from reactorwatch.cli.alarm import _line as alarm_line
+from reactorwatch.cli.alarm import _alarm_line as alarm_line
+from reactorwatch.cli.display import Screen
 from reactorwatch.cli.status import StatusBoard
 from reactorwatch.contract.codec import Encoded, encode_message
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Priority, Quality, Sample, Suspect
+from reactorwatch.contract.messages_pb2 import (
+    Alarm,
+    AlarmState,
+    Health,
+    Power,
+    Priority,
+    Promise,
+    Quality,
+    Sample,
+    Suspect,
+)
 from reactorwatch.description.find import find_process
 
 S = 10**9
@@ -152,7 +163,54 @@ def test_alarms_are_sorted_by_priority_and_incident_and_each_line_fits() -> None
         item = alarm(name, AlarmState.ALARM_STATE_UNACKNOWLEDGED, Priority.Name(priority))  # type: ignore[arg-type]
         item.incident, item.text = incident, "a sentence that is much longer than a terminal is wide " * 3
         board.on_message(encoded(f"p/alarm/{name}", item))
-    lines = board.text(START_NS, width=80).splitlines()
+    lines = board.text(START_NS, Screen(80)).splitlines()
     shown = [line for line in lines if "…" in line]
     assert [line.split()[2] for line in shown] == ["a/3", "a/2", "a/1"]
     assert max(map(len, lines)) <= 80
+
+
+NOW_NS = 10**12
+
+
+def board(*, kept: bool = True) -> StatusBoard:
+    power = [
+        Power(deviation="coolant_flow", unit="1", within_10_min=0.0114, within_1_h=0.00512, within_1_day=0.003),
+        Power(deviation="coolant_flow", unit="1", profile="ramp", within_1_day=0.02),
+    ]
+    message = Promise(
+        time_ns=1,
+        expected=1.0,
+        expected_90=2.3456,
+        kept=kept,
+        can_keep_per_30_days=40.0,
+        text="a sentence",
+        power=power,
+    )
+    status = StatusBoard(NOW_NS)
+    status.on_message(Encoded("reactor/a/promise/monitor", *encode_message(message), NOW_NS))
+    status.on_token("reactor/a/alive/monitor", True)
+    return status
+
+
+def test_the_json_has_both_in_the_words_of_a_back_test() -> None:
+    plant = board(kept=False).plant("a", NOW_NS)
+    assert plant["promise"]["expected_90"] == 2.35
+    assert (plant["promise"]["kept"], plant["promise"]["can_keep_per_30_days"]) == (False, 40.0)
+    step, ramp = plant["power"]
+    sizes = {"within_10_min": 0.0114, "within_1_h": 0.00512, "within_1_day": 0.003}
+    assert step == {"deviation": "coolant_flow", "unit": "1", **sizes}
+    assert (ramp["profile"], ramp["within_10_min"]) == ("ramp", None)
+
+
+def test_people_see_the_sentence_and_the_steps_of_an_hour() -> None:
+    text = board().text(NOW_NS)
+    assert "a sentence" in text
+    assert "coolant_flow 0.0051" in text
+
+
+def test_a_plant_without_a_promise_has_none() -> None:
+    status = StatusBoard(NOW_NS)
+    status.on_token("reactor/b/alive/monitor", True)
+    plant = status.plant("b", NOW_NS)
+    assert (plant["promise"], plant["power"]) == (None, [])
+    assert "promise" not in status.text(NOW_NS)

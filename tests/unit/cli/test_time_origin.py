@@ -13,7 +13,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.api.files import open_messages, record
 from reactorwatch.api.simulation import simulate_along
-from reactorwatch.cli.backtest_jobs import BacktestOptions, run_job
+from reactorwatch.cli.backtest import BacktestOptions, run_job
 from reactorwatch.cli.batch import make_jobs
 from reactorwatch.cli.options import parse_span_ns
 from reactorwatch.cli.recordings import cut

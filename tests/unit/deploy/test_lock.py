@@ -91,7 +91,7 @@ def test_nodes_run_without_rerun_and_a_dashboard_names_the_missing_package() -> 
         "machinery.PathFinder.find_spec = lambda name, *rest: None if name.startswith('rerun') else find(name, *rest)\n"
         "import diagnosis_node.__main__, monitor_node.__main__\n"
         "import plant_node.__main__, recorder.__main__\n"
-        "import reactorwatch.cli.diagnosis\n"
+        "import reactorwatch.cli.diagnose\n"
         "try:\n"
         "    import recorder.view.file\n"
         "except ValueError as error:\n"

@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from reactorwatch.api.simulation import simulate_along
-from reactorwatch.cli.diagnosis import DiagnosisOptions, load_case
+from reactorwatch.cli.diagnose import DiagnosisOptions, load_case
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cascaded_tanks import tanks

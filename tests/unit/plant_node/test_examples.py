@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import reactorwatch as rw
-from reactorwatch.cli.examples import make_example
+from reactorwatch.cli.example import make_example
 from reactorwatch.errors import InputError
 from reactorwatch.process import OPERATIONS
 from reactorwatch.process.library.cstr_operation import BOILING_FROM_K

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from reactorwatch.cli.recording_reports import info_object, info_text
+from reactorwatch.cli.info import info_object, info_text
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import find_process
 from reactorwatch.description.process import ROLES, Process, Signal

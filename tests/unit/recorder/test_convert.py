@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from reactorwatch.cli.recording_reports import info_object
+from reactorwatch.cli.info import info_object
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write import write_table

@@ -8,7 +8,7 @@ from mcap.records import Metadata
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.cli.diagnosis import DiagnosisOptions, load_case
+from reactorwatch.cli.diagnose import DiagnosisOptions, load_case
 from reactorwatch.contract.codec import encode
 from reactorwatch.description.find import find_process
 from reactorwatch.description.plants import PlantProcesses

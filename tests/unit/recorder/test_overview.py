@@ -3,7 +3,7 @@
 from collections import Counter
 from pathlib import Path
 
-from reactorwatch.cli.recording_reports import info_object
+from reactorwatch.cli.info import info_object
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, encode

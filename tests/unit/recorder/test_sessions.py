@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reactorwatch.cli.recording_reports import info_object, info_text
+from reactorwatch.cli.info import info_object, info_text
 from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import Record
 from recorder import RecordedMessage

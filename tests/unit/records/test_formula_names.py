@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 from rich.text import Text
 
 from reactorwatch.axis import axis
-from reactorwatch.cli.backtest_jobs import RowsOfFile, write_rows
+from reactorwatch.cli.backtest import RowsOfFile, write_rows
 from reactorwatch.cli.batch import write_summary
-from reactorwatch.cli.display import format_report, format_rows
-from reactorwatch.cli.files import _report_text
-from reactorwatch.cli.progress import _escape_markup
+from reactorwatch.cli.display import Screen, _escape_markup, format_rows, wrap_line
+from reactorwatch.cli.recordings import _report_text
 from reactorwatch.diagnosis.report import mathml, svg
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import quote_formula, unquote_formula
@@ -146,8 +145,8 @@ def test_a_name_on_a_terminal_is_shown_and_not_acted_on(name: str) -> None:
     shown = printable(name)
     assert Text.from_markup(_escape_markup(name)).plain == shown
     for colour in (False, True):
-        rows = format_rows([[name, "2"], ["T", name]], width=80, colour=colour)
-        report = format_report([printable(f"  {name}   2")], 80, colour=colour)
+        rows = format_rows([[name, "2"], ["T", name]], to=Screen(80, colour))
+        report = "\n".join(wrap_line(printable(f"  {name}   2"), 80))
         for text in (rows, report):
             plain = re.sub(r"\x1b\[[\d;]*m", "", text)
             assert shown in plain

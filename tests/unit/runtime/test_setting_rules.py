@@ -13,7 +13,7 @@ from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
 from plant_node.config import PlantConfig
-from reactorwatch.cli.supervise import diagnosis_settings
+from reactorwatch.cli.up import diagnosis_settings
 from reactorwatch.errors import InputError
 from reactorwatch.limits import Limits
 from reactorwatch.runtime.config import SECTIONS, BusConfig, LogConfig, MetricsConfig, section

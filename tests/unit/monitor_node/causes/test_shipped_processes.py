@@ -7,7 +7,7 @@ import reactorwatch as rw
 from monitor_node.causes.isolation import causes_of
 from monitor_node.causes.scan import GlrScan
 from monitor_node.causes.window import window_of
-from reactorwatch.cli.examples import make_example
+from reactorwatch.cli.example import make_example
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.library.cascaded_tanks import tanks

@@ -2,7 +2,7 @@
 
 import reactorwatch as rw
 from monitor_node.watch import row_step
-from reactorwatch.cli.examples import make_example
+from reactorwatch.cli.example import make_example
 
 
 def watch(name: str) -> None:

@@ -14,19 +14,21 @@ from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
 from monitor_node.watch.evaluation import check_promise
 from plant_node.config import PlantConfig
-from reactorwatch.cli.bus_settings import (
+from reactorwatch.cli.kernels import compile_at_first_start
+from reactorwatch.cli.option_groups import BusOptions
+from reactorwatch.cli.plant_settings import PlayedRecord, load_source
+from reactorwatch.cli.processes import (
+    POLL_S,
     VIEWER,
     BusSettings,
+    Processes,
+    RunProgress,
     load_bus_settings,
     open_router,
     restrict_to_plant,
     write_node_settings,
+    write_settings,
 )
-from reactorwatch.cli.kernels import compile_at_first_start
-from reactorwatch.cli.options import BusOptions
-from reactorwatch.cli.plant_settings import PlayedRecord, load_source
-from reactorwatch.cli.processes import Processes, write_settings
-from reactorwatch.cli.run_progress import RunProgress
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
@@ -41,10 +43,6 @@ from recorder.recording_files import file_names
 
 log = structlog.get_logger()
 
-POLL_S = 0.5
-DEFAULT_OUT = "runs"
-"""Default folder of recordings."""
-
 
 def run_until_stopped(
     target: BusOptions,
@@ -54,23 +52,7 @@ def run_until_stopped(
     site: Path | None = None,
     played: PlayedRecord | None = None,
 ) -> int:
-    """Run everything until SIGINT, SIGTERM or SIGHUP, or until a node ends by itself.
-
-    Args:
-        target: settings file and router.
-        out: folder for the recording and the settings that ran, or the recording's file; a folder that does not exist
-            is made. None: `out` of the recorder's settings, or the folder `runs`.
-        flags: flags of the plant; None: not given.
-        diagnose: folder for diagnoses after alarms; None: that of the settings, or none.
-        site: folder of a site, for its router and the nodes' certificates; None: without TLS.
-        played: a record that is played in place of a simulated plant; None: a plant is simulated.
-
-    Returns:
-        0 if it was stopped or the plant finished, 1 if a node failed.
-
-    Raises:
-        InputError: invalid settings.
-    """
+    """Run everything until SIGINT, SIGTERM or SIGHUP, or until a node ends by itself."""
     tables = read_settings(target.config)
     log_config = section(LogConfig, "log", tables, {})
     configure(as_json=log_config.format == "json")
@@ -83,7 +65,7 @@ def run_until_stopped(
             raise InputError(f"settings [monitor]: {error}") from error
     of_recorder = tables.get("recorder", {})
     processes = {source.plant: source.process, **of_recorder.get("processes", {})}
-    of_recorder = {"recorder": {"out": DEFAULT_OUT, **of_recorder, "processes": processes}}
+    of_recorder = {"recorder": {"out": "runs", **of_recorder, "processes": processes}}
     recorder_flags = {"plant": source.plant, "out": str(out) if out is not None else None}
     recorder = restrict_to_plant(section(RecorderConfig, "recorder", of_recorder, recorder_flags), site)
     join = load_bus_settings(site, source.plant, tables, target.endpoint)
@@ -115,16 +97,7 @@ def run_until_stopped(
 
 
 def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig, out: Path | None) -> DiagnosisConfig:
-    """Settings of diagnoses after alarms.
-
-    Args:
-        tables: tables of the settings file.
-        monitor: settings of the monitor, whose plant and process are the defaults.
-        out: folder for the reports; None: as in the settings.
-
-    Raises:
-        InputError: invalid settings, a folder that is a file, or a process without equations.
-    """
+    """Settings of diagnoses after alarms."""
     of_monitor = {"plant": monitor.plant, **({"process": monitor.process} if monitor.process else {})}
     stated = tables.get("diagnosis", {})
     if "model" in stated:  # the older name

@@ -15,19 +15,18 @@ from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from reactorwatch.api.files import open_messages
-from reactorwatch.cli.bus_settings import (
+from reactorwatch.cli.display import bar, format_age, print_lines, print_report, task
+from reactorwatch.cli.kernels import compile_at_first_start
+from reactorwatch.cli.plant_settings import WAIT_FOR, complete_plant_settings
+from reactorwatch.cli.processes import (
+    POLL_S,
+    Processes,
+    RunProgress,
     load_bus_settings,
     open_router,
     restrict_to_plant,
     write_node_settings,
 )
-from reactorwatch.cli.display import format_age, print_report
-from reactorwatch.cli.kernels import compile_at_first_start
-from reactorwatch.cli.plant_settings import WAIT_FOR, complete_plant_settings
-from reactorwatch.cli.printing import print_lines
-from reactorwatch.cli.processes import Processes
-from reactorwatch.cli.progress import bar, task
-from reactorwatch.cli.run_progress import POLL_S, RunProgress
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.contract.codec import Encoded, decode
@@ -53,8 +52,10 @@ from recorder.core import DISK_ALARM
 PLANT = "demo"
 NODES = ("recorder", "monitor", "plant")
 """Nodes in the order of their start."""
+
 ONSET_MIN = 150.0
 """Onset of the fault: the training ends after 100 minutes."""
+
 START_WITHIN_S = 60.0
 SETTINGS_FILE = "settings.toml"
 DIAGNOSIS_FOLDER = "diagnosis"
@@ -62,15 +63,7 @@ DRAIN_TIMEOUT_S = 1.0  # for the recorder, which is stopped last
 
 
 def choose_fault(text: str | None, process: Process) -> FaultSpecification:
-    """Fault to inject.
-
-    Args:
-        text: specification of the fault; None: that of the process, from `ONSET_MIN` on.
-        process: the process.
-
-    Raises:
-        InputError: it is invalid, or the process has no equations.
-    """
+    """Fault to inject."""
     if text is None and process.operation.fault:
         text = f"{process.operation.fault}@{ONSET_MIN:g}min"
     elif text is None:
@@ -81,21 +74,7 @@ def choose_fault(text: str | None, process: Process) -> FaultSpecification:
 
 
 def run(flags: dict[str, Any], fault: str | None, out: Path | None, site: Path | None = None) -> int:
-    """Run the demonstration.
-
-    Args:
-        flags: settings of the plant: `process`, `speed`, `duration_min` and `seed`.
-        fault: see `choose_fault`.
-        out: folder to make; None: one named after the time.
-        site: folder of a site, for its router and the nodes' certificates; None: without TLS.
-
-    Returns:
-        0 if alarms were raised after the fault and not before, and the back-test agreed; 1 if not; 130 if Ctrl-C
-        stopped it, and 0 if SIGTERM or SIGHUP did.
-
-    Raises:
-        InputError: invalid arguments, or a node that failed.
-    """
+    """Run the demonstration."""
     configure()
     process = find_process(flags["process"] or DEFAULT_PROCESS)
     injected = str(choose_fault(fault, process))
@@ -186,7 +165,7 @@ def _describe_end(node: str, code: int, folder: Path) -> str:
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
     """Diagnose and draw the recording, and write the summary; returns the exit code."""
     from reactorwatch.api.diagnosis import diagnose_case
-    from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, DiagnosisOptions, load_case, write_report
+    from reactorwatch.cli.diagnose import DRAWING, MODEL, PAGE, DiagnosisOptions, load_case, write_report
     from reactorwatch.diagnosis.report.words import describe_verdict
     from recorder.columns import read_segments
     from recorder.view.file import write_rrd
@@ -265,13 +244,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
 
 
 def headline(delay_s: float | None, diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
-    """Delay of the detection, and the cause that the diagnosis names, in a sentence.
-
-    Args:
-        delay_s: seconds of plant time from the fault to the first alarm; None: there was none.
-        diagnosis: diagnosis of the recording.
-        effects: possible causes.
-    """
+    """Delay of the detection, and the cause that the diagnosis names, in a sentence."""
     detected = "Not detected" if delay_s is None else f"Detected after {format_age(delay_s)}"
     catalogue = {effect.name: effect for effect in effects}
     causes = [

@@ -1,16 +1,20 @@
-"""`reactorwatch baseline` and `--mode`: what is sent, what is printed, and what is refused."""
+"""Commands of an operator: what is sent, what is printed, what is refused; a busy node is named."""
 
+import json
+import threading
 from typing import Any
 
 import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from reactorwatch.cli import baseline
+from reactorwatch.cli import bus_client
 from reactorwatch.cli.main import app
-from reactorwatch.cli.options import ClientOptions, ProcessOptions
-from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply
+from reactorwatch.cli.option_groups import ClientOptions, ProcessOptions
+from reactorwatch.contract.codec import Encoded, encode_message
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Baseline, BaselineCommand, CommandReply
 from reactorwatch.errors import InputError
+from tests.running import Command
 
 BASELINES = [
     Baseline(id=0, what="trained", by="monitor"),
@@ -31,7 +35,7 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
             accepted=True, text=f"{command.what} by {command.by}, from the next row on", baselines=listed
         )
 
-    monkeypatch.setattr(baseline, "send_command", send)
+    monkeypatch.setattr(bus_client, "send_command", send)
     return commands
 
 
@@ -69,9 +73,49 @@ def test_the_list_is_one_line_or_one_object_a_baseline(sent: list[tuple[Any, ...
 
 
 def test_a_mode_is_a_column_of_a_process_without_a_file() -> None:
-    process = ProcessOptions(None, ["q"], ["th"]).choose(["phase,auto"]).load()
+    process = ProcessOptions(inputs=["q"], outputs=["th"]).choose(["phase,auto"]).load()
     assert process.names("mode") == ("phase", "auto")
     with pytest.raises(InputError, match="--mode needs an --output, got only the mode phase"):
         ProcessOptions().choose(["phase"])
     with pytest.raises(InputError, match="--input, --output and --mode describe a process without a file"):
         ProcessOptions("cstr").choose(["phase"])
+
+
+ALARM = Alarm(alarm="shewhart/T", state=AlarmState.ALARM_STATE_UNACKNOWLEDGED, text="T is high")
+
+
+class Nodes:
+    """A bus with a monitor that answers; a recorder, if there is one, does not answer in time."""
+
+    def __init__(self, recorder: bool) -> None:
+        self._recorder = recorder
+
+    def query(self, question: Encoded, timeout_s: float) -> list[Encoded]:
+        if question.key.endswith("/list_alarms"):
+            return [Encoded(question.key, *encode_message(CommandReply(accepted=True, alarms=[ALARM])))]
+        if self._recorder:
+            threading.Event().wait(timeout_s)
+        return []
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("recorder", "said"),
+    [
+        (
+            True,
+            "the alarms of the recorder are missing: the recorder of plant 'cstr' did not answer within 0.1 s; "
+            "give it a longer --timeout\n",
+        ),
+        (False, ""),
+    ],
+)
+def test_alarms_are_listed_without_a_recorder_and_a_busy_one_is_named(
+    called: Command, monkeypatch: pytest.MonkeyPatch, recorder: bool, said: str
+) -> None:
+    monkeypatch.setattr("reactorwatch.cli.bus_client.connect", lambda *_: Nodes(recorder))
+    done = called("alarm", "list", "--json", "--timeout", "0.1")
+    assert (done.returncode, done.stderr) == (0, said)
+    assert json.loads(done.stdout)["alarm"] == "shewhart/T"

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from monitor_node.config import DEFAULT, DEFAULT_TRAINING_ROWS, MonitorConfig
 from monitor_node.replay.backtest import (
@@ -25,16 +26,17 @@ from monitor_node.watched_process import WatchedProcess, limit_training, load_pr
 from reactorwatch.api.alarm_lines import group_by_cause
 from reactorwatch.api.backtest_report import backtest_object, backtest_text
 from reactorwatch.api.files import MessageSource, open_messages, resolve_plant
-from reactorwatch.cli.batch import FileOptions, Job, JobKind, JobResult, Row, as_table
+from reactorwatch.cli.batch import FileOptions, Job, JobKind, JobResult, Row, as_table, unit_remark
+from reactorwatch.cli.display import json_line
 from reactorwatch.cli.options import check_recording
-from reactorwatch.cli.printing import json_line
-from reactorwatch.cli.unit_remarks import FirstSamples
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Encoded
+from reactorwatch.contract.codec import DecodeError, Encoded, decode
+from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import DEFAULT_PROCESS
 from reactorwatch.description.process import Process
 from reactorwatch.errors import prefix_errors
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import quote_formula
 from reactorwatch.records.record import to_minutes, to_time_ns
 from reactorwatch.records.write import atomic_write
@@ -47,49 +49,29 @@ LOG_COLUMNS = ("file", "row", "time_min", "in_alarm", "raised")
 
 @dataclass(frozen=True, kw_only=True)
 class BacktestOptions(FileOptions):
-    """Options of a back-test.
+    """Options of a back-test."""
 
-    Attributes:
-        settings: settings of the monitor, except the plant, which the file may name.
-        log_rows: return the rows with their alarms.
-        is_one_of_many: name the file in the result, because there are others.
-        trained: result of a training on another file; None: each file begins with a training.
-    """
-
-    settings: MonitorConfig
+    settings: MonitorConfig  # but for the plant, which the file may name
     log_rows: bool = False
-    is_one_of_many: bool = False
-    trained: TrainedPlant | None = None
+    is_one_of_many: bool = False  # it is then named in its result
+    trained: TrainedPlant | None = None  # on another file; else each begins with a training
 
 
 class RowsOfFile(NamedTuple):
-    """The rows of a file with their alarms.
-
-    Attributes:
-        file: the file as named.
-        rows: the rows.
-        zero_ns: time from which their minutes are counted.
-    """
+    """The rows of a file with their alarms."""
 
     file: Path
     rows: list[LoggedRow]
-    zero_ns: int
+    zero_ns: int  # from which their minutes are counted
 
 
 class _Opened(NamedTuple):
-    """A file that is open, and the settings to watch it by.
-
-    Attributes:
-        source: messages of the file.
-        watched: settings and equations.
-        process: process that was named, recorded or described by its columns; None: as the settings say.
-        still: inputs that never move, with the reason why they explain nothing.
-    """
+    """A file that is open, and the settings to watch it by."""
 
     source: MessageSource
     watched: WatchedProcess
-    process: Process | None
-    still: dict[str, str]
+    process: Process | None  # named, recorded or described by its columns
+    still: dict[str, str]  # inputs that never move, and why they explain nothing
 
 
 def choose_settings(settings: MonitorConfig, choice: ProcessChoice) -> ProcessChoice:
@@ -106,11 +88,7 @@ def choose_settings(settings: MonitorConfig, choice: ProcessChoice) -> ProcessCh
 
 
 def train_on(file: Path, asked: BacktestOptions) -> TrainedPlant:
-    """Train on the whole of a file.
-
-    Raises:
-        InputError: as `run_job`; or the file has too few rows, or no output that can be watched.
-    """
+    """Train on the whole of a file."""
     opened = _open(file, asked, learns=True)
     with prefix_errors(f"--train {file}"):
         config, model = opened.watched
@@ -118,11 +96,7 @@ def train_on(file: Path, asked: BacktestOptions) -> TrainedPlant:
 
 
 def run_job(job: Job[BacktestOptions]) -> JobResult:
-    """Run the monitor over a file.
-
-    Raises:
-        InputError: the file cannot be read or has no value of any output, or settings do not fit together.
-    """
+    """Run the monitor over a file."""
     asked = job.asked
     opened = _open(job.at, asked, learns=asked.trained is None)
     source, (config, model) = opened.source, opened.watched
@@ -139,7 +113,7 @@ def run_job(job: Job[BacktestOptions]) -> JobResult:
         text = backtest_text(result, zero_ns, job.file, zero_ns if zero else None, is_trained=asked.trained is not None)
     remarks = [f"read as: {source.read_as}"] if source.read_as else []
     if opened.process is None or model is not None:
-        remarks += filter(None, [first.unit_remark(model or DEFAULT.require_model())])
+        remarks += filter(None, [first.remark(model or DEFAULT.require_model())])
     logged = None if log is None else RowsOfFile(job.file, _logged_rows(log, source, zero_ns), zero_ns)
     return JobResult(
         text,
@@ -151,17 +125,7 @@ def run_job(job: Job[BacktestOptions]) -> JobResult:
 
 
 def _open(file: Path, asked: BacktestOptions, *, learns: bool) -> _Opened:
-    """Open a file, and find the settings to watch it by.
-
-    Args:
-        file: path of the file.
-        asked: options of the back-test.
-        learns: True if the monitor is trained on the file.
-
-    Raises:
-        InputError: the file or the process cannot be read, settings do not fit together, or the file is none to learn
-            from.
-    """
+    """Open a file, and find the settings to watch it by."""
     plant = resolve_plant(check_recording(file), asked.plant)
     settings = msgspec.structs.replace(asked.settings, plant=plant)
     choice = choose_settings(settings, asked.process)
@@ -200,11 +164,7 @@ def _logged_rows(log: RowLog, source: MessageSource, zero_ns: int) -> list[Logge
 
 
 def write_rows(path: Path, files: Sequence[RowsOfFile]) -> None:
-    """Write the rows of files with their alarms as a table.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Write the rows of files with their alarms as a table."""
     with atomic_write(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as out:
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(LOG_COLUMNS)
@@ -257,3 +217,36 @@ def _summary(rows: Sequence[Row]) -> str:
 
 
 BACKTEST = JobKind("watching", run_job, (*_COLUMNS, *_OF_ALARMS), _summary)
+MAX_SAMPLES = 3000
+"""Samples of each signal from which its unit is checked."""
+
+
+class FirstSamples:
+    """Collects the first samples of a plant from a stream of messages."""
+
+    def __init__(self, plant: str) -> None:
+        self._prefix = keys.key(plant, keys.SAMPLE, "")
+        self._series: dict[str, list[tuple[int, float]]] = {}
+
+    def collect_samples(self, messages: Iterable[Encoded]) -> Iterator[Encoded]:
+        """Yield the messages unchanged, and collect the first samples."""
+        for message in messages:
+            if message.key.startswith(self._prefix):
+                series = self._series.setdefault(message.key.removeprefix(self._prefix), [])
+                if len(series) < MAX_SAMPLES:
+                    self._collect(message, series)
+            yield message
+
+    def _collect(self, message: Encoded, series: list[tuple[int, float]]) -> None:
+        try:
+            sample = decode(message.payload, message.encoding)
+        except DecodeError:
+            return  # the monitor counts it as refused
+        if isinstance(sample, Sample):
+            series.append((sample.time_ns, sample.value))
+
+    def remark(self, model: ProcessModel) -> str:
+        """Remark on the units of these samples."""
+        columns = {name: np.array([value for _, value in series]) for name, series in self._series.items()}
+        times = next(iter(self._series.values()), [])
+        return unit_remark(model, columns, np.array([to_minutes(time_ns) for time_ns, _ in times]))

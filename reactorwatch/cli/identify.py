@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from reactorwatch.cli.printing import json_line
+from reactorwatch.cli.display import json_line
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
@@ -27,16 +27,7 @@ NAMES = {
 def choose_outputs(
     process: str | None, inputs: tuple[str, ...], outputs: tuple[str, ...]
 ) -> tuple[Process, tuple[str, ...]]:
-    """Process and the outputs that are identified.
-
-    Args:
-        process: name or path of a process; None: the named columns describe one, or it is the default process.
-        inputs: columns that are inputs.
-        outputs: outputs of the process, or columns that are outputs.
-
-    Raises:
-        InputError: as `ProcessChoice`; or a process has no such output.
-    """
+    """Process and the outputs that are identified."""
     default = find_process()
     if process is None and (inputs or not set(outputs) <= set(default.outputs)):
         described = ProcessChoice(None, inputs, outputs).load()
@@ -58,20 +49,7 @@ def fit(
     *,
     as_json: bool,
 ) -> str:
-    """Fit one model of each output and format them, as JSON one object a line.
-
-    Args:
-        measured: the record that is fitted.
-        inputs: names of the inputs.
-        outputs: names of the outputs.
-        form: form of the models.
-        held_out: record to validate on; None: the second half of `measured`.
-        settle: number of first held-out rows that may set the state.
-        as_json: format as JSON.
-
-    Raises:
-        InputError: the record or the options are unsuitable.
-    """
+    """Fit one model of each output and format them, as JSON one object a line."""
     found = []
     for output in outputs:
         validated = None if held_out is None else Dataset.of_record(held_out, inputs, output)
@@ -90,11 +68,7 @@ def compare(
     *,
     as_json: bool,
 ) -> str:
-    """Compare every family at every order up to that of the form, and format the choice for each output.
-
-    Raises:
-        InputError: as `fit`.
-    """
+    """Compare every family at every order up to that of the form, and format the choice for each output."""
     if form.order < 1:
         raise InputError(f"order must be at least 1, got {form.order}")
     orders, texts = range(1, form.order + 1), []

@@ -17,18 +17,7 @@ STEP_SHARE = 0.1
 
 
 def describe(model: ProcessModel, levels: Sequence[float], step: float | None, *, as_json: bool) -> str:
-    """Format all steady states at constant inputs with their linear models.
-
-    Args:
-        model: the process.
-        levels: levels of the inputs, in their order and units.
-        step: step of each input with which plant and linear model are compared at the stable states, in its unit; None:
-            `STEP_SHARE` of its scale.
-        as_json: format as a JSON object.
-
-    Raises:
-        InputError: too few or too many levels, or a level outside the bounds of its input.
-    """
+    """Format all steady states at constant inputs with their linear models."""
     if len(levels) != len(model.inputs):
         raise InputError(
             f"{model.name}: one level for each input is needed ({', '.join(model.input_names)}), got {len(levels)}"

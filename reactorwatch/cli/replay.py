@@ -7,8 +7,7 @@ from typing import Any
 from monitor_node.config import MonitorConfig
 from monitor_node.replay.message_diff import Difference
 from monitor_node.replay.verification import COMPARED, Verification, verify
-from reactorwatch.cli.printing import json_line, print_lines, print_text
-from reactorwatch.cli.progress import task
+from reactorwatch.cli.display import json_line, print_lines, print_report, task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.description.choice import ProcessChoice
@@ -18,7 +17,6 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.runtime.config import parse_tables, read_settings, section
-from reactorwatch.terminal import printable_lines
 from reactorwatch.version import UNKNOWN, describe_build, this_build
 from recorder.files.metadata import gaps_of
 from recorder.files.recording import Recording, has_clock
@@ -26,26 +24,12 @@ from recorder.tools.inspect import zero_ns_of
 
 SETTINGS = "settings"
 """Name of the nodes' settings in the metadata of a recording."""
-MAX_LINES = 10
-MAX_VALUE = 60
+
+MAX_LINES, MAX_VALUE = 10, 60  # differences, and letters of a value, that fit a terminal
 
 
 def run(file: Path, config: Path | None, plant: str | None, process: str | None = None, *, as_json: bool) -> int:
-    """Verify a recording and print the result.
-
-    Args:
-        file: the recording, or a folder of them.
-        config: settings file; None: the settings in the recording.
-        plant: plant of the monitor; None: the only one in the recording.
-        process: name or file of the process; None: that of the settings file, or the one that the recording describes.
-        as_json: print one JSON object.
-
-    Returns:
-        The exit code: 0 if every recorded message is reproduced, 1 if not.
-
-    Raises:
-        InputError: the recording cannot be read, or holds nothing to verify.
-    """
+    """Verify a recording and print the result."""
     if is_table(file):
         raise InputError(f"{file}: holds no alarms to verify; a recording (.mcap) was expected")
     recording = Recording(file)
@@ -78,7 +62,7 @@ def run(file: Path, config: Path | None, plant: str | None, process: str | None 
     }
     if as_json:
         report["notes"] = other_builds + report["notes"]
-    print_text(json_line(report) if as_json else _text(report))
+    print_report(json_line(report) if as_json else _text(report), as_json=as_json)
     return 0 if verification.exact else 1
 
 
@@ -96,9 +80,6 @@ def _recorded_process(recording: Recording, monitor: MonitorConfig) -> Process |
     """Process that the settings in a recording name: of the catalogue, or as the recording itself describes it.
 
     A file that they name is not opened. None: they name none.
-
-    Raises:
-        InputError: the recording does not hold the equations that judged.
     """
     path = ProcessChoice(monitor.process).file
     described = None if path is None else recording.process(monitor.plant)
@@ -108,11 +89,7 @@ def _recorded_process(recording: Recording, monitor: MonitorConfig) -> Process |
 
 
 def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: str) -> MonitorConfig:
-    """Settings of the monitor when this was recorded.
-
-    Raises:
-        InputError: they are neither given nor in the recording.
-    """
+    """Settings of the monitor when this was recorded."""
     if config is not None:
         tables = read_settings(config)
     elif SETTINGS in metadata:
@@ -175,7 +152,7 @@ def _text(report: dict[str, Any]) -> str:
     if report["after_the_end"]:
         lines.append(f"{report['after_the_end']} more would have come after the end of the recording")
     lines += [f"note: {note}" for note in report["notes"]]
-    return printable_lines(lines)
+    return "\n".join(lines)
 
 
 def _short(text: str) -> str:

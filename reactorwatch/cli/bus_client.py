@@ -1,0 +1,97 @@
+"""Commands that join the bus: their settings and log, and a question to a node with its answer."""
+
+import logging
+import threading
+import time
+from typing import Any
+
+from google.protobuf.message import Message
+
+from reactorwatch.cli.option_groups import BusOptions, ClientOptions, PlantOptions
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, decode, encode_message
+from reactorwatch.contract.messages_pb2 import CommandReply
+from reactorwatch.description.find import find_process
+from reactorwatch.description.plants import PlantProcesses
+from reactorwatch.description.process import Process
+from reactorwatch.errors import InputError
+from reactorwatch.runtime.bus_zenoh import connect
+from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
+from reactorwatch.runtime.event_loop import StopSignal
+from reactorwatch.runtime.logs import configure
+from recorder.config import RecorderConfig
+
+
+def load_settings(target: BusOptions, level: int = logging.WARNING) -> tuple[dict[str, dict[str, Any]], BusConfig]:
+    """Configure the log; returns the tables of the settings, and the bus settings."""
+    configure(level)
+    tables = read_settings(target.config)
+    return tables, section(BusConfig, "bus", tables, {"endpoint": target.endpoint})
+
+
+def load_recorder_settings(target: PlantOptions, level: int = logging.WARNING) -> tuple[BusConfig, RecorderConfig]:
+    """Configure the log; returns the settings of the bus, and of the recorder, which name the plant."""
+    tables, bus = load_settings(target, level)
+    return bus, section(RecorderConfig, "recorder", tables, {"plant": target.name})
+
+
+def observed_process(process: str | None, recorder: RecorderConfig) -> Process | None:
+    """Process of the plant that is observed."""
+    return PlantProcesses(recorder.processes).find(recorder.plant) if process is None else find_process(process)
+
+
+class NoReplyError(InputError):
+    """No such node replied."""
+
+
+class LateReplyError(NoReplyError):
+    """Such a node runs, and did not reply in time."""
+
+
+def send_command(node: str, client: ClientOptions, name: str, message: Message) -> CommandReply:
+    """Send a command to a node and return its reply."""
+    tables, bus_config = load_settings(client)
+    timeout_s = client.timeout
+    try:
+        plant = keys.check_plant(client.name or str(tables.get(node, {}).get("plant") or keys.DEFAULT_PLANT))
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    stop = StopSignal()
+    timer = threading.Timer(timeout_s, stop.set)
+    timer.start()
+    try:
+        bus = connect(bus_config, "command", stop)
+    finally:
+        timer.cancel()
+    if bus is None:
+        raise InputError(f"no router at {bus_config.endpoint} within {timeout_s:g} s; is it running?")
+    asked_s = time.monotonic()
+    try:
+        answers = bus.query(Encoded(keys.key(plant, keys.COMMAND, name), *encode_message(message)), timeout_s)
+        waited_s = time.monotonic() - asked_s
+    finally:
+        bus.close()
+    replies = [decode(answer.payload, answer.encoding) for answer in answers]
+    reply = next((item for item in replies if isinstance(item, CommandReply)), None)
+    if reply is None and waited_s >= timeout_s:  # the router ends a query at once that no node takes
+        raise LateReplyError(
+            f"the {node} of plant {plant!r} did not answer within {timeout_s:g} s; give it a longer --timeout"
+        )
+    if reply is None:
+        refused = ", and may this certificate ask it?" if bus_config.ca is not None else "?"  # refusals are silent
+        raise NoReplyError(f"no {node} of plant {plant!r} answered within {timeout_s:g} s; is it running{refused}")
+    if not reply.accepted:
+        raise InputError(reply.text)
+    return reply
+
+
+def node_settings(target: BusOptions) -> tuple[dict[str, dict[str, Any]], BusConfig]:
+    """Configure the log of a node; returns the tables of the settings, and the bus settings."""
+    tables = read_settings(target.config)
+    configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
+    return tables, section(BusConfig, "bus", tables, {"endpoint": target.endpoint})
+
+
+def metrics_settings(tables: dict[str, dict[str, Any]]) -> MetricsConfig:
+    """Settings of a node's metrics."""
+    return section(MetricsConfig, "metrics", tables, {})
