@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sklearn.exceptions import ConvergenceWarning  # type: ignore[import-untyped]
+from sklearn.neural_network import MLPRegressor  # type: ignore[import-untyped]
 
-from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import fit_arx
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.regressor import rows_of
@@ -97,11 +98,6 @@ class Neural:
         self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
     ) -> NeuralModel:
         """Fit the networks and choose the one with the best simulation."""
-        try:
-            from sklearn.exceptions import ConvergenceWarning  # type: ignore[import-untyped]
-            from sklearn.neural_network import MLPRegressor  # type: ignore[import-untyped]
-        except ImportError as missing:
-            raise InputError("the neural model needs scikit-learn: pip install scikit-learn") from missing
         linear = fit_arx(structure, inputs, outputs, time)
         record = ScaledRecord.of(structure, inputs, outputs, time)
         # Without the constant: the network has its own.
