@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,11 @@ from recorder.config import RecorderConfig
 from recorder.files.recording import Recording
 
 KILLS = 50
-DEFAULTS = {"history_s": BusConfig().history_s, "black_box_min": RecorderConfig().black_box_min}
+start_recorder = partial(
+    recorder_process, history_s=BusConfig().history_s, black_box_min=RecorderConfig().black_box_min
+)
+"""The recorder as it is configured by default."""
+
 SOONEST_S, LATEST_S = 0.5, 4.0
 KEPT = 30 * RATE_PER_S // SIGNALS
 """Messages on a key that the publisher remembers: of half a minute, as a busy machine is slow to start a recorder."""
@@ -67,13 +72,13 @@ def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Kil
     alive_at, killed_ns = [], []
     try:
         for _ in range(kills):
-            with recorder_process(folder, config.endpoint, tokens, **DEFAULTS) as process:
+            with start_recorder(folder, config.endpoint, tokens) as process:
                 alive_at.append(publisher.sequence + 1)  # the row that is being published may be half heard
                 catch_up.wait()
                 time.sleep(random.uniform(SOONEST_S, LATEST_S))
                 killed_ns.append(time.time_ns())
                 process.send_signal(signal.SIGKILL)
-        with recorder_process(folder, config.endpoint, tokens, **DEFAULTS) as process:
+        with start_recorder(folder, config.endpoint, tokens) as process:
             catch_up.wait()
             process.terminate()  # the last start recovers, too
             process.wait(PATIENCE_S)
